@@ -11,7 +11,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import synchronise
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
-from reproduction import damage
+from reproduction.fault_cases import heading_drift
 
 SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]
 
@@ -43,7 +43,7 @@ def test_a_shift_is_found_with_its_time_and_size(share):
 def test_a_world_that_drifts_is_no_mount_that_has_moved():
     """Seen in a short recording, it looks like a shift as well."""
     drive = simulate_drive(1, HILLY_DRIVE, NoiseConfig(gaussian=0.003))
-    child = damage.heading_drift(drive.child, 20.0, None)[: len(drive.child) // 3]
+    child = heading_drift(drive.child, 20.0, None)[: len(drive.child) // 3]
     codes = [found.code for found in check_streams(drive.parent, child).findings]
     assert codes == ["world_drift"]
 
