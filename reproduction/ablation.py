@@ -15,8 +15,8 @@ import numpy as np
 
 from hand_eye_calib.alignment.scale import child_scaled, settle_scale
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.increments import SYSTEMATIC
 from hand_eye_calib.gls.tuning import TUNING
@@ -125,10 +125,8 @@ def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
         )
     except (np.linalg.LinAlgError, ValueError):
         return None
-    T, rotation = found.T_parent_child, found.T_parent_child[:3, :3]
-    turn = se3.rotation_log(rotation @ case.T_parent_child[:3, :3].T)
-    off = np.r_[T[:3, 3] - case.T_parent_child[:3, 3], turn]
-    to_parent = np.kron(np.eye(2), rotation)
+    off = deviation(found.T_parent_child, case.T_parent_child)
+    to_parent = np.kron(np.eye(2), found.T_parent_child[:3, :3])
     variances = np.diag(to_parent @ found.cov_parent_child_in_child @ to_parent.T)
     known = np.isfinite(case.sigmas)
     squares = np.where(known, off**2 + 0.25 * np.where(known, case.sigmas, 0.0) ** 2, 0.0)

@@ -7,7 +7,6 @@ every run: errors over those of another version of the package (a folder that ho
 intervals hold the truth, with the common-mode floor and without.
 """
 
-import dataclasses
 import os
 import pickle
 import subprocess
@@ -20,11 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.coverage.classes import simulate
 from reproduction.coverage.mixed import MIXED, drawn_class
-from reproduction.recordings import real_rigs
+from reproduction.recordings import between, real_rigs
 from reproduction.writing import markdown_table, show, study_parser
 
 # Runs with any version since 0.1: answer and covariance, with the floor or without, of all streams.
@@ -77,16 +76,9 @@ def real_cases(folder: Path, pieces: int, rng: np.random.Generator) -> Iterator[
             for _ in range(pieces):
                 share = np.exp(rng.uniform(*np.log(_SHARES)))
                 start = first + int(rng.uniform(0.0, 1.0 - share) * length)
-                piece = [_between(each, start, start + int(share * length)) for each in streams]
+                piece = [between(each, start, start + int(share * length)) for each in streams]
                 if min(map(len, piece)) >= _FEWEST:
                     yield Case(f"{family}, pieces", (piece[0], piece[1]), clock, *truth)
-
-
-def _between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
-    kept = (trajectory.stamps_ns >= first_ns) & (trajectory.stamps_ns <= last_ns)
-    return dataclasses.replace(
-        trajectory, stamps_ns=trajectory.stamps_ns[kept], poses=trajectory.poses[kept]
-    )
 
 
 def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
@@ -117,16 +109,12 @@ def solved(cases: list[Case], package: Path, method: str) -> list[Any]:
         return list(pickle.loads(Path(found).read_bytes()))
 
 
-def _off(case: Case, answer: Any) -> FloatArray:
-    """Error (6,) along and about the axes of the parent."""
-    T, truth = answer[0], case.T_parent_child
-    return np.r_[T[:3, 3] - truth[:3, 3], se3.rotation_log(T[:3, :3] @ truth[:3, :3].T)]
-
-
 def _sizes(case: Case, answer: Any, known: BoolArray) -> FloatArray:
     """Errors of translation and rotation; half of what the truth is not known to counts."""
     known = known & np.isfinite(case.sigmas)
-    squares = np.where(known, _off(case, answer) ** 2 + 0.25 * case.sigmas**2, 0.0)
+    squares = np.where(
+        known, deviation(answer[0], case.T_parent_child) ** 2 + 0.25 * case.sigmas**2, 0.0
+    )
     parts = slice(0, 3), slice(3, 6)
     return np.array([np.sqrt(squares[p].sum()) if known[p].any() else np.nan for p in parts])
 
@@ -148,7 +136,7 @@ def row(cases: list[Case], found: list[Any], others: dict[str, list[Any]]) -> di
         if one is None:
             continue
         to_parent = np.kron(np.eye(2), one[0][:3, :3])
-        off, told = _off(case, one), one[3] & np.isfinite(case.sigmas)
+        off, told = deviation(one[0], case.T_parent_child), one[3] & np.isfinite(case.sigmas)
         for index, covariance in enumerate(one[1:3]):
             variances = np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
             inside[index] += [*(np.abs(off) < _90_PERCENT * np.sqrt(variances))[told]]

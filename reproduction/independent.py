@@ -5,7 +5,6 @@
 each run.
 """
 
-import argparse
 import hashlib
 import random
 import re
@@ -24,6 +23,8 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.stops import read_arm_samples
 from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
+from reproduction.recordings import between
+from reproduction.writing import markdown_table, study_parser
 
 # Pairs of the arm's poses: hand and camera within this (s).
 _WITHIN_S = 0.011
@@ -196,7 +197,7 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
         errors, covered, verdicts = [], [], []
         for _ in range(n_segments):
             first = generator.integers(start_ns, end_ns - seconds * 10**9)
-            pair = (_between(each, first, first + seconds * 10**9) for each in (nav, velodyne))
+            pair = (between(each, first, first + seconds * 10**9) for each in (nav, velodyne))
             result = hec.calibrate(*pair)
             relative = se3.inverse(truth) @ result.T_parent_child
             error = np.r_[relative[:3, 3], np.degrees(se3.rotation_log(relative[:3, :3]))]
@@ -227,11 +228,6 @@ def _shrimp_trajectory(path: Path, name: str) -> hec.Trajectory:
         poses[k] = pose
     poses[:, :3, :3] = se3.nearest_rotation(poses[:, :3, :3])
     return hec.Trajectory(np.asarray(data.time, dtype=np.int64) * 1000, poses)
-
-
-def _between(trajectory: hec.Trajectory, first_ns: int, last_ns: int) -> hec.Trajectory:
-    which = (trajectory.stamps_ns >= first_ns) & (trajectory.stamps_ns <= last_ns)
-    return hec.Trajectory(trajectory.stamps_ns[which], trajectory.poses[which])
 
 
 def ntu_viral(folder: Path) -> Iterator[Row]:
@@ -266,34 +262,21 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
 
 def page(rows: list[Row]) -> str:
     """Markdown of all rows."""
-    lines = [
-        "# Recordings of others",
-        "",
-        "Figures that others published for their own recordings, and ours by the same protocol",
-        "(`python -m reproduction.independent`).",
-        "",
-        "| recording | figure | hand_eye_calib | published | from |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {row.recording} | {row.figure} | {row.ours} | {row.published} | {row.source} |"
-        for row in rows
-    ]
-    return "\n".join([*lines, ""])
+    about = (
+        "Figures that others published for their own recordings, and ours by the same protocol\n"
+        "(`python -m reproduction.independent`)."
+    )
+    return f"# Recordings of others\n\n{about}\n\n{markdown_table(map(vars, rows))}\n"
 
 
 def main() -> None:
     """Measure and print, or write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data-folder", type=Path, required=True)
-    parser.add_argument("--page", type=Path)
+    parser = study_parser("reproduction.independent", __doc__, "write the page there")
     parser.add_argument("--segments", type=int, default=20, help="of Shrimp, for each length")
     arguments = parser.parse_args()
-    rows: list[Row] = []
-    for study in (ethz, camodocal, moveit, wise, ntu_viral):
-        rows += study(arguments.data_folder)
-    rows += shrimp(arguments.data_folder, arguments.segments)
-    text = page(rows)
+    folder = arguments.data_folder or parser.error("name the recordings with --data-folder")
+    rows = [row for study in (ethz, camodocal, moveit, wise, ntu_viral) for row in study(folder)]
+    text = page([*rows, *shrimp(folder, arguments.segments)])
     if arguments.page:
         arguments.page.write_text(text, encoding="utf-8")
     print(text)

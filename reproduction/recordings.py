@@ -7,7 +7,6 @@ folder is absent is left out, and the page says so.
 from __future__ import annotations
 
 import csv
-import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -54,8 +53,8 @@ class Recording:
         edges_ns = np.linspace(start_ns, end_ns, count + 1)
         return [
             Recording(
-                _within(self.parent, self.parent.stamps_ns, first - _MARGIN_NS, last + _MARGIN_NS),
-                _within(self.child, child_ns, first, last),
+                between(self.parent, first - _MARGIN_NS, last + _MARGIN_NS),
+                between(self.child, first, last, child_ns),
             )
             for first, last in zip(edges_ns[:-1], edges_ns[1:], strict=True)
         ]
@@ -314,14 +313,12 @@ def _read(path: Path, columns: str) -> Trajectory:
     return read_trajectory_file(path, "csv", columns=columns, repair=True)[0]
 
 
-def _within(
-    trajectory: Trajectory, stamps_ns: IntArray, first_ns: float, last_ns: float
+def between(
+    trajectory: Trajectory, first_ns: float, last_ns: float, stamps_ns: IntArray | None = None
 ) -> Trajectory:
-    """The poses whose stamps, given on another clock, lie between two."""
-    mask = (stamps_ns >= first_ns) & (stamps_ns <= last_ns)
-    return dataclasses.replace(
-        trajectory, stamps_ns=trajectory.stamps_ns[mask], poses=trajectory.poses[mask]
-    )
+    """The poses whose stamps, perhaps given on another clock, lie between two."""
+    stamps_ns = trajectory.stamps_ns if stamps_ns is None else stamps_ns
+    return trajectory[(stamps_ns >= first_ns) & (stamps_ns <= last_ns)]
 
 
 _LOADERS: dict[str, Callable[[Path], list[Rig]]] = {

@@ -1,13 +1,12 @@
-"""``python -m reproduction.rig``: several sensors of one rig, simulated and real.
+"""``python -m reproduction.rig``: several sensors of one simulated rig.
 
-Simulated rigs drive over hills. Every pose of every sensor has an error of its own, and every
+It drives over hills. Every pose of every sensor has an error of its own, and every
 motion one that stays. Their sizes and the extrinsics are known.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import combinations
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +14,10 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.rig.calibrate import calibrate_rig, solve_rig
-from hand_eye_calib.rig.result import RigCalibration
+from hand_eye_calib.rig.calibrate import calibrate_rig
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
-from reproduction.positions import QUANTILE_90
-from reproduction.recordings import tango_devices, zxl19_sensors
+from reproduction.partial import QUANTILE_90
 from reproduction.writing import markdown_table, show, study_parser
 
 # Errors per axis of the first sensor: white m and rad, walk m and rad from pose to pose.
@@ -73,20 +70,6 @@ def unequal(n_sensors: int) -> FloatArray:
     return _ERRORS * np.stack([share, share[::-1], share, share[::-1]], axis=1)
 
 
-def unlike(n_sensors: int) -> FloatArray:
-    """Sigmas of sensors of which every other one hardly drifts, with four times the white error."""
-    errors = alike(n_sensors)
-    errors[1::2] *= [4.0, 4.0, 0.1, 0.1]
-    return errors
-
-
-def with_bad_first(n_sensors: int) -> FloatArray:
-    """Sigmas of sensors of which the first one's are five times those of the others."""
-    errors = alike(n_sensors)
-    errors[0] *= 5.0
-    return errors
-
-
 class Outcome(NamedTuple):
     """One simulated rig: errors (P, 6) of all pairs of sensors in sigmas, squared errors of the rig
     and of the answers for neighbours alone (S - 2, 6), by how much the answers for two sensors at a
@@ -130,8 +113,7 @@ def trajectories_of(rig: Rig, names: Sequence[str]) -> dict[str, Trajectory]:
 def simulated_table(repeats: int, n_poses: int) -> str:
     """A row for every kind and number of sensors."""
     rows = []
-    kinds = {"alike": alike, "unequal": unequal, "unlike": unlike, "first is bad": with_bad_first}
-    for name, errors_of in kinds.items():
+    for name, errors_of in (("alike", alike), ("unequal", unequal)):
         for n_sensors in (3, 5):
             errors = errors_of(n_sensors)
             found = [outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)]
@@ -152,44 +134,6 @@ def _row(found: Sequence[Outcome]) -> dict[str, str]:
     }
 
 
-def real_rigs(folder: Path) -> Iterator[tuple[str, RigCalibration]]:
-    """The three devices of tango, and the three sensors of zxl19's vehicle in three recordings."""
-    tango, zxl19 = folder / "asl_tango_easy", folder / "zxl19"
-    if tango.is_dir():
-        devices = tango_devices(tango)
-        yield "tango", solve_rig(devices, {"time_offset": "estimate", "scale": "auto"})
-    for number, sensors in enumerate(zxl19_sensors(zxl19) if zxl19.is_dir() else (), start=1):
-        options = {"time_offset": "estimate", "scale": "estimate"}
-        yield f"zxl19 bag{number}", solve_rig(sensors, options)
-
-
-def real_table(folder: Path) -> str:
-    """A row for every sensor of every real rig."""
-    rows = []
-    for name, found in real_rigs(folder):
-        miss = "; ".join(
-            f"{1e3 * each.translation_m:.0f} mm, {np.degrees(each.rotation_rad):.2f} deg, "
-            f"{each.chi2:.1f} of {each.dof}"
-            for each in found.closures
-        )
-        for own in found.calibrations:
-            rows.append(
-                {
-                    "Rig": name,
-                    "Sensor": own.child_frame,
-                    "Sigma x y z (mm)": _listed(1e3 * own.sigmas[:3]),
-                    "roll pitch yaw (deg)": _listed(np.degrees(own.sigmas[3:])),
-                    "Answers miss closing by, chi-square of degrees": miss,
-                }
-            )
-            miss = ""
-    return markdown_table(rows)
-
-
-def _listed(values: FloatArray) -> str:
-    return " ".join(f"{value:.2g}" for value in values)
-
-
 def main() -> None:
     """Simulate, calibrate and write."""
     parser = study_parser("reproduction.rig", __doc__)
@@ -197,8 +141,6 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=1200)
     arguments = parser.parse_args()
     show(arguments.page, {"simulated": simulated_table(arguments.repeats, arguments.poses)})
-    if arguments.data_folder:
-        show(arguments.page, {"real": real_table(arguments.data_folder)})
 
 
 if __name__ == "__main__":

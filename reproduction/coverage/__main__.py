@@ -1,75 +1,108 @@
-"""``python -m reproduction.coverage``: the coverage study from one command."""
+"""``python -m reproduction.coverage``: do the stated uncertainties hold, and how close are the
+errors to the least possible? On simulated recordings with the Cramer-Rao bound, and on real ones
+with known answers.
+"""
 
-import argparse
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from hand_eye_calib.cli.main import exit_code_of
-from hand_eye_calib.errors import ConfigError
-from reproduction.coverage import study
-from reproduction.coverage.measures import KINDS
+from reproduction.coverage import scores
+from reproduction.coverage.classes import CLASSES
+from reproduction.coverage.measures import KINDS, POOLED, Row, pooled
+from reproduction.coverage.mixed import MIXED
 from reproduction.coverage.page import page
-from reproduction.coverage.scores import METHODS
-from reproduction.recordings import real_rigs
+from reproduction.published import LEVELS, SIMULATED
+from reproduction.recordings import CYCLE, Rig, real_rigs
+from reproduction.runner import in_parallel
 from reproduction.writing import study_parser, write_csv
 
-_METHODS = tuple(METHODS)
-_SEEDS = 10
+METHODS = tuple(scores.METHODS)
+TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle", "refused")
+
+# Table, function and its arguments, the method among them, of a row.
+_Task = tuple[Any, ...]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
     parser = study_parser("reproduction.coverage", __doc__, page="write the page there")
-    for name, known in (("--methods", _METHODS), ("--tables", study.TABLES)):
-        parser.add_argument(name, default=",".join(known), help=f"Default: {','.join(known)}")
-    parser.add_argument(
-        "--seeds", type=int, default=_SEEDS, help=f"recordings per class. Default: {_SEEDS}"
-    )
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--rows", metavar="FILE", type=Path, help="write all rows there (CSV)")
-    return int(exit_code_of(lambda: run(parser.parse_args(argv))))
+    add = parser.add_argument
+    add("--methods", nargs="+", choices=METHODS, default=METHODS, help="default: both")
+    add("--tables", nargs="+", choices=TABLES, default=TABLES, help="default: all")
+    add("--seeds", type=int, default=10, help="recordings per class. Default: 10")
+    add("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    add("--rows", metavar="FILE", type=Path, help="write all rows there (CSV)")
+    arguments = parser.parse_args(argv)
+
+    def run() -> int:
+        folder = arguments.data_folder
+        rigs, absent = real_rigs(folder) if folder else ([], ["every real recording"])
+        tasks = [
+            task
+            for method in arguments.methods
+            for task in tasks_of(method, arguments.seeds, rigs, folder)
+            if task[0] in arguments.tables
+        ]
+        rows = measure(tasks, arguments.methods, arguments.jobs)
+        text = page(rows, absent, arguments.seeds)
+        print(text)
+        if arguments.page:
+            arguments.page.write_text(text, encoding="utf-8")
+        if arguments.rows:
+            names = ("table", "name", "method")
+            named = [{name: getattr(row, name) for name in names} for row in rows]
+            values = [{kind: row.value(kind) for kind in KINDS} for row in rows]
+            write_csv(arguments.rows, [{**a, **b} for a, b in zip(named, values, strict=True)])
+        return 0
+
+    return exit_code_of(run)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the study; returns the exit code."""
-    plan, absent = _plan(arguments)
-    rows = study.measure(plan, arguments.jobs)
-    text = page(rows, absent, arguments.seeds)
-    print(text)
-    if arguments.page:
-        arguments.page.write_text(text, encoding="utf-8")
-    if arguments.rows:
-        names = ("table", "name", "method")
-        named = [{name: getattr(row, name) for name in names} for row in rows]
-        values = [{kind: row.value(kind) for kind in KINDS} for row in rows]
-        write_csv(arguments.rows, [{**a, **b} for a, b in zip(named, values, strict=True)])
-    return 0
+def measure(tasks: Sequence[_Task], methods: Sequence[str], jobs: int) -> list[Row]:
+    """Rows of every class, level, rig and cycle, then the pooled ones."""
+    rows: list[Row] = [*in_parallel(_measured, [task[1:] for task in tasks], jobs)]
+    rows += [
+        pooled(table, name, method, rows) for method in methods for table, name in POOLED.items()
+    ]
+    return [row for row in rows if any(row.cases.values())]
 
 
-def _plan(arguments: argparse.Namespace) -> tuple[study.Plan, list[str]]:
-    """What to measure, and the folders of recordings that are absent."""
-    methods = _chosen("--methods", arguments.methods, _METHODS)
-    tables = _chosen("--tables", arguments.tables, study.TABLES)
-    if arguments.seeds < 1 or arguments.jobs < 1:
-        raise ConfigError("--seeds and --jobs must be at least 1")
-    given = arguments.data_folder
-    plan = study.Plan(methods=methods, tables=tables, seeds=arguments.seeds)
-    if not given:
-        return plan, ["every real recording"]
-    rigs, absent = real_rigs(given)
-    published = None if "valimaki2023" in absent else given / "valimaki2023"
-    return replace(plan, rigs=tuple(rigs), published=published), absent
+def _measured(function: Callable[..., Row], *arguments: Any) -> Row:
+    return function(*arguments)
 
 
-def _chosen(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    chosen = tuple(text.split(","))
-    unknown = [name for name in chosen if name not in known]
-    if unknown:
-        raise ConfigError(f"{option} must be of {', '.join(known)}; got {unknown[0]}")
-    return chosen
+def tasks_of(method: str, seeds: int, rigs: Sequence[Rig], folder: Path | None) -> list[_Task]:
+    """What is to be measured of a method."""
+    tasks: list[_Task] = [
+        (table, scores.class_row, name, method, seeds)
+        for table, names in (("simulated", CLASSES), ("mixed", MIXED))
+        for name in names
+    ]
+    if folder is not None and (folder / "valimaki2023").is_dir():
+        tasks += [
+            ("levels", scores.level_row, folder / "valimaki2023", dataset, level, method)
+            for dataset in SIMULATED
+            for level in LEVELS[dataset]
+        ]
+    for rig in rigs:
+        names = list(rig.recordings)
+        if rig.is_refused:
+            tasks += [("refused", scores.refused_row, rig, name, method) for name in names]
+            continue
+        if rig.truth is not None:
+            tasks += [("known answer", scores.truth_row, rig, name, method) for name in names]
+        if len(names) > 1:
+            tasks.append(("rig", scores.scatter_row, rig, method))
+        if rig.is_cut:
+            tasks += [("parts", scores.parts_row, rig, name, method) for name in names]
+    by_name = {rig.name: rig for rig in rigs}
+    if set(CYCLE) <= set(by_name):
+        tasks.append(("cycle", scores.cycle_row, {name: by_name[name] for name in CYCLE}, method))
+    return tasks
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ KINDS = {
     "arm": {"arm_target": 180.0},
 }
 TARGET = np.r_[np.full(3, 0.02), np.full(3, 0.00524)]
-FACTORS = (0.5, 1.0, 2.0, 4.0)
+FACTORS = (0.5, 1.0, 2.0)
 _STEPS = 24
 
 

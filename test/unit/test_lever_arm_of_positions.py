@@ -10,7 +10,7 @@ from hand_eye_calib.engine.checking import check_partial
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from reproduction.positions import simulated_positions
+from reproduction.partial import simulated_positions
 
 LEVER_ARM = np.array([0.8, -0.5, 1.2])
 START_NS = 1_700_000_000_000_000_000
