@@ -35,7 +35,6 @@ def write(name: str, results: Results) -> list[Path]:
             comparison.describe_rows(paired),
             "## DNLO",
             comparison.describe_dnlo(results.rows),
-            _dnlo_by_dataset(results.rows),
             "## Ali: as published, and with a normalised quaternion",
             _ali(results.ours),
             "## Zhuang's false minima",
@@ -47,23 +46,6 @@ def write(name: str, results: Results) -> list[Path]:
         ),
         comparison.write_rows(results.out / "rows.csv", results.rows),
     ]
-
-
-def _dnlo_by_dataset(rows: pd.DataFrame) -> str:
-    rows = rows[rows["method"] == "dnlo"]
-    return markdown_table(
-        {
-            "data set": dataset,
-            "rows": len(some),
-            "objective lower": (some["verdict"] == "lower").sum(),
-            "equal": (some["verdict"] == "equal").sum(),
-            "higher": (some["verdict"] == "higher").sum(),
-            "e_at agrees": percent(some["same_e_at"].sum(), len(some)),
-            "median e_at (m)": f"{some['e_at'].median():.4f}",
-            "published (m)": f"{some['published_e_at'].median():.4f}",
-        }
-        for dataset, some in rows.groupby("dataset", sort=False)
-    )
 
 
 def _ali(table: Table) -> str:
