@@ -12,7 +12,7 @@ nothing but Python.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-# The home of every public name and, if it differs, its name there.
+# The home of every public name.
 _HOMES = {
     "Calibration": "results.calibration",
     "Calibrator": "engine.calibrator",
@@ -40,60 +40,36 @@ _HOMES = {
     "simulate": "simulation.drive",
     "write_trajectory": "io.trajectory_files.writing",
 }
-_ORIGINAL_NAMES = {"load": "load_result", "save": "save_result"}
 
-# Literal, for type checkers.
-__all__ = [
-    "Calibration",
-    "Calibrator",
-    "CalibratorConfig",
-    "HandEyeCalibError",
-    "Reason",
-    "Residuals",
-    "RigCalibration",
-    "SolveStatus",
-    "Trajectory",
-    "Verdict",
-    "calibrate",
-    "calibrate_arm",
-    "calibrate_many",
-    "calibrate_rig",
-    "calibrate_stops",
-    "calibrate_together",
-    "compare",
-    "cross_check",
-    "load",
-    "plot",
-    "read_arm_samples",
-    "read_trajectory",
-    "save",
-    "simulate",
-    "write_trajectory",
-]
+__all__ = [*_HOMES]
 
 if TYPE_CHECKING:
     # The same for editors and type checkers.
-    from hand_eye_calib.config import CalibratorConfig
-    from hand_eye_calib.engine.calibrator import Calibrator
-    from hand_eye_calib.engine.offline import calibrate, cross_check
-    from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
-    from hand_eye_calib.errors import HandEyeCalibError
-    from hand_eye_calib.geometry.trajectory import Trajectory
-    from hand_eye_calib.io.results import load_result as load
-    from hand_eye_calib.io.results import save_result as save
-    from hand_eye_calib.io.stops import read_arm_samples
-    from hand_eye_calib.io.trajectory_files.reading import read_trajectory
-    from hand_eye_calib.io.trajectory_files.writing import write_trajectory
-    from hand_eye_calib.report.plot import plot
-    from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.results.records import Residuals
-    from hand_eye_calib.results.status import SolveStatus
-    from hand_eye_calib.results.verdict import Reason, Verdict
-    from hand_eye_calib.rig.calibrate import calibrate_rig
-    from hand_eye_calib.rig.result import RigCalibration
-    from hand_eye_calib.session.compare import compare
-    from hand_eye_calib.session.together import calibrate_many, calibrate_together
-    from hand_eye_calib.simulation.drive import simulate
+    from hand_eye_calib.config import CalibratorConfig as CalibratorConfig
+    from hand_eye_calib.engine.calibrator import Calibrator as Calibrator
+    from hand_eye_calib.engine.offline import calibrate as calibrate
+    from hand_eye_calib.engine.offline import cross_check as cross_check
+    from hand_eye_calib.engine.stops import calibrate_arm as calibrate_arm
+    from hand_eye_calib.engine.stops import calibrate_stops as calibrate_stops
+    from hand_eye_calib.errors import HandEyeCalibError as HandEyeCalibError
+    from hand_eye_calib.geometry.trajectory import Trajectory as Trajectory
+    from hand_eye_calib.io.results import load as load
+    from hand_eye_calib.io.results import save as save
+    from hand_eye_calib.io.stops import read_arm_samples as read_arm_samples
+    from hand_eye_calib.io.trajectory_files.reading import read_trajectory as read_trajectory
+    from hand_eye_calib.io.trajectory_files.writing import write_trajectory as write_trajectory
+    from hand_eye_calib.report.plot import plot as plot
+    from hand_eye_calib.results.calibration import Calibration as Calibration
+    from hand_eye_calib.results.records import Residuals as Residuals
+    from hand_eye_calib.results.status import SolveStatus as SolveStatus
+    from hand_eye_calib.results.verdict import Reason as Reason
+    from hand_eye_calib.results.verdict import Verdict as Verdict
+    from hand_eye_calib.rig.calibrate import calibrate_rig as calibrate_rig
+    from hand_eye_calib.rig.result import RigCalibration as RigCalibration
+    from hand_eye_calib.session.compare import compare as compare
+    from hand_eye_calib.session.together import calibrate_many as calibrate_many
+    from hand_eye_calib.session.together import calibrate_together as calibrate_together
+    from hand_eye_calib.simulation.drive import simulate as simulate
 
     __version__: str
 else:
@@ -106,7 +82,7 @@ else:
         if name not in _HOMES:
             raise AttributeError(f"module 'hand_eye_calib' has no attribute {name!r}")
         module = importlib.import_module(f"hand_eye_calib.{_HOMES[name]}")
-        return getattr(module, _ORIGINAL_NAMES.get(name, name))
+        return getattr(module, name)
 
 
 def __dir__() -> list[str]:

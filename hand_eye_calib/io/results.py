@@ -304,3 +304,7 @@ def _remarks(calibration: Calibration) -> list[str]:
 def _xacro_attribute(text: str) -> str:
     """Quoted for XML, and kept from being evaluated by xacro."""
     return quoteattr(printable(text).replace("$", "$$"))
+
+
+# Their names in the package's public interface.
+load, save = load_result, save_result
