@@ -10,7 +10,6 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import checked_pose
-from hand_eye_calib.io.plausibility import check_positions
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
 
 # An edge's stamps that jump back by more begin a new session (ns).
@@ -164,7 +163,6 @@ def _matrix(transform: PoseFields) -> FloatArray:
         If it is not a pose.
     """
     try:
-        check_positions(np.array([transform.position]))
         return checked_pose(transform.position, transform.quat_xyzw)
     except InputError as error:
         edge = f"transform {transform.world_frame}:{transform.sensor_frame}"

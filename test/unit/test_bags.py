@@ -411,8 +411,7 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
         messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
     path = write_messages(tmp_path / "bag", messages)
     expected = (
-        r"/a: 1 of 120 stamps jump away and back against the bag's own time \(first message "
-        r"31, .*by 64 s\); their poses were left out"
+        "/a: 1 stamps jump away and back against the bag's own time; their poses were left out"
     )
     with pytest.warns(UserWarning, match=expected):
         found = hec.read_trajectory(path, topic="/a")

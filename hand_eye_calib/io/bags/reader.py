@@ -1,6 +1,7 @@
 """Reading the poses of two streams from bags."""
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from itertools import chain, pairwise
@@ -36,7 +37,7 @@ from hand_eye_calib.io.bags.messages import (
 from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns
 from hand_eye_calib.io.bags.storage import BLOCK_SIZE, message_blocks, open_bags
 from hand_eye_calib.io.bags.topics import Source, Topics, joined_parts
-from hand_eye_calib.io.plausibility import PoseWatch
+from hand_eye_calib.io.plausibility import are_believable
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
 
 T = TypeVar("T")
@@ -71,7 +72,7 @@ class PoseBag:
         self.shown: Callable[[Iterable[Message], int, str], Iterable[Message]] = (
             lambda messages, count, doing: messages
         )
-        self._watches: dict[str, PoseWatch] = {}
+        self._n_wrong_stamps = Counter[str]()
         self._readers: dict[str, MessageReader] = {}
         self._notes: list[str] = []
         self._parts: dict[tuple[str, int], list[PoseBlock]] = {}
@@ -102,22 +103,26 @@ class PoseBag:
     def warnings(self) -> list[str]:
         """What could not be read, and poses that cannot be right; complete after reading."""
         losses = [f"{each.path}: {loss}" for each in self._storages for loss in each.losses]
-        watched = [text for name, watch in self._watches.items() for text in watch.warnings(name)]
+        wrong = [
+            f"{name}: {count} stamps jump away and back against the bag's own time; their poses "
+            "were left out, the bag may be damaged"
+            for name, count in (+self._n_wrong_stamps).items()
+        ]
         without = [
             f"{name}: {reader.n_left_out} messages without a fix, or without what they were read "
             "for, were left out"
             for name, reader in self._readers.items()
             if reader.n_left_out
         ]
-        return [*self._notes, *losses, *watched, *without]
+        return [*self._notes, *losses, *wrong, *without]
 
     @property
     def n_left_out(self) -> int:
         """Messages left out because their stamps cannot be right, or without a fix; complete after
         reading.
         """
-        of_stamps = sum(watch.n_stamps for watch in self._watches.values())
-        return of_stamps + sum(reader.n_left_out for reader in self._readers.values())
+        without = sum(reader.n_left_out for reader in self._readers.values())
+        return self._n_wrong_stamps.total() + without
 
     @property
     def duration_s(self) -> float:
@@ -206,7 +211,7 @@ class PoseBag:
             If the bag is damaged, or the transforms do not lead from one frame to the other.
         """
         sources = {"parent": parent} | ({"child": child} if child else {})
-        self._watches = {str(source): PoseWatch() for source in sources.values()}
+        self._n_wrong_stamps = Counter()
         self._readers, self._parts = {}, {}
         direct: dict[str, str] = {}
         others, transforms = dict[str, str](), dict[str, TfSource]()
@@ -245,10 +250,10 @@ class PoseBag:
                 except InputError as error:
                     number = numbers[getattr(error, "index", 0)]
                     raise InputError(f"{name}, message {number}: {error}") from None
-                first = int(numbers[0])
-                keep &= self._watches[name].believable(first, columns.stamps_ns, bag_ns)
+                is_right = are_believable(columns.stamps_ns, bag_ns)
+                self._n_wrong_stamps[name] += int((~is_right).sum())
                 poses = PoseBlock.of_columns(streams[name], numbers, columns, bag_ns)
-                found.append(self._watched(name, poses[keep]))
+                found.append(poses[keep & is_right])
                 if len(self.paths) > 1:
                     self._parts.setdefault((name, kind.bag), []).append(found[-1])
             yield _in_bag_order(PoseBlock.concatenate(found))
@@ -259,19 +264,10 @@ class PoseBag:
         found = [(number, PoseBlock.concatenate(self._parts[topic, number])) for number in numbers]
         return [(self.paths[number], poses.trajectory()) for number, poses in found if len(poses)]
 
-    def _watched(self, name: str, block: PoseBlock) -> PoseBlock:
-        """Look at poses of a source."""
-        try:
-            self._watches[name].add(block.message_numbers, block.stamps_ns, block.poses)
-        except InputError as error:
-            raise InputError(f"{name}, {error}") from None
-        return block
-
-    def _whole(self, source: Source, stream: str, columns: PoseColumns, bag_ns: Any) -> PoseBlock:
+    def _whole(self, stream: str, columns: PoseColumns, bag_ns: Any) -> PoseBlock:
         """All poses of a source that is no topic of poses, in the order of bag time."""
         numbers, bag_ns = 1 + np.arange(len(bag_ns)), np.array(bag_ns, dtype=np.int64)
-        poses = PoseBlock.of_columns(stream, numbers, columns, bag_ns)
-        return _in_bag_order(self._watched(str(source), poses))
+        return _in_bag_order(PoseBlock.of_columns(stream, numbers, columns, bag_ns))
 
     def _other_poses(self, stream: str, source: str) -> PoseBlock:
         """Poses of a path, of scans, of two topics that are joined, or of fields of messages."""
@@ -299,13 +295,12 @@ class PoseBag:
 
         stamps_ns, poses, notes = rows_of_messages(topic, fields or FIELDS[type_], messages())
         self._notes += notes
-        return self._whole(source, stream, PoseColumns.of_frames(stamps_ns, poses), bag_ns)
+        return self._whole(stream, PoseColumns.of_frames(stamps_ns, poses), bag_ns)
 
     def _joined_poses(self, stream: str, source: str, fix: str, imu: str) -> PoseBlock:
         """Positions of one topic with the orientations of another, interpolated."""
         found = []
         for topic, measured in ((fix, "positions"), (imu, "rotations")):
-            self._watches.setdefault(topic, PoseWatch())
             self._readers[topic] = MessageReader(self.topics[topic].type, measured)
             found.append(PoseBlock.concatenate(self._direct_blocks({topic: stream})))
         positions, orientations = found
@@ -321,7 +316,7 @@ class PoseBag:
         poses = np.c_[positions.poses[:, :3], quats]
         frame = orientations.sensor_frames[0]
         columns = PoseColumns.of_frames(positions.stamps_ns, poses, "", frame)
-        return self._whole(source, stream, columns, positions.bag_ns)
+        return self._whole(stream, columns, positions.bag_ns)
 
     def _path_poses(self, stream: str, topic: str) -> PoseBlock:
         """Poses of a path that is published again and again as it grows, perhaps with all poses
@@ -348,7 +343,7 @@ class PoseBag:
                 "the path was made from"
             )
         columns = PoseColumns.of_frames(stamps_ns, poses, world_frame)
-        return self._whole(topic, stream, columns, bag_ns)
+        return self._whole(stream, columns, bag_ns)
 
     def _scan_poses(self, stream: str, topic: str) -> PoseBlock:
         """Odometry from the points of a lidar, which is kept beside the bag for the next time."""
@@ -366,7 +361,7 @@ class PoseBag:
         lost = f", {found.n_failed} of which could not be registered" if found.n_failed else ""
         self._notes.append(f"{about}{lost}; it is kept in {place}")
         columns = PoseColumns.of_frames(found.stamps_ns, found.poses, "scans", found.frame)
-        return self._whole(topic, stream, columns, found.bag_ns)
+        return self._whole(stream, columns, found.bag_ns)
 
     def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
         """A PoseBlock for each stream whose poses come from the transform tree."""
@@ -385,7 +380,7 @@ class PoseBag:
                 )
             poses = np.c_[trajectory.poses[:, :3, 3], se3.to_quat_xyzw(trajectory.poses)]
             columns = PoseColumns.of_frames(trajectory.stamps_ns, poses, *source)
-            found.append(self._whole(source, stream, columns, log_ns))
+            found.append(self._whole(stream, columns, log_ns))
         return found
 
     def static_frames(self) -> FrameTree:
