@@ -26,19 +26,21 @@ HINT = "PYTHONPATH=. python test/unit/test_readme.py writes it"
 
 
 def parameter_table(config):
-    """The Markdown table of an option dataclass."""
-    rows = [
-        [
-            f"`{option_name(field)}`",
-            f"`{default(field)}`",
-            meta["unit"],
-            allowed(field),
-            meaning(meta),
-        ]
-        for field in dataclasses.fields(config)
-        for meta in [field.metadata]
+    """The Markdown table of an option dataclass; parameters that differ by a word share a row."""
+    rows = {}
+    for field in dataclasses.fields(config):
+        meta, name = field.metadata, option_name(field)
+        word = re.match(r"prior\.(.*)|(parent|child)_|", name)
+        word = word[1] or word[2] or "nothing"
+        cells = [f"`{default(field)}`", meta["unit"], allowed(field), meaning(meta)]
+        alike = tuple(re.sub(rf"(?<![a-z]){word}(?![a-z])", "#", cell) for cell in cells)
+        rows.setdefault(alike, []).append((name, word))
+    table = [
+        [", ".join(f"`{name}`" for name, _ in some)]
+        + [cell.replace("#", "/".join(word for _, word in some)) for cell in alike]
+        for alike, some in rows.items()
     ]
-    lines = [HEADER, ["---"] * len(HEADER), *([escaped(cell) for cell in row] for row in rows)]
+    lines = [HEADER, ["---"] * len(HEADER), *([escaped(cell) for cell in row] for row in table)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -82,7 +84,8 @@ def test_parameter_table_is_that_of_the_code(config):
 
 
 def test_parameter_tables_have_no_other_rows():
-    documented = re.findall(r"^\| `([a-z_.]+)` \| `[^|]*` \|", PAGES["docs/node.md"], re.MULTILINE)
+    rows = re.findall(r"^\| (`[a-z_.`, ]+`) \| `[^|]*` \|", PAGES["docs/node.md"], re.MULTILINE)
+    documented = [name for row in rows for name in re.findall(r"`([a-z_.]+)`", row)]
     assert documented == [
         option_name(field)
         for config in (CalibratorConfig, NodeConfig)
