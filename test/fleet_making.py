@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from result_making import calibration
 
-from hand_eye_calib.cli.batch.workers import failed
+from hand_eye_calib.cli.batch.work import failed
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import (
     Calibration,

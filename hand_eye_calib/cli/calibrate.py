@@ -6,22 +6,23 @@ name, for bags and journals alone.
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import note, print_table, waiting_for
+from hand_eye_calib.cli.console import STREAMS, note, waiting_for
 from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
     add_output_arguments,
     at_least,
+    options_from,
+    sources_from,
 )
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
-    from hand_eye_calib.io.bags import PoseBag
-    from hand_eye_calib.io.bags.topics import TopicInfo
     from hand_eye_calib.io.remote import AsGiven
 
 EXAMPLES = """\
@@ -39,12 +40,14 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
-_HEADINGS = ("topic", "type", " count", " rate", "frames", "poses")
+_HEADINGS = ("topic", "type", "count", "rate", "frames", "poses")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = EXAMPLES
+    parser.set_defaults(parser=parser)
     add_input_arguments(
         parser,
         "trajectory files of parent and child, and of more sensors; or a rosbag2 directory, .mcap, "
@@ -70,8 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="none: the poses of two files are stops without an order, paired by their rows. So "
         "are the samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH",
     )
-    _add_images(parser)
-    _add_many(parser)
+    _add_images_and_many(parser)
     add_config_arguments(parser)
     add_output_arguments(parser)
     robot = parser.add_argument_group("what is installed")
@@ -89,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_images(parser: argparse.ArgumentParser) -> None:
+def _add_images_and_many(parser: argparse.ArgumentParser) -> None:
     images = parser.add_argument_group("images of a target, one for each pose of a hand")
     images.add_argument(
         "--target",
@@ -104,9 +106,6 @@ def _add_images(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="its intrinsics: YAML of camera_info, of Kalibr or of OpenCV",
     )
-
-
-def _add_many(parser: argparse.ArgumentParser) -> None:
     batch = parser.add_argument_group("many recordings")
     batch.add_argument(
         "--batch",
@@ -144,6 +143,9 @@ def _add_many(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
+    if not (arguments.paths or arguments.batch):
+        print(f"{arguments.parser.format_usage()}\n{EXAMPLES}", file=sys.stderr)
+        return 2
     _check_usage(arguments)
     if arguments.batch:
         from hand_eye_calib.cli.batch.run import run_batch
@@ -170,13 +172,10 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise ConfigError("--dask and --vehicle are for --batch")
     if arguments.pairs and len(arguments.paths) % 2:
         raise ConfigError("--pairs takes the files of parent and child by turns: one is missing")
-    if arguments.topics:
-        named = [f"{each}_{kind}" for each in ("parent", "child") for kind in ("topic", "tf")]
-        others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
-        if others:
-            raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
-    if not arguments.batch and not arguments.paths:
-        raise ConfigError("the following arguments are required: PATH, or --batch FILE")
+    named = [f"{stream}_{kind}" for stream in STREAMS for kind in ("topic", "tf")]
+    others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
+    if arguments.topics and others:
+        raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
 
 
 def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
@@ -186,25 +185,29 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """
     if arguments.list:
         return _list_topics(arguments, as_given)
-    from hand_eye_calib.cli import rig, stops
+    from hand_eye_calib.cli import reading, rig, stops
     from hand_eye_calib.cli.parts import SeveralRecordings
     from hand_eye_calib.cli.present import deliver
-    from hand_eye_calib.cli.reading import are_bags, journal_in, read_recording
 
+    paths = arguments.paths
     if arguments.topics:
         return rig.calibrate_bag(arguments, as_given)
     if stops.are_stops(arguments):
-        return deliver(*stops.solved(arguments), None)
+        calibration, inputs = stops.solved(arguments)
+        return deliver(calibration, arguments, inputs)
     if arguments.pairs:
-        pairs = list(zip(arguments.paths[::2], arguments.paths[1::2], strict=True))
-        return _together(arguments, pairs, are_files=True)
-    if len(arguments.paths) > 1 and any(journal_in([path]) for path in arguments.paths):
-        return _together(arguments, [[path] for path in arguments.paths])
-    arguments.is_of_bags = arguments.command == "replay" or are_bags(arguments.paths)
-    if len(arguments.paths) > 2 and not arguments.is_of_bags:
+        return _together(arguments, list(zip(paths[::2], paths[1::2], strict=True)), True)
+    if len(paths) > 1 and any(reading.journal_in([path]) for path in paths):
+        return _together(arguments, [[path] for path in paths])
+    are_bags = arguments.command == "replay" or reading.are_bags(paths)
+    if len(paths) > 2 and not are_bags:
         return rig.calibrate_files(arguments)
+    options = options_from(arguments)
     try:
-        recording = read_recording(arguments)
+        if are_bags:
+            recording = reading.read_paths(paths, sources_from(arguments), options)
+        else:
+            recording = reading.read_pair(paths, reading.file_settings(arguments), options)
     except SeveralRecordings as several:
         note(f"{several.reason}; they give one result, as recordings of one rig")
         return _together(arguments, several.groups)
@@ -212,7 +215,8 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     if arguments.out:
         recording.with_fingerprints()
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
-    return deliver(calibration, arguments, as_given(recording.inputs), recording.snapshot)
+    bag = paths[0] if are_bags else None
+    return deliver(calibration, arguments, as_given(recording.inputs), recording.snapshot, bag)
 
 
 def _together(
@@ -224,12 +228,24 @@ def _together(
 
 
 def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
-    """Print the topics of a bag; returns the exit code."""
+    """Print the topics of a bag, with the rate in the bag's time, the frames of the first messages,
+    and whether one can be one of the two sensors; returns the exit code.
+    """
     from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.messages import SENSOR_TYPES
 
-    with PoseBag(*arguments.paths) as bag:
-        with waiting_for(f"reading {bag}"):
-            topics = [_described(bag, topic) for topic in bag.topics.values()]
+    with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
+        topics = [
+            {
+                **topic._asdict(),
+                "rate_hz": (topic.count - 1) / bag.duration_s
+                if topic.count > 1 and bag.duration_s > 0
+                else None,
+                "frames": bag.frames_on(topic.name),
+                "is_usable": topic.type in SENSOR_TYPES,
+            }
+            for topic in bag.topics.values()
+        ]
         document: dict[str, Any] = {
             "bag": as_given(str(bag)),
             "start_ns": bag.start_ns,
@@ -242,38 +258,26 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         note(text)
     if arguments.json:
         print(json.dumps(document, indent=2))
-    elif not topics:
-        print(f"{document['bag']} has no topics")
-    else:
-        title = f"{document['bag']}, {document['duration_s']:.1f} s"
-        print_table(title, _HEADINGS, map(list, map(_cells, topics)))
-        if any(topic["is_usable"] for topic in topics):
-            print(
-                "--parent-topic and --child-topic take the topics with poses, --parent-tf and "
-                "--child-tf frames of /tf: odom:lidar"
-            )
+        return 0
+    print(f"{document['bag']}, {document['duration_s']:.1f} s")
+    rows = [_HEADINGS, *map(_cells, topics)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        print("  ".join(cells).rstrip())
+    print(
+        "--parent-topic and --child-topic take the topics with poses, --parent-tf and --child-tf "
+        "frames of /tf: odom:lidar"
+    )
     return 0
 
 
-def _described(bag: "PoseBag", topic: "TopicInfo") -> dict[str, Any]:
-    """A topic, its rate in the bag's time, the frames of its first messages, and whether it can be
-    one of the two sensors.
-    """
-    from hand_eye_calib.io.bags.messages import SENSOR_TYPES
-
-    is_sampled = topic.count > 1 and bag.duration_s > 0
-    return {
-        **topic._asdict(),
-        "rate_hz": (topic.count - 1) / bag.duration_s if is_sampled else None,
-        "frames": bag.frames_on(topic.name),
-        "is_usable": topic.type in SENSOR_TYPES,
-    }
-
-
-def _cells(topic: dict[str, Any]) -> Iterator[str]:
-    yield printable(topic["name"])
-    yield topic["type"] or "several types"
-    yield str(topic["count"])
-    yield "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
-    yield "\n".join(printable(frame) for frame in topic["frames"])
-    yield "yes" if topic["is_usable"] else ""
+def _cells(topic: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        printable(topic["name"]),
+        topic["type"] or "several types",
+        str(topic["count"]),
+        "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz",
+        " ".join(map(printable, topic["frames"])),
+        "yes" if topic["is_usable"] else "",
+    )

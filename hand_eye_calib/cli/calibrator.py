@@ -4,11 +4,10 @@ import argparse
 import dataclasses
 import json
 import textwrap
-from collections.abc import Iterator
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
 
-INTERFACE = """\
+_INTERFACE = """\
 examples:
   hand_eye_calib calibrator --ros-args -r parent_odom:=/lidar/odometry -r child_odom:=/camera/odom
   hand_eye_calib calibrator --ros-args --params-file calibrator.yaml
@@ -35,19 +34,13 @@ parameters (-p NAME:=VALUE):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments: all are the node's, and passed on to it."""
-    parser.usage = (
-        "hand_eye_calib calibrator [--ros-args -p NAME:=VALUE ... --params-file FILE "
-        "-r FROM:=TO ...]"
-    )
-    parser.epilog = (INTERFACE + "\n".join(_parameters())).replace("%", "%%")
-    parser.set_defaults(passed_on=())
-
-
-def _parameters() -> Iterator[str]:
+    parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
+    epilog = _INTERFACE
     for field in (*dataclasses.fields(CalibratorConfig), *dataclasses.fields(NodeConfig)):
         value = " ".join(filter(None, (json.dumps(field.default), field.metadata["unit"])))
-        yield f"  {option_name(field)} ({value})"
-        yield textwrap.indent(textwrap.fill(field.metadata["doc"], 90), 6 * " ")
+        doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), 6 * " ")
+        epilog += f"  {option_name(field)} ({value})\n{doc}\n"
+    parser.epilog = epilog.replace("%", "%%")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,16 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import note, typed_options, waiting_for, with_progress
+from hand_eye_calib.cli.console import STREAMS, note, typed_options, waiting_for, with_progress
 from hand_eye_calib.cli.options import (
-    STREAMS,
     add_config_arguments,
     add_input_arguments,
     add_json_argument,
     config_from,
     options_from,
+    sources_from,
 )
-from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
@@ -33,11 +33,10 @@ examples:
 
 _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
-_Read = tuple[dict[str, "Trajectory"], dict[str, str], "list[Finding]"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = EXAMPLES
     add_input_arguments(parser, "a bag, or the trajectory files of parent and child")
     add_config_arguments(parser)
@@ -53,20 +52,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
     from hand_eye_calib.checks.check import check_streams
-    from hand_eye_calib.checks.findings import answered, gravest_first
+    from hand_eye_calib.checks.findings import answered, finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.cli.present import show
-    from hand_eye_calib.cli.reading import are_bags
-    from hand_eye_calib.cli.reporting import CHECK, write_page
+    from hand_eye_calib.cli.reading import are_bags, file_settings, read_files
+    from hand_eye_calib.cli.reporting import write_page
     from hand_eye_calib.engine.checking import check_partial
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 
+    options = options_from(arguments)
+    names = [str(path) for path in arguments.paths]
     is_bag = are_bags(arguments.paths)
-    if len(arguments.paths) != 2 - is_bag:
-        raise ConfigError(f"expected one bag or two trajectory files; got {len(arguments.paths)}")
-    read, sources, of_files = _read_bag(arguments) if is_bag else _read_files(arguments)
-    first, second = read.values()
-    config = offline_config(first, second, options_from(arguments))
+    if len(names) != 2 - is_bag:
+        raise ConfigError(f"expected one bag or two trajectory files; got {len(names)}")
+    if is_bag:
+        names, both, of_files = _read_bag(arguments)
+    else:
+        both, repairs = read_files(arguments.paths, file_settings(arguments), options)
+        of_files = [finding("repaired_file", text=text) for text in repairs]
+    first, second = both
+    config = offline_config(first, second, options)
     snapshot = whole_snapshot(config, first, second)
     parent, child = snapshot.parent, snapshot.child
     # What is to be estimated is not known yet: the checks say what it is.
@@ -78,65 +83,58 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             checked = check_partial(snapshot)
     findings = gravest_first(answered([*checked.findings, *of_files], config))
-    both = zip(STREAMS, (parent, child), strict=True)
-    streams = {name: summarise(one) for name, one in both if len(one) > 1}
+    sources = dict(zip(STREAMS, names, strict=True))
+    streams = {
+        name: summarise(one)
+        for name, one in zip(STREAMS, (parent, child), strict=True)
+        if len(one) > 1
+    }
     said = _verdict(findings)
 
-    def finish() -> None:
-        if arguments.out:
-            corrected = child.shifted(offset_s).scaled(scale)
-            shown = ((name, one if is_bag else Path(one).name) for name, one in sources.items())
-            names = [f"{name}: {one}" for name, one in shown]
-            of_page = (parent, corrected, checked, findings, names, said, config.max_gap)
-            write_page(arguments.out / CHECK, "check_page.render_check", *of_page)
+    def page() -> str:
+        from hand_eye_calib.report.check_page import render_check
+
+        corrected = child.shifted(offset_s).scaled(scale)
+        shown = [f"{name}: {one if is_bag else Path(one).name}" for name, one in sources.items()]
+        return render_check(parent, corrected, checked, findings, shown, said, config.max_gap)
 
     errors = [str(finding) for finding in findings[:1] if finding.makes_unusable]
     return show(
         arguments,
         lambda: _document(sources, streams, findings, checked),
         lambda: "\n".join([said, "", *_table(findings), "", *_lines(sources, streams, checked)]),
-        finish=finish,
+        finish=lambda: write_page(arguments.out / "check.html", page) if arguments.out else None,
         errors=errors,
         code=len(errors),
     )
 
 
-def _read_files(arguments: argparse.Namespace) -> _Read:
-    from hand_eye_calib.checks.findings import finding
-    from hand_eye_calib.cli.reading import read_files
-
-    trajectories, repairs = read_files(arguments)
-    sources = dict(zip(STREAMS, map(str, arguments.paths), strict=True))
-    return trajectories, sources, [finding("repaired_file", text=text) for text in repairs]
-
-
-def _read_bag(arguments: argparse.Namespace) -> _Read:
+def _read_bag(
+    arguments: argparse.Namespace,
+) -> "tuple[list[str], list[Trajectory], list[Finding]]":
     """Every pose as it was recorded: what is wrong with the stamps is a finding."""
-    import numpy as np
-
     from hand_eye_calib.checks.streams import tidy
-    from hand_eye_calib.cli.reading import measures_of, sources_from
-    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.cli.reading import select
+    from hand_eye_calib.io.bags import PoseBag, PoseBlock
 
     with PoseBag(arguments.paths[0]) as bag:
-        wanted = sources_from(arguments)
-        selected = bag.topics.select(wanted["parent"], wanted["child"])
-        sources = dict(zip(STREAMS, selected, strict=True))
-        measures = measures_of(bag, sources, config_from(arguments))
-        blocks = bag.blocks(*selected, measures=measures)
-        shown = with_progress(blocks, bag.expected(*selected), f"reading {bag}", len)
-        read = list(shown)
+        sources, measures = select(bag, sources_from(arguments), config_from(arguments))
+        parent, child = sources.values()
+        blocks = bag.blocks(parent, child, measures=measures)
+        expected = bag.expected(parent, child)
+        found = list(with_progress(blocks, expected, f"reading {bag}", len))
         for text in bag.warnings:
             note(text)
-    trajectories, findings = {}, []
+        if not found:
+            raise InputError(f"no poses on {parent} and {child} of {bag}")
+    read = PoseBlock.concatenate(found)
+    trajectories, findings = [], []
     for stream in STREAMS:
-        parts = [block[block.streams == stream] for block in read]
-        stamps_ns = np.concatenate([np.empty(0, np.int64), *(part.stamps_ns for part in parts)])
-        poses = np.concatenate([np.empty((0, 7)), *(part.poses for part in parts)])
-        tidied, found = tidy(stamps_ns, poses[:, :3], poses[:, 3:], stream)
-        trajectories[stream] = replace(tidied, measures=measures[stream])
-        findings += found
-    return trajectories, {stream: str(source) for stream, source in sources.items()}, findings
+        part = read[read.streams == stream]
+        tidied, told = tidy(part.stamps_ns, part.poses[:, :3], part.poses[:, 3:], stream)
+        trajectories.append(replace(tidied, measures=measures[stream]))
+        findings += told
+    return [str(parent), str(child)], trajectories, findings
 
 
 def _document(

@@ -2,10 +2,9 @@
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import waiting_for
+from hand_eye_calib.cli.console import told_apart, waiting_for
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.text import amount
@@ -27,6 +26,7 @@ exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] RESULT ..."
     parser.epilog = _EPILOG
     parser.add_argument(
         "results",
@@ -62,23 +62,16 @@ def run(arguments: argparse.Namespace) -> int:
         frames = results[0].parent_frame, results[0].child_frame
         with waiting_for(f"reading {arguments.installed}"):
             installed = read_installed(arguments.installed, *frames)
-    found = compare(results, installed, _names(arguments.results))
+    names = told_apart(arguments.results)
+    if len({*names}) < len(names):
+        raise InputError(f"expected different results; got {', '.join(names)}")
+    found = compare(results, installed, names)
     if arguments.json:
         print(json_text(found.to_dict()))
     else:
         print("\n".join(printable(line) for line in _lines(found, results[0])))
     codes = {Change.SAME: EXIT_SAME, Change.MOVED: EXIT_MOVED}
     return codes.get(found.verdict, EXIT_CANNOT_TELL)
-
-
-def _names(paths: list[str]) -> list[str]:
-    """The shortest ends of the paths that tell them apart."""
-    parts = [Path(path).parts for path in paths]
-    for length in range(1, max(map(len, parts)) + 1):
-        names = [str(Path(*part[-length:])) for part in parts]
-        if len(set(names)) == len(names):
-            return names
-    raise InputError(f"expected different results; got {', '.join(paths)}")
 
 
 def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:

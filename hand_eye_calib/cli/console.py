@@ -3,11 +3,13 @@ command line spells options.
 """
 
 import dataclasses
+import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
+from pathlib import PurePath
 from typing import TypeVar
 
 from hand_eye_calib.config import CalibratorConfig, option_name
@@ -15,32 +17,19 @@ from hand_eye_calib.errors import printable
 
 _Item = TypeVar("_Item")
 
-_CLEAR_LINE = "\r\033[K"
-# Columns of a table that does not go to a terminal: its lines stay whole.
-_WIDTH_IN_A_FILE = 240
+STREAMS = ("parent", "child")
 
-# How a terminal shows the verdict that a line begins with.
-_STYLES = {"USE": "bold green", "USE WITH CARE": "bold yellow", "DO NOT USE": "bold red"}
-
-# Notes and progress are left out: work for a batch, of which only the result is of interest.
-_IS_SILENT = ContextVar("is_silent", default=False)
+# How a terminal shows the verdict that a line begins with: bold green, yellow, red.
+_STYLES = {"USE": "\x1b[1;32m", "USE WITH CARE": "\x1b[1;33m", "DO NOT USE": "\x1b[1;31m"}
 
 OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(CalibratorConfig)}
 
-# Options of :func:`hand_eye_calib.read_trajectory`.
-_FILE_OPTIONS = [
-    f"{stream}{name}"
-    for stream in ("", "parent_", "child_")
-    for name in ("format", "columns", "times", "stamp_unit")
-]
+_OF_FILES = ("format", "columns", "times", "stamp_unit")
+_OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for name in _OF_FILES)}
 
-# Names that are no words of the language, such as max_gap and prior.z, wherever they stand, but not
-# in a path, after dashes or in quotes; and any name in backticks.
-_UNMISTAKABLE = [name for name in (*OPTION_FIELDS, *_FILE_OPTIONS) if set(name) & set("._")]
-_NAMES = re.compile(
-    rf"`(?P<quoted>[\w.]+)`|(?<![\w./\\='-])(?P<plain>{'|'.join(map(re.escape, _UNMISTAKABLE))})"
-    r"(?![\w/=-]|\.\w)"
-)
+# Names in backticks; and names that are no words of the language, such as max_gap and prior.z,
+# wherever they stand, but not in a path, after dashes or in quotes.
+_NAMES = re.compile(r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._][a-z_]+)+)(?![\w/=-]|\.\w)")
 
 
 def flag(name: str) -> str:
@@ -54,34 +43,20 @@ def typed_options(options: Iterable[tuple[str, object]]) -> str:
 
 
 def as_typed(text: str) -> str:
-    """A message of the engine with its option names as they are typed.
-
-    Messages spell options as Python and the node do. ``raise max_gap`` becomes ``raise --max-gap``;
-    a name that is also a word is in backticks, and becomes an option, too.
+    """A message of the engine with its option names, which are those of Python and the node, as
+    they are typed: ``raise max_gap`` becomes ``raise --max-gap``.
     """
-    return _NAMES.sub(_typed, text)
 
+    def typed(match: re.Match[str]) -> str:
+        name = match[1] or match[2]
+        return f"--{flag(name)}" if name in _OPTIONS else match[0]
 
-def _typed(match: re.Match[str]) -> str:
-    name = match["quoted"] or match["plain"]
-    is_option = name in OPTION_FIELDS or name in _FILE_OPTIONS
-    return f"--{flag(name)}" if is_option else match[0]
-
-
-@contextmanager
-def silence() -> Iterator[None]:
-    """Print neither notes nor progress inside the block."""
-    token = _IS_SILENT.set(True)
-    try:
-        yield
-    finally:
-        _IS_SILENT.reset(token)
+    return _NAMES.sub(typed, text)
 
 
 def note(text: object) -> None:
     """Print something that is good to know, in one line."""
-    if not _IS_SILENT.get():
-        print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
+    print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
 def fail(error: object, code: int) -> int:
@@ -90,21 +65,15 @@ def fail(error: object, code: int) -> int:
     return code
 
 
-def _is_watched() -> bool:
-    return sys.stderr.isatty() and not _IS_SILENT.get()
-
-
 @contextmanager
 def waiting_for(what: str) -> Iterator[None]:
     """On a terminal, show what is being done for as long as it lasts."""
-    if not _is_watched():
-        yield
-        return
-    print(f"{what} ...", end="", file=sys.stderr, flush=True)
+    is_watched = sys.stderr.isatty()
+    print(f"{what} ..." * is_watched, end="", file=sys.stderr, flush=True)
     try:
         yield
     finally:
-        print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
+        print("\r\x1b[K" * is_watched, end="", file=sys.stderr, flush=True)
 
 
 def with_progress(
@@ -113,18 +82,10 @@ def with_progress(
     doing: str,
     size: Callable[[_Item], int] = lambda item: 1,
 ) -> Iterator[_Item]:
-    """Pass on ``items``. On a terminal, show how much is done and the time left.
-
-    Parameters
-    ----------
-    items : iterable
-    total : int or None
-        Sum of their sizes, if it is known.
-    doing : str
-    size : callable
-        What an item adds to what is done.
+    """Pass on items. On a terminal, show how much of the sum of their sizes is done and the time
+    left.
     """
-    if not _is_watched():
+    if not sys.stderr.isatty():
         yield from items
         return
     from rich.console import Console
@@ -140,33 +101,25 @@ def with_progress(
 def print_result(text: str) -> None:
     """Print what a command found; on a terminal, the verdict that it begins with in its colour."""
     verdict, colon, rest = text.partition(":")
-    if not (sys.stdout.isatty() and verdict in _STYLES):
-        print(text)
-        return
-    from rich.console import Console
-    from rich.text import Text
-
-    Console(highlight=False).print(
-        Text.assemble((verdict, _STYLES[verdict]), colon, rest), soft_wrap=True
-    )
+    if sys.stdout.isatty() and verdict in _STYLES:
+        text = f"{_STYLES[verdict]}{verdict}\x1b[0m{colon}{rest}"
+    print(text)
 
 
-def print_table(title: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
-    """Print a table; through a pipe with whole lines, not those of a terminal of 80 columns.
-
-    Columns whose heading begins with a space are aligned to the right.
+def told_apart(paths: Sequence[str]) -> list[str]:
+    """The shortest ends of paths that tell them apart, without an end that all share: monday and
+    tuesday of monday/bag and tuesday/bag.
     """
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table: Table = Table(title=title, box=box.SIMPLE, title_justify="left", pad_edge=False)
-    for heading in headings:
-        is_number = heading.startswith(" ")
-        table.add_column(heading.strip(), justify="right" if is_number else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    console = Console(highlight=False, markup=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, markup=False, width=_WIDTH_IN_A_FILE)
-    console.print(table)
+    whole = [PurePath(path).parts for path in paths]
+    first = len(os.path.commonprefix(whole))
+    parts = [each[first:] or each[-1:] for each in whole]
+    shared = len(os.path.commonprefix([each[::-1] for each in parts]))
+    names: dict[tuple[str, ...], str] = {}
+    for length in range(1, max(map(len, parts), default=0) + 1):
+        ends = {
+            each: "/".join(each[: len(each) - shared][-length:] or each[-1:])
+            for each in {*parts} - names.keys()
+        }
+        alike = Counter(ends.values())
+        names |= {each: end for each, end in ends.items() if alike[end] == 1}
+    return [names.get(each, "/".join(each)) for each in parts]

@@ -44,6 +44,7 @@ _ROWS = {"truth": "truth", "offline": "replay of the bag", "online": "live node"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --seed 7 --out demo_7"
     parser.add_argument(
         "--out",

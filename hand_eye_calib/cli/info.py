@@ -17,6 +17,7 @@ _TEXT = (".tum", ".txt")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] RESULT"
     parser.epilog = (
         "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
         "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml\n"

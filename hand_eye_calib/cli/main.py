@@ -6,7 +6,6 @@ when it is asked for, so that a missing optional package breaks no other command
 
 import argparse
 import contextlib
-import errno
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -52,8 +51,6 @@ unobservable or the verdict is DO NOT USE"""
 _OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 # Set by the shell functions of argcomplete.
 _COMPLETING = "_ARGCOMPLETE"
-# Commands that are another name of a module.
-_MODULES = {"replay": "calibrate"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -98,30 +95,31 @@ def exit_code_of(run: Callable[[], int]) -> int:
         package = name.partition(".")[0]
         if package == "hand_eye_calib":
             raise
+        text = f"this needs the Python package {name!r}, which is not installed; install it"
         if package.endswith(_OF_ROS):
             text = (
                 f"this needs ROS 2's Python packages ({name} is missing): source the setup file of "
                 "a ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
             )
-            return fail(text, EXIT_FAILED)
-        text = f"this needs the Python package {name!r}, which is not installed; install it"
-        return fail(f"{text}, try again", EXIT_FAILED)
+        return fail(text, EXIT_FAILED)
     except BrokenPipeError:
         # Keeps the interpreter from complaining when it flushes at exit: the reader has gone.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
     except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
+        if error.filename is None:
             raise
-        name = str(error.filename)[:_MOST_SHOWN]
-        return fail(f"cannot use {name}...: {error.strerror}; give a shorter name", EXIT_FAILED)
+        name = str(error.filename)
+        shown = name if len(name) <= _MOST_SHOWN else f"{name[:_MOST_SHOWN]}..."
+        return fail(f"cannot use {shown}: {error.strerror}; choose another", EXIT_FAILED)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 
 
 def module_of(command: str) -> ModuleType:
     """The module of a command, with ``add_arguments`` and ``run``."""
-    return import_module(f"hand_eye_calib.cli.{_MODULES.get(command, command)}")
+    name = "calibrate" if command == "replay" else command
+    return import_module(f"hand_eye_calib.cli.{name}")
 
 
 def named_command() -> int:
@@ -150,15 +148,6 @@ class CommandParser(argparse.ArgumentParser):
             self.error(f"unexpected argument {words[0]!r}")
         self.error(f"unknown option {word}{did_you_mean(word, self._option_string_actions)}")
 
-    def shorten_usage(self) -> None:
-        """Leave out of the usage line what need not be given: the help lists all options."""
-        words = [self.prog, "[OPTION ...]"]
-        for action in self._actions:
-            if action.required or not action.option_strings:
-                dots = " ..." if action.nargs in ("*", "+") else ""
-                words += [*action.option_strings[:1], f"{action.metavar}{dots}"]
-        self.usage = self.usage or " ".join(words)
-
 
 def _run(argv: Sequence[str]) -> int:
     command = next((word for word in argv if not word.startswith("-")), None)
@@ -167,11 +156,11 @@ def _run(argv: Sequence[str]) -> int:
         description="Extrinsic calibration of two sensors on one rigid body from their motion.",
         epilog=_EPILOG,
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    parser.add_argument("--version", action="store_true", help="show the version and exit")
     if command is not None and command not in COMMANDS:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=bool(argv))
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     module: Any = None
     of_command = parser
     for name, summary in COMMANDS.items():
@@ -179,27 +168,21 @@ def _run(argv: Sequence[str]) -> int:
         if name == command or _COMPLETING in os.environ:
             module, of_command = module_of(name), added
             module.add_arguments(added)
-            added.shorten_usage()
     if _COMPLETING in os.environ:
         with contextlib.suppress(ModuleNotFoundError):
             import argcomplete
 
             argcomplete.autocomplete(parser)  # tells the shell, and ends the process
     arguments, rest = parser.parse_known_args(argv)
-    if command is None:
-        parser.print_help()
-        return 0
     if rest and command != "calibrator":
         of_command.refuse(rest)
-    arguments.passed_on, arguments.typed = rest, list(argv)
-    return module.run(arguments)
-
-
-class _Version(argparse.Action):
-    """Look the version up only if it is asked for: that takes time."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+    if arguments.version:
         from hand_eye_calib.version import package_version
 
         print(f"hand_eye_calib {package_version()}")
-        parser.exit()
+    elif command is None:
+        parser.print_help()
+    else:
+        arguments.passed_on, arguments.typed = rest, list(argv)
+        return module.run(arguments)
+    return 0

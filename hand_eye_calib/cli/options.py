@@ -9,10 +9,11 @@ import contextlib
 import dataclasses
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from hand_eye_calib.cli.console import OPTION_FIELDS, flag, note
+from hand_eye_calib.cli.console import OPTION_FIELDS, STREAMS, flag, note
 from hand_eye_calib.config import (
     STAMP_UNITS,
     TRAJECTORY_FORMATS,
@@ -23,20 +24,16 @@ from hand_eye_calib.config import (
     option_name,
 )
 from hand_eye_calib.errors import ConfigError
-
-if TYPE_CHECKING:
-    from hand_eye_calib.io.transforms import TfSource
+from hand_eye_calib.text import split_frames
 
 Options = dict[str, Any]
 
-STREAMS = ("parent", "child")
-
 _NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(NodeConfig)}
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
-_NODES = ("calibrator", "**", "*", "ros__parameters")
+_NODES = ("calibrator", "**", "*", "")
+_OF_ROS = "ros__parameters"
 _DEST = "option "
-_PRIOR = "prior."
-_AXES = ", ".join(name.removeprefix(_PRIOR) for name in OPTION_FIELDS if _PRIOR in name)
+_AXES = ", ".join(name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name)
 
 # What most people set: the help has these options first.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
@@ -98,14 +95,27 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     # argparse takes -1e-3, -90deg+-2deg and the like for options otherwise.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
-    for name in _COMMON:
-        _add_option(group, name)
+    rare = parser.add_argument_group("calibration options that are rarely needed")
+    for name in [*_COMMON, *(name for name in OPTION_FIELDS if name not in _COMMON)]:
+        field = OPTION_FIELDS[name]
+        meta = field.metadata
+        unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+        default = "" if field.default == "" else f" Default: {field.default}."
+        value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
+        (group if name in _COMMON else rare).add_argument(
+            f"--{flag(name)}",
+            dest=_DEST + name,
+            default=argparse.SUPPRESS,
+            type=argument_type(partial(_value, field), f"{name} "),
+            metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
+            help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
+        )
     group.add_argument(
         "--prior",
         metavar="AXIS=VALUE+-SIGMA",
         action="append",
         type=_prior_argument,
-        default=argparse.SUPPRESS,
+        default=[],
         help="what is known of an axis beforehand, such as z=1.85+-0.02 (m) or yaw=-90deg+-2deg; "
         f"AXIS is one of {_AXES}; may be repeated",
     )
@@ -115,34 +125,15 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="YAML file with these options by name, or a ROS parameter file",
     )
-    rare = parser.add_argument_group("calibration options that are rarely needed")
-    for name in OPTION_FIELDS:
-        if name not in _COMMON:
-            _add_option(rare, name)
-
-
-def _add_option(group: argparse._ArgumentGroup, name: str) -> None:
-    field = OPTION_FIELDS[name]
-    meta = field.metadata
-    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-    default = "" if field.default == "" else f" Default: {field.default}."
-    value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
-    group.add_argument(
-        f"--{flag(name)}",
-        dest=_DEST + name,
-        default=argparse.SUPPRESS,
-        type=argument_type(lambda text: _value(field, text), f"{name} "),
-        metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
-        help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
-    )
 
 
 @argument_type
 def _prior_argument(text: str) -> tuple[str, Any]:
     axis, equals, value = text.partition("=")
-    if not equals or _PRIOR + axis not in OPTION_FIELDS:
+    name = f"prior.{axis}"
+    if not equals or name not in OPTION_FIELDS:
         raise ConfigError(f"expected AXIS=VALUE+-SIGMA with AXIS one of {_AXES}; got {text!r}")
-    return _PRIOR + axis, check_value(OPTION_FIELDS[_PRIOR + axis], value)
+    return name, check_value(OPTION_FIELDS[name], value)
 
 
 def _value(field: dataclasses.Field[Any], value: Any) -> Any:
@@ -165,12 +156,9 @@ def options_from(arguments: argparse.Namespace) -> Options:
         If the file cannot be read.
     """
     options = _read_config(arguments.config) if arguments.config else {}
-    options |= dict(getattr(arguments, "prior", ()))
-    return options | {
-        name.removeprefix(_DEST): value
-        for name, value in vars(arguments).items()
-        if name.startswith(_DEST)
-    }
+    typed = {name: value for name, value in vars(arguments).items() if name.startswith(_DEST)}
+    typed = {name.removeprefix(_DEST): value for name, value in typed.items()}
+    return options | dict(arguments.prior) | typed
 
 
 def config_from(arguments: argparse.Namespace) -> CalibratorConfig:
@@ -178,69 +166,51 @@ def config_from(arguments: argparse.Namespace) -> CalibratorConfig:
     return CalibratorConfig.from_options(options_from(arguments))
 
 
-# ------------------------------------------------------ the configuration file
-
-
 def _read_config(path: Path) -> Options:
+    """Options of a file: plain names and values, or what a ROS parameter file has for the node."""
     from hand_eye_calib.io.yaml_files import read_yaml
 
     document = read_yaml(path)
-    if document is None:
-        return {}
-    if not isinstance(document, dict):
-        raise ConfigError(
-            f"{path}: expected a mapping of options to values; found {type(document).__name__}"
-        )
-    options, ignored = {}, []
-    for name, value in _flatten(_parameters(path, document)).items():
-        if name in OPTION_FIELDS:
+    if not isinstance(document, dict | None):
+        found = type(document).__name__
+        raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
+    options, ignored, of_others = {}, [], []
+    for name, value in _flat(document or {}):
+        node, is_of_ros, option = name.rpartition(f"{_OF_ROS}.")
+        if is_of_ros and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
+            of_others.append(f"/{node.strip('/.')}")
+        elif option in OPTION_FIELDS:
             try:
-                options[name] = _value(OPTION_FIELDS[name], value)
+                options[option] = _value(OPTION_FIELDS[option], value)
             except ConfigError as error:
                 # In quotes it keeps the spelling of the file.
-                text = str(error).replace(name, repr(name), 1)
+                text = str(error).replace(option, repr(option), 1)
                 raise ConfigError(f"{path}: {text}") from None
-        elif name in _NODE_OPTIONS or name.partition(".")[0] in _ROS_OPTIONS:
-            ignored.append(repr(name))
-        else:
+        elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
+            ignored.append(repr(option))
+        elif value is not None or not option.endswith(_OF_ROS):
             known = sorted(OPTION_FIELDS)
             raise ConfigError(
-                f"{path}: unknown option {name!r}{did_you_mean(name, known)}; "
+                f"{path}: unknown option {option!r}{did_you_mean(option, known)}; "
                 f"known are {', '.join(map(repr, known))}"
             )
+    if of_others and not (options or ignored):
+        found = ", ".join(dict.fromkeys(of_others))
+        raise ConfigError(
+            f"{path}: no parameters for a node named calibrator; found some for {found}"
+        )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")
     return options
 
 
-def _parameters(path: Path, document: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Of a ROS parameter file what is meant for the node ``calibrator``, of any other file all."""
-    key, ending = "ros__parameters", ".ros__parameters"
-    flat = _flatten(document, until=key)
-    sections = {name.removesuffix(ending): each for name, each in flat.items() if key in name}
-    for node, each in sections.items():
-        if not isinstance(each, dict | None):
-            raise ConfigError(f"{path}: {node}: {key} must be a mapping of names to values")
-    if not sections:
-        return document
-    ours = [each or {} for node, each in sections.items() if re.split("[./]", node)[-1] in _NODES]
-    if not ours:
-        found = ", ".join(f"/{node.strip('/').replace('.', '/')}" for node in sections)
-        raise ConfigError(
-            f"{path}: no parameters for a node named calibrator; found some for {found}"
-        )
-    return {name: value for each in ours for name, value in _flatten(each).items()}
-
-
-def _flatten(mapping: Mapping[str, Any], prefix: str = "", until: str = "") -> Options:
-    """Nested mappings to dotted names, but for what lies below the name ``until``."""
-    flat: Options = {}
+def _flat(mapping: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Nested mappings as dotted names and values."""
+    found = []
     for name, value in mapping.items():
-        if isinstance(value, dict) and name != until:
-            flat |= _flatten(value, f"{prefix}{name}.", until)
-        else:
-            flat[f"{prefix}{name}"] = value
-    return flat
+        is_nested = isinstance(value, dict)
+        found += _flat(value, f"{prefix}{name}.") if is_nested else [(f"{prefix}{name}", value)]
+    return found
 
 
 # -------------------------------------------------- what is read, what is written
@@ -264,13 +234,12 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         source.add_argument(
             f"--{stream}-tf",
             metavar="WORLD:SENSOR",
-            type=_tf_source,
+            type=argument_type(lambda text: ":".join(split_frames(text))),
             help="the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar",
         )
         parser.add_argument(
             f"--{stream}-fields",
             metavar="NAME=PATH,...",
-            default="",
             help=f"where the poses are in messages of any type on --{stream}-topic: "
             "t=header.stamp,x=pose.position.x,...",
         )
@@ -282,6 +251,19 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         for stream in STREAMS:
             of_one = settings | {"help": f"the same for {stream.upper()} only"}
             group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **of_one)
+
+
+def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
+    """Topic or frames, WORLD:SENSOR, of "parent" and "child", if they are given."""
+    found = {}
+    for stream in STREAMS:
+        topic, tf, fields = (
+            getattr(arguments, f"{stream}_{kind}") for kind in ("topic", "tf", "fields")
+        )
+        if fields and not topic:
+            raise ConfigError(f"--{stream}-fields is of messages: give --{stream}-topic, too")
+        found[stream] = f"{topic}?{fields}" if fields else topic or tf
+    return {stream: source for stream, source in found.items() if source}
 
 
 def _label(text: str) -> tuple[str, str]:
@@ -331,10 +313,3 @@ def add_verbose_argument(parser: argparse._ActionsContainer) -> None:
 def _path(text: str) -> Path | str:
     """A path; a URL stays as it is, for a path has no two slashes in a row."""
     return text if "://" in text else Path(text)
-
-
-@argument_type
-def _tf_source(text: str) -> "TfSource":
-    from hand_eye_calib.io.transforms import TfSource
-
-    return TfSource.parse(text)

@@ -52,7 +52,8 @@ def deliver(
     calibration: Calibration,
     arguments: argparse.Namespace,
     inputs: dict[str, Any],
-    snapshot: "Snapshot | None",
+    snapshot: "Snapshot | None" = None,
+    bag: Path | None = None,
 ) -> int:
     """Print a calibration, save it if ``--out`` asks for that, and return the exit code.
 
@@ -63,11 +64,13 @@ def deliver(
         With ``json``, ``out``, ``verbose``, ``installed`` and ``base_frame``.
     inputs : dict
         Where the data came from, in plain values; it is saved, too.
-    snapshot : Snapshot or None
-        The poses and options that gave it. With them, ``--out`` also writes the report. None for
-        stops.
+    snapshot : Snapshot, optional
+        The poses and options that gave it. With them, ``--out`` also writes the report.
+    bag : path-like, optional
+        The bag that it is from, whose transforms may have the base frame.
     """
-    calibration = _with_robot(calibration, arguments)
+    if not calibration.status.failure:
+        calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
 
@@ -96,27 +99,30 @@ def deliver(
     )
 
 
-def _with_robot(calibration: Calibration, arguments: argparse.Namespace) -> Calibration:
+def _with_robot(
+    calibration: Calibration, arguments: argparse.Namespace, bag: Path | None
+) -> Calibration:
     """The result with its comparison with what is installed, and its pose in the base frame, if
     they were asked for.
     """
     installed, base = arguments.installed, arguments.base_frame
-    if calibration.status.failure or not (installed or base):
-        return calibration
-    from hand_eye_calib.io.installed import frames_of_bag, read_installed
-    from hand_eye_calib.io.urdf import read_urdf
-    from hand_eye_calib.session.compare import with_comparison
-
     if installed:
+        from hand_eye_calib.io.installed import read_installed
+        from hand_eye_calib.session.compare import with_comparison
+
         frames = calibration.parent_frame, calibration.child_frame
         with waiting_for(f"reading {installed}"):
             calibration = with_comparison(calibration, read_installed(installed, *frames))
     if not base:
         return calibration
     if installed and Path(installed).suffix == ".urdf":
+        from hand_eye_calib.io.urdf import read_urdf
+
         tree = read_urdf(Path(installed))
-    elif getattr(arguments, "is_of_bags", False):
-        tree = frames_of_bag(arguments.paths[0])
+    elif bag:
+        from hand_eye_calib.io.installed import frames_of_bag
+
+        tree = frames_of_bag(bag)
     else:
         raise ConfigError("--base-frame needs --installed ROBOT.urdf: a description with the frame")
     T_base_parent = tree.pose(base, calibration.parent_frame)
@@ -133,22 +139,11 @@ def show(
     errors: Iterable[str] = (),
     code: int = 0,
 ) -> int:
-    """Show what a command found, in the order of all commands; returns ``code``.
+    """Show what a command found, in the order of all commands; returns the exit code.
 
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        With ``json`` and ``out``.
-    document, text : callable
-        What ``--json`` prints, and what is printed otherwise.
-    save : callable, optional
-        Writes the files of ``--out``, before anything is printed; returns the most important one.
-    finish : callable, optional
-        Writes what takes longer, or may fail, after that.
-    errors : iterable of str
-        Lines for stderr, at the end.
-    code : int
-        The exit code.
+    For ``--out``, ``save`` writes the files, and returns the most important one, before anything
+    is printed. After that ``finish`` writes what takes longer, or may fail. The errors are lines
+    for stderr, at the end.
     """
     if arguments.out and save is not None:
         note(f"wrote {save()}")

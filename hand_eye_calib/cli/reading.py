@@ -11,8 +11,8 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import flag, note, waiting_for, with_progress
-from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, options_from
+from hand_eye_calib.cli.console import STREAMS, flag, note, waiting_for, with_progress
+from hand_eye_calib.cli.options import FILE_OPTIONS
 from hand_eye_calib.cli.parts import refuse_recordings
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -26,10 +26,9 @@ from hand_eye_calib.text import names_of_files
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.bags import PoseBag, PoseBlock
+    from hand_eye_calib.io.bags.topics import Source
 
 _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
-# The options of a file as the messages of its reader name them.
-_FILE_OPTION = re.compile("`(format|columns|times|stamp_unit)`")
 
 
 @dataclass
@@ -85,7 +84,11 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     ConfigError
         If some are bags and others are not, or a file stands alone.
     """
-    bags = [path for path in paths if _is_bag(path)]
+    bags = [
+        path
+        for path in paths
+        if isinstance(path, str) or path.suffix in _BAG_SUFFIXES or path.is_dir()
+    ]
     if len(bags) == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
         return True
     if bags:
@@ -100,26 +103,9 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     return False
 
 
-def _is_bag(path: Path | str) -> bool:
-    return isinstance(path, str) or path.suffix in _BAG_SUFFIXES or path.is_dir()
-
-
-def read_recording(arguments: Namespace) -> Recording:
-    """The recording that the arguments name; ``is_of_bags`` says what they are.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If it cannot be read, or something does not go together.
-    """
-    if not arguments.is_of_bags:
-        return _read_pair(arguments)
-    return read_paths(arguments.paths, sources_from(arguments), options_from(arguments))
-
-
 def read_paths(
     paths: Sequence[Path | str],
-    sources: Mapping[str, Any],
+    sources: Mapping[str, str],
     options: Mapping[str, Any],
     are_files: bool = False,
 ) -> Recording:
@@ -131,15 +117,11 @@ def read_paths(
         If it cannot be read, or something does not go together.
     """
     if are_files:
-        settings = [
-            {"format": "auto", "measures": options.get(f"{stream}_measures", "auto")}
-            for stream in STREAMS
-        ]
-        return _recording(paths, *_read(list(map(Path, paths)), settings, ["", ""]), options)
+        return read_pair(paths, [{"format": "auto"}] * 2, options)
     journal = journal_in(paths)
     if journal is None:
         return read_bags(paths, sources, CalibratorConfig.from_options(dict(options)))
-    if any(sources.values()):
+    if sources:
         raise ConfigError(
             f"{journal} is the journal of a session, which has two streams; it cannot be combined "
             "with topics or frames"
@@ -147,58 +129,75 @@ def read_paths(
     return read_journal_of(journal, options)
 
 
-def sources_from(arguments: Namespace) -> dict[str, Any]:
-    """Topic or frames of "parent" and "child"; None for what is not given."""
-    for stream in STREAMS:
-        if fields := getattr(arguments, f"{stream}_fields"):
-            if not (topic := getattr(arguments, f"{stream}_topic")):
-                raise ConfigError(f"--{stream}-fields is of messages: give --{stream}-topic, too")
-            setattr(arguments, f"{stream}_topic", f"{topic}?{fields}")
-            setattr(arguments, f"{stream}_fields", "")
-    return {
-        stream: getattr(arguments, f"{stream}_topic") or getattr(arguments, f"{stream}_tf")
-        for stream in STREAMS
-    }
-
-
 # ----------------------------------------------------------------------- files
 
 
-def _read_pair(arguments: Namespace) -> Recording:
-    trajectories, repairs = read_files(arguments)
-    times = (arguments.times, arguments.parent_times, arguments.child_times)
-    options = options_from(arguments)
-    found = _recording(arguments.paths, [*trajectories.values()], repairs, options)
-    found.files += filter(None, times)
-    return found
-
-
-def _recording(
+def read_pair(
     paths: Sequence[Path | str],
-    trajectories: Sequence[Trajectory],
-    repairs: Sequence[str],
+    settings: Sequence[Mapping[str, Any]],
     options: Mapping[str, Any],
 ) -> Recording:
-    """The recording of the trajectories of two files."""
+    """The recording of the trajectory files of parent and child, with how each is read.
+
+    Raises
+    ------
+    HandEyeCalibError
+        If a file cannot be read.
+    """
+    (parent, child), repairs = read_files(paths, settings, options)
     for text in repairs:
         note(text)
-    parent, child = trajectories
-    config = offline_config(parent, child, options)
     inputs: dict[str, Any] = {}
-    for path, stream, poses in zip(paths, STREAMS, trajectories, strict=True):
+    for path, stream, poses in zip(paths, STREAMS, (parent, child), strict=True):
         first_ns, last_ns = poses.stamps_ns[[0, -1]].tolist()
         inputs[stream] = {"file": str(path), "poses": len(poses)}
         inputs[stream] |= {"first_stamp_ns": first_ns, "last_stamp_ns": last_ns}
-    return Recording(whole_snapshot(config, parent, child), inputs, [*map(Path, paths)])
+    files = [*map(Path, paths), *(each["times"] for each in settings if each.get("times"))]
+    snapshot = whole_snapshot(offline_config(parent, child, options), parent, child)
+    return Recording(snapshot, inputs, files)
 
 
-def read_files(arguments: Namespace) -> tuple[dict[str, Trajectory], list[str]]:
-    """Read the trajectories of parent and child as the arguments say; a note says what was guessed.
+def file_settings(arguments: Namespace) -> list[dict[str, Any]]:
+    """How each of the files is read: of two, its own options before those for both.
+
+    Raises
+    ------
+    ConfigError
+        If an option is of one of two files, and there are more.
+    """
+    if len(arguments.paths) == 2:
+        return [
+            {
+                name: getattr(arguments, f"{stream}_{name}") or getattr(arguments, name)
+                for name in FILE_OPTIONS
+            }
+            for stream in STREAMS
+        ]
+    for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):
+        if getattr(arguments, name):
+            raise ConfigError(f"--{flag(name)} is of two files; give the option for all of a rig's")
+    return [{name: getattr(arguments, name) for name in FILE_OPTIONS}] * len(arguments.paths)
+
+
+def read_files(
+    paths: Sequence[Path | str],
+    settings: Sequence[Mapping[str, Any]],
+    options: Mapping[str, Any],
+) -> tuple[list[Trajectory], list[str]]:
+    """Read trajectory files; a note says what was guessed.
+
+    Parameters
+    ----------
+    paths : list of path-like
+    settings : list of mapping
+        How each file is read, see :func:`file_settings`.
+    options : mapping
+        What the sensors measure, if that is set.
 
     Returns
     -------
-    trajectories : dict
-        "parent" and "child" to Trajectory.
+    trajectories : list of Trajectory
+        With a sensor frame that is named like the file, if the file names none.
     repairs : list of str
         What was wrong with the stamps.
 
@@ -207,117 +206,42 @@ def read_files(arguments: Namespace) -> tuple[dict[str, Trajectory], list[str]]:
     HandEyeCalibError
         If a file cannot be read.
     """
-    options = options_from(arguments)
-    settings = [
-        _settings_of(arguments, index) | {"measures": options.get(f"{stream}_measures", "auto")}
-        for index, stream in enumerate(STREAMS)
-    ]
-    trajectories, repairs = _read(arguments.paths, settings, [f"{each}_" for each in STREAMS])
-    names = names_of_files([Path(path) for path in arguments.paths])
-    named = [
-        dataclasses.replace(each, sensor_frame=each.sensor_frame or name)
-        for each, name in zip(trajectories, names, strict=True)
-    ]
-    return dict(zip(STREAMS, named, strict=True)), repairs
-
-
-def read_rig_files(arguments: Namespace) -> dict[str, Trajectory]:
-    """The trajectories of three files or more by the names of their frames, or of the files.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If a file cannot be read, or an option is of two files.
-    """
-    for stream in STREAMS:
-        for name in FILE_OPTIONS:
-            if getattr(arguments, f"{stream}_{name}"):
-                raise ConfigError(
-                    f"--{stream}-{flag(name)} is of two files; give the option for all of a rig's "
-                    "files"
-                )
-    settings = {name: getattr(arguments, name) for name in FILE_OPTIONS}
-    settings["format"] = settings["format"] or "auto"
-    count = len(arguments.paths)
-    trajectories, repairs = _read(arguments.paths, [settings] * count, [""] * count)
-    for text in repairs:
-        note(text)
-    found: dict[str, Trajectory] = {}
-    for path, trajectory in zip(arguments.paths, trajectories, strict=True):
-        add_sensor(found, trajectory.sensor_frame or Path(path).stem, trajectory)
-    return found
-
-
-def add_sensor(found: dict[str, Trajectory], name: str, trajectory: Trajectory) -> None:
-    """Add the trajectory of a sensor by its name, which no other one has.
-
-    Raises
-    ------
-    ConfigError
-        If another one has it.
-    """
-    if name in found:
-        raise ConfigError(
-            f"two trajectories of the rig are of one sensor, {name!r}: sensors have the names of "
-            "their frames or files, which must differ"
-        )
-    found[name] = trajectory
-
-
-def _read(
-    paths: Sequence[Path], settings: Sequence[Mapping[str, Any]], prefixes: Sequence[str]
-) -> tuple[list[Trajectory], list[str]]:
-    """Trajectories of files, and what was wrong with their stamps; guesses become notes, in which
-    the options of a file have a prefix.
-    """
     from hand_eye_calib.io.trajectory_files import FileOptions, read_trajectory_files
 
-    options = [FileOptions(**each, repair=True) for each in settings]
-    files = list(zip(paths, options, strict=True))
+    is_pair = len(paths) == 2
+    streams = STREAMS if is_pair else [""] * len(paths)
+    files = []
+    for path, stream, given in zip(paths, streams, settings, strict=True):
+        measures = options.get(f"{stream}_measures", "auto")
+        of_file = {name: value for name, value in given.items() if value} | {"measures": measures}
+        files.append((Path(path), FileOptions(**of_file, repair=True)))
     with waiting_for(f"reading {' and '.join(map(str, paths))}"):
         readings = read_trajectory_files(files)
-    for reading, prefix in zip(readings, prefixes, strict=True):
+    for reading, stream in zip(readings, streams, strict=True):
         for text in reading.guesses:
-            note(_FILE_OPTION.sub(rf"`{prefix}\1`", text))
-    repairs = [text for reading in readings for text in reading.repairs]
-    return [reading.trajectory for reading in readings], repairs
-
-
-def _settings_of(arguments: Namespace, index: int) -> dict[str, Any]:
-    """How to read the parent's (0) or the child's (1) file: its own options before those for both.
-
-    Of those for both, columns are meant for the files that do not name their own, and times for
-    those of format kitti.
-    """
-    given = {name: _given(arguments, index, name) for name in FILE_OPTIONS}
-    for name in ("columns", "times"):
-        is_own = getattr(arguments, f"{STREAMS[index]}_{name}")
-        if given[name] and not is_own and not _is_meant(arguments, index, name):
-            given[name] = None if _is_meant(arguments, 1 - index, name) else given[name]
-    return given | {"format": given["format"] or "auto"}
-
-
-def _given(arguments: Namespace, index: int, name: str) -> Any:
-    """An option of one file, or the one for both."""
-    return getattr(arguments, f"{STREAMS[index]}_{name}") or getattr(arguments, name)
-
-
-def _is_meant(arguments: Namespace, index: int, name: str) -> bool:
-    """Whether ``--columns`` or ``--times`` for both files fits one of them."""
-    from hand_eye_calib.io.trajectory_files import layout_of_file
-
-    found = layout_of_file(arguments.paths[index])
-    given = _given(arguments, index, "format")
-    if name == "times":
-        return bool((given or found.format) == "kitti")
-    return (given or found.format) == "csv" or not (given or found.is_named)
+            of_one = rf"`{stream}_\1`" if is_pair else r"`\1`"
+            note(re.sub(f"`({'|'.join(FILE_OPTIONS)})`", of_one, text))
+    as_paths = [Path(path) for path in paths]
+    names = names_of_files(as_paths) if is_pair else [path.stem for path in as_paths]
+    trajectories = [
+        dataclasses.replace(each.trajectory, sensor_frame=each.trajectory.sensor_frame or name)
+        for each, name in zip(readings, names, strict=True)
+    ]
+    return trajectories, [text for reading in readings for text in reading.repairs]
 
 
 # ------------------------------------------------------------ bags and journals
 
 
+def source_of(text: str) -> "Source":
+    """The topic, or the frames, that a text names."""
+    from hand_eye_calib.io.transforms import TfSource
+
+    return TfSource.parse(text) if ":" in text.partition("?")[0] else text
+
+
 def read_bags(
-    paths: Sequence[Path | str], wanted: Mapping[str, Any], config: CalibratorConfig
+    paths: Sequence[Path | str], wanted: Mapping[str, str], config: CalibratorConfig
 ) -> Recording:
     """Read one bag, or the parts of one recording.
 
@@ -326,7 +250,7 @@ def read_bags(
     paths : list of path-like
         Parts of one recording; see :func:`refuse_recordings`.
     wanted : mapping
-        "parent" and "child" to a topic or a TfSource; to None if the bag leaves no choice.
+        "parent" and "child" to a topic or WORLD:SENSOR, unless the bag leaves no choice.
     config : CalibratorConfig
 
     Raises
@@ -337,14 +261,13 @@ def read_bags(
     from hand_eye_calib.io.bags import PoseBag
 
     with PoseBag(*paths) as bag:
-        parent, child = bag.topics.select(wanted["parent"], wanted["child"])
-        sources = {"parent": parent, "child": child}
-        if not all(wanted.values()):
+        sources, measures = select(bag, wanted, config)
+        parent, child = sources.values()
+        if len(wanted) < len(STREAMS):
             note(
                 f"parent is {parent}, child is {child}; to change that, give --parent-topic and "
                 "--child-topic"
             )
-        measures = measures_of(bag, sources, config)
         of_streams: dict[str, Any] = {f"{stream}_measures": measures[stream] for stream in STREAMS}
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
         bag.shown = with_progress
@@ -360,7 +283,7 @@ def read_bags(
                 calibrator.set_frame(stream, str(source).strip("/"))
         with waiting_for("comparing the bags"):
             kinds = {source: measures[stream] for stream, source in sources.items()}
-            refuse_recordings(bag, kinds, config.max_gap)
+            refuse_recordings(bag.paths, kinds, config.max_gap)
         warnings = list(bag.warnings)
         files = bag.files()
     if expected is not None and found != expected:
@@ -374,11 +297,14 @@ def read_bags(
     return Recording(calibrator.snapshot(), inputs, files, tuple(warnings))
 
 
-def measures_of(
-    bag: "PoseBag", sources: Mapping[str, Any], config: CalibratorConfig
-) -> dict[str, str]:
-    """What the messages of each stream measure, unless an option says that."""
-    return {
+def select(
+    bag: "PoseBag", wanted: Mapping[str, str], config: CalibratorConfig
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The sources of "parent" and "child" in a bag, and what each measures."""
+    given = {stream: source_of(text) for stream, text in wanted.items()}
+    chosen = bag.topics.select(given.get("parent"), given.get("child"))
+    sources = dict(zip(STREAMS, chosen, strict=True))
+    return sources, {
         stream: bag.measured(source, getattr(config, f"{stream}_measures"))
         for stream, source in sources.items()
     }

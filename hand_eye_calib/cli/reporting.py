@@ -7,7 +7,6 @@ import pickle
 import shlex
 import sys
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +16,10 @@ from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
-    from hand_eye_calib.geometry.trajectory import Trajectory
     from hand_eye_calib.live.processes import SessionResult
+    from hand_eye_calib.rig.result import RigCalibration
 
-REPORT, CHECK = "report.html", "check.html"
+REPORT = "report.html"
 _OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 # Frame of a child sensor that names none: in a rig it has the name of its input.
 _NAMELESS = "child_sensor"
@@ -62,25 +61,25 @@ def rendered(calibration: Calibration, snapshot: "Snapshot", inputs: Mapping[str
 
 def write_report(directory: Path, *of: Any) -> None:
     """Write the report of a calibration; the arguments are those of :func:`rendered`."""
-    write_page(Path(directory) / REPORT, rendered, *of)
+    write_page(directory / REPORT, lambda: rendered(*of))
 
 
-def write_page(path: Path, render: str | Callable[..., str], *arguments: Any) -> None:
-    """Write the page that a function returns, or one of the package ``report`` by its name, such as
-    ``rig_page.render_rig``; if a library for it is missing, say so and go on.
+def write_rig_report(directory: Path, rig: "RigCalibration", names: Any) -> None:
+    """Write the report of a rig, whose sensors have these files, topics or frames."""
 
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
+    def render() -> str:
+        from hand_eye_calib.report.rig_page import render_rig
+
+        return render_rig(rig, names)
+
+    write_page(directory / REPORT, render)
+
+
+def write_page(path: Path, render: Callable[[], str]) -> None:
+    """Write a page; if a library for it is missing, say so and go on."""
     if can_draw(path.name):
         with waiting_for(f"writing {path.name}"):
-            made: Any = render
-            if isinstance(render, str):
-                module, _, name = render.partition(".")
-                made = getattr(import_module(f"hand_eye_calib.report.{module}"), name)
-            save_text(path, made(*arguments))
+            save_text(path, render())
         note(f"wrote {path}")
 
 
@@ -97,25 +96,12 @@ def can_draw(file_name: str) -> bool:
     return True
 
 
-def save_text(path: Path, text: str | bytes) -> None:
-    """Write a file in one step, into a directory that is made if it is missing.
-
-    A link at that path is replaced, not followed.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
+def save_text(path: Path, text: str) -> None:
+    """Write a file in one step, into a directory that is made if it is missing."""
     from hand_eye_calib.io.files import write_atomically
 
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically({path: text})
-    except OSError as error:
-        raise InputError(
-            f"cannot write {error.filename or path}: {error.strerror}; choose another directory"
-        ) from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically({path: text})
 
 
 # ----------------------------------------------------------- a session's pages
@@ -141,7 +127,7 @@ def write_session() -> None:
             # The file and the report beside it say the same.
             save_result(found.calibration, directory, result.inputs)
             write_report(directory, found.calibration, result.snapshot, result.inputs)
-    except HandEyeCalibError as error:
+    except (HandEyeCalibError, OSError) as error:
         sys.exit(fail(error, 1))
 
 
@@ -149,29 +135,12 @@ def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
     """Solve for all sensors of a session together, and write the files and the page; returns the
     results of the further child sensors.
 
-    Raises
-    ------
-    HandEyeCalibError
-        If they cannot be solved together, or nothing can be written.
+    A time offset and a scale in numbers are the child's, which has them; the others have none.
     """
     from hand_eye_calib.io.results import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
-    rig = solve_rig(*_rig_of(result))
-    inputs = {**result.inputs, "sensors": list(rig.sensors)}
-    save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
-    write_page(directory / REPORT, "rig_page.render_rig", rig, rig.sensors)
-    return [*rig.calibrations[1:]]
-
-
-def _rig_of(result: "SessionResult") -> "tuple[dict[str, Trajectory], dict[str, Any]]":
-    """The trajectories of all sensors by their frames, and the options to solve them with.
-
-    A time offset and a scale in numbers are the child's, which has them; the others have none.
-    """
-    snapshot = result.snapshot
-    parent, child = snapshot.streams
-    config, options = snapshot.config, snapshot.config.to_options()
+    config, (parent, child) = result.snapshot.config, result.snapshot.streams
     of_all = ["method", "max_gap", "target.translation", "target.rotation"]
     if isinstance(config.time_offset, str):
         of_all.append("time_offset")
@@ -181,10 +150,15 @@ def _rig_of(result: "SessionResult") -> "tuple[dict[str, Trajectory], dict[str, 
         of_all.append("scale")
     else:
         child = child.scaled(config.scale)
-    found = {snapshot.parent_frame: parent, snapshot.child_frame: child}
+    sensors = {result.snapshot.parent_frame: parent, result.snapshot.child_frame: child}
     for name, other in result.others.items():
         if other.config.child_measures not in ("auto", "poses"):
             raise InputError(f"{name} has {other.config.child_measures}: a rig takes poses")
         frame = other.child_frame
-        found[name if frame in found or frame == _NAMELESS else frame] = other.streams[1]
-    return found, {name: options[name] for name in of_all}
+        sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]
+    options = config.to_options()
+    rig = solve_rig(sensors, {name: options[name] for name in of_all})
+    inputs = {**result.inputs, "sensors": list(rig.sensors)}
+    save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
+    write_rig_report(directory, rig, rig.sensors)
+    return [*rig.calibrations[1:]]

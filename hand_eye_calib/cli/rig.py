@@ -1,15 +1,16 @@
 """A rig of three sensors or more: calibrated, printed and saved."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.parts import refuse_recordings
 from hand_eye_calib.cli.present import exit_code, show, transform_lines, wrapped
-from hand_eye_calib.cli.reading import add_sensor, read_rig_files
-from hand_eye_calib.cli.reporting import REPORT, write_page
+from hand_eye_calib.cli.reading import file_settings, read_files, source_of
+from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError, printable
 
 if TYPE_CHECKING:
@@ -20,8 +21,10 @@ if TYPE_CHECKING:
 
 def calibrate_files(arguments: argparse.Namespace) -> int:
     """Calibrate a rig from a trajectory file of each sensor; returns the exit code."""
-    inputs = {"files": [str(path) for path in arguments.paths]}
-    return _calibrate(read_rig_files(arguments), arguments, inputs)
+    trajectories, repairs = read_files(arguments.paths, file_settings(arguments), {})
+    for text in repairs:
+        note(text)
+    return _calibrate(trajectories, arguments, {"files": [*map(str, arguments.paths)]})
 
 
 def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
@@ -31,47 +34,51 @@ def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """
     from hand_eye_calib.io.bags import PoseBag, trajectory_of
     from hand_eye_calib.io.results import fingerprint
-    from hand_eye_calib.io.transforms import TfSource
 
-    found: dict[str, Trajectory] = {}
+    trajectories = []
     with PoseBag(*arguments.paths) as bag:
         for topic in arguments.topics:
-            source = TfSource.parse(topic) if ":" in topic else topic
+            source = source_of(topic)
             with waiting_for(f"reading {topic}"):
                 trajectory, notes = trajectory_of(bag, source)
-            refuse_recordings(bag, {source: "auto"})
+            refuse_recordings(bag.paths, {source: "auto"})
             for text in notes:
                 note(text)
-            add_sensor(found, trajectory.sensor_frame or topic, trajectory)
+            frame = trajectory.sensor_frame or topic
+            trajectories.append(replace(trajectory, sensor_frame=frame))
         for text in bag.warnings:
             note(text)
         inputs: dict[str, Any] = {"bag": str(bag), "topics": arguments.topics}
         if arguments.out:
             inputs["files"] = [fingerprint(file) for file in bag.files()]
-    return _calibrate(found, arguments, as_given(inputs))
+    return _calibrate(trajectories, arguments, as_given(inputs))
 
 
 def _calibrate(
-    trajectories: Mapping[str, "Trajectory"], arguments: argparse.Namespace, inputs: dict[str, Any]
+    trajectories: "Sequence[Trajectory]", arguments: argparse.Namespace, inputs: dict[str, Any]
 ) -> int:
     """Calibrate a rig, print it and save it if ``--out`` asks for that; returns the exit code."""
     from hand_eye_calib.io.results import save_rig
     from hand_eye_calib.rig.calibrate import solve_rig
 
-    for name in ("installed", "base_frame"):
-        if getattr(arguments, name):
-            raise ConfigError(f"--{name.replace('_', '-')} is of two sensors, not of a rig")
-    options = options_from(arguments)
-    with waiting_for(f"solving for {len(trajectories)} sensors"):
-        rig = solve_rig(trajectories, options)
-    inputs = {**inputs, "options": dict(options)}
+    if arguments.installed or arguments.base_frame:
+        raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
+    frames = [each.sensor_frame for each in trajectories]
+    if twice := [each for each in frames if frames.count(each) > 1]:
+        raise ConfigError(
+            f"two trajectories of the rig are of one sensor, {twice[0]!r}: sensors have the names "
+            "of their frames or files, which must differ"
+        )
+    sensors = dict(zip(frames, trajectories, strict=True))
+    inputs |= {"options": options_from(arguments)}
+    with waiting_for(f"solving for {len(sensors)} sensors"):
+        rig = solve_rig(sensors, inputs["options"])
 
     def finish() -> None:
         if arguments.out:
             names = inputs.get("topics") or inputs["files"]
-            write_page(arguments.out / REPORT, "rig_page.render_rig", rig, names)
+            write_rig_report(arguments.out, rig, names)
 
-    codes = [exit_code(each) for each in rig.calibrations]
     failed = [each for each in rig.calibrations if each.status.failure]
     return show(
         arguments,
@@ -80,7 +87,7 @@ def _calibrate(
         save=lambda: save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs),
         finish=finish,
         errors=[f"{each.child_frame}: {each.headline}" for each in failed],
-        code=1 if failed else max(codes),
+        code=1 if failed else max(map(exit_code, rig.calibrations)),
     )
 
 

@@ -43,6 +43,7 @@ TUM format:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] --out DIR"
     parser.epilog = _EPILOG
     add = parser.add_argument
     out = "directory to make; it must be empty or not exist"

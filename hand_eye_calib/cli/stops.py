@@ -6,10 +6,9 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.cli.console import note, with_progress
-from hand_eye_calib.cli.options import config_from
-from hand_eye_calib.cli.reading import read_files
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.cli.console import STREAMS, note, with_progress
+from hand_eye_calib.cli.options import config_from, options_from
+from hand_eye_calib.cli.reading import file_settings, read_files
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
@@ -37,8 +36,8 @@ def are_stops(arguments: Namespace) -> bool:
     return is_one or bool(arguments.target) or arguments.order == "none"
 
 
-def solved(arguments: Namespace) -> tuple[Calibration, Namespace, dict[str, Any]]:
-    """The calibration, the arguments, and where the poses came from in plain values.
+def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
+    """The calibration, and where the poses came from in plain values.
 
     Raises
     ------
@@ -50,51 +49,36 @@ def solved(arguments: Namespace) -> tuple[Calibration, Namespace, dict[str, Any]
         path = arguments.paths[0]
         samples = read_arm_samples(path)
         inputs = {"samples": {"file": str(path), "poses": len(samples.robot)}}
-        found = calibrate_arm(samples.robot, samples.tracking, config, samples.frames)
-        return found, arguments, inputs
-    if arguments.target:
-        return _of_images(arguments, config)
-    trajectories, _ = read_files(arguments)
-    parent, child = trajectories.values()
-    if len(parent) != len(child):
+        return calibrate_arm(samples.robot, samples.tracking, config, samples.frames), inputs
+    parent_path, child_path = map(Path, arguments.paths)
+    settings = file_settings(arguments)
+    if not arguments.target:
+        (parent, child), _ = read_files(arguments.paths, settings, options_from(arguments))
+        n_child, what = len(child), "poses"
+    else:
+        from hand_eye_calib.io import target_images
+
+        target = target_images.Target.parse(arguments.target)
+        camera = target_images.read_camera(arguments.camera)
+        (parent,), _ = read_files([parent_path], settings[:1], {})
+        images = target_images.images_in(child_path)
+        n_child, what = len(images), "images"
+    if len(parent) != n_child:
         raise InputError(
-            f"{' and '.join(map(str, arguments.paths))} have {len(parent)} and {len(child)} poses: "
-            "without an order they are paired by their rows; give as many of both"
+            f"{parent_path} has {len(parent)} poses and {child_path} {n_child} {what}: without an "
+            "order they are paired by the rows, and by the names of images; give as many of both"
         )
-    inputs = {
-        stream: {"file": str(path), "poses": len(poses)}
-        for path, (stream, poses) in zip(arguments.paths, trajectories.items(), strict=True)
-    }
-    return calibrate_stops(parent.poses, child.poses, config), arguments, inputs
-
-
-def _of_images(
-    arguments: Namespace, config: CalibratorConfig
-) -> tuple[Calibration, Namespace, dict[str, Any]]:
-    """From the poses of a hand, and an image for each."""
-    from hand_eye_calib.io import target_images
-    from hand_eye_calib.io.trajectory_files import FileOptions, read_trajectory_files
-
-    hand_file, folder = map(Path, arguments.paths)
-    target = target_images.Target.parse(arguments.target)
-    camera = target_images.read_camera(arguments.camera)
-    options = FileOptions(format=arguments.parent_format or arguments.format or "auto", repair=True)
-    hand = read_trajectory_files([(hand_file, options)])[0].trajectory
-    images = target_images.images_in(folder)
-    if len(images) != len(hand):
-        raise InputError(
-            f"{hand_file} has {len(hand)} poses and {folder} {len(images)} images: they are paired "
-            "in the order of the rows and of the names; give as many of both"
+    if not arguments.target:
+        found = calibrate_stops(parent.poses, child.poses, config)
+    else:
+        shown = with_progress(target_images.read_images(images), n_child, "finding the target")
+        seen = target_images.poses_of_target(shown, target, camera)
+        n_child = len(seen.images)
+        note(
+            f"the target is seen in {n_child} of {len(images)} images, its corners to "
+            f"{float((seen.rms_px**2).mean() ** 0.5):.2f} pixels (rms)"
         )
-    shown = with_progress(target_images.read_images(images), len(images), "finding the target")
-    found = target_images.poses_of_target(shown, target, camera)
-    note(
-        f"the target is seen in {len(found.images)} of {len(images)} images, its corners to "
-        f"{float((found.rms_px**2).mean() ** 0.5):.2f} pixels (rms)"
-    )
-    inputs = {
-        "parent": {"file": str(hand_file), "poses": len(hand)},
-        "child": {"file": str(folder), "poses": len(found.images)},
-    }
-    tracking = se3.inverse(found.Ts_target_camera)
-    return calibrate_arm(hand.poses[found.images], tracking, config), arguments, inputs
+        tracking = se3.inverse(seen.Ts_target_camera)
+        found = calibrate_arm(parent.poses[seen.images], tracking, config)
+    counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
+    return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}

@@ -36,6 +36,7 @@ _SURE = {"r": "forgets all poses", "c": "stops watching and calibrates anew"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = EXAMPLES
     parser.add_argument(
         "--node",

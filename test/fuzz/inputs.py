@@ -14,7 +14,7 @@ from pathlib import Path
 from fuzz import text_inputs
 from fuzz.chaos import Chaos
 
-from hand_eye_calib.cli.batch.results import stored
+from hand_eye_calib.cli.batch.run import stored
 from hand_eye_calib.cli.batch.tasks import read_batch
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig

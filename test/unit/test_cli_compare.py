@@ -77,7 +77,7 @@ def test_json_has_it_all(saved, run):
         (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),
         (["first", "--with", "0 0 0 0 1e300 0"], 2, "must be at most 1e+06 rad; got '1e300'"),
         (["first", "--with", "x" * 5000], 2, "xxx..."),
-        (["first", "n" * 256], 1, "n...: File name too long; give a shorter name"),
+        (["first", "n" * 256], 1, "n...: File name too long; choose another"),
     ],
 )
 def test_what_cannot_be_compared_is_one_line(saved, run, words, code, text):

@@ -155,7 +155,7 @@ def test_a_topic_and_frames_together(run, bag, tmp_path):
         (["bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
         (["bag", "--batch", "fleet.yaml"], "--batch cannot be combined with PATH or --list"),
         (["--batch", "fleet.yaml", "bag"], "--batch takes one file, or bags: fleet.yaml is a file"),
-        ([], "the following arguments are required: PATH, or --batch FILE"),
+        ([], "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n"),
     ],
 )
 def test_wrong_usage(run, arguments, message):

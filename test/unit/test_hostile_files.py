@@ -11,7 +11,7 @@ import yaml
 from motions import as_trajectory, child_of, disturbed, wandering_poses, write_pair
 from result_making import calibration
 
-from hand_eye_calib.cli.batch.results import stored
+from hand_eye_calib.cli.batch.run import stored
 from hand_eye_calib.cli.batch.tasks import Task, read_batch
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.bags import write_bag
@@ -150,7 +150,7 @@ def test_a_name_that_is_too_long_for_a_file_is_one_line(run, tmp_path, command):
     name = tmp_path / ("n" * 256)
     code, out, err = run(command, name, *[name][: command == "calibrate"])
     assert (code, out, err.count("\n")) == (1, "", 1)
-    assert "File name too long; give a shorter name" in err
+    assert "File name too long; choose another" in err
     assert len(err) < 200
 
 

@@ -1,91 +1,91 @@
-"""The commands ``calibrate --batch`` and ``calibrate RECORDING RECORDING ...``: tasks, workers,
-results, and what is printed of them.
+"""The commands ``calibrate --batch`` and ``calibrate RECORDING RECORDING ...``: what was done
+already, what is left, and what all results say.
 """
 
 import argparse
 import contextlib
+import csv
+import io
 import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hand_eye_calib.cli.batch.results import Row, row_of, store, stored, write_rows
-from hand_eye_calib.cli.batch.tasks import (
-    INDEX,
-    SOURCES,
-    SUMMARY,
-    TABLE,
-    VEHICLES,
-    Task,
-    read_batch,
-)
-from hand_eye_calib.cli.batch.workers import Outcome, on_cores, on_dask
-from hand_eye_calib.cli.console import note, print_table, waiting_for, with_progress
-from hand_eye_calib.cli.options import options_from
-from hand_eye_calib.cli.present import deliver, wrapped
+from hand_eye_calib.cli.batch import tasks as names
+from hand_eye_calib.cli.batch.tasks import Task, read_batch
+from hand_eye_calib.cli.batch.work import Outcome, outcomes
+from hand_eye_calib.cli.console import STREAMS, note, waiting_for, with_progress
+from hand_eye_calib.cli.options import options_from, sources_from
+from hand_eye_calib.cli.present import deliver, exit_code, wrapped
 from hand_eye_calib.cli.reporting import REPORT, can_draw, save_text
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.session.together import together
-from hand_eye_calib.text import counted, listing, with_sigma
+from hand_eye_calib.session.together import row_of_result, together
+from hand_eye_calib.text import counted, listing
 
-_HEADINGS = (" x m", " y m", " z m", " roll deg", " pitch deg", " yaw deg", " poses", " warnings")
 # The worst come first on the terminal; rows.csv has all.
 _MOST_LINES = 200
 _GRAVITY = ("failed", *(each.value for each in reversed(Verdict)))
-_EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
+# Text that begins with one of these is a formula to spreadsheets, with full width to some.
+_FORMULA = tuple("=+-@＝＋－＠")
+
+Row = dict[str, Any]
 
 
-class _Done(NamedTuple):
+class Done(NamedTuple):
     """A recording that is done: its row, and its outcome as text, which takes little memory."""
 
     row: Row
     text: str
     code: int
-    is_new: bool
+
+    @classmethod
+    def of(cls, outcome: Outcome) -> "Done":
+        """Raises the errors of damaged values."""
+        found, code = outcome["calibration"], 1
+        if found and not outcome["error"]:
+            code = exit_code(Calibration.from_dict(found))
+        return cls(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code)
 
     @property
-    def outcome(self) -> Outcome:
-        return dict(json.loads(self.text))
+    def calibration(self) -> Calibration:
+        return Calibration.from_dict(json.loads(self.text)["calibration"])
 
     @property
     def verdict(self) -> str:
         return "failed" if self.row["error"] else str(self.row["verdict"])
 
-    @property
-    def rig(self) -> tuple[str, ...]:
-        """Vehicle and frames: recordings of other frames are another rig."""
-        return tuple(self.row[name] for name in ("vehicle", "parent_frame", "child_frame"))
-
 
 def run_batch(arguments: argparse.Namespace) -> int:
     """Calibrate from many recordings; returns the exit code. A bag that fails is a row."""
-    out: Path | None = arguments.out
     title = " ".join(map(str, arguments.batch))
     with waiting_for(f"reading {title}"):
         tasks = _tasks(arguments, arguments.batch, arguments.vehicle or "")
     done = _all_done(tasks, arguments)
-    rigs: dict[tuple[str, ...], list[_Done]] = {}
-    for one in done:
-        if one.row["vehicle"] and one.row["verdict"]:
-            rigs.setdefault(one.rig, []).append(one)
-    vehicles = {}
-    changed = set()
-    for rig, group in sorted(rigs.items()):
-        name = rig[0] if rig[0] not in vehicles else " ".join(rig)
-        with contextlib.suppress(InputError):  # no recording of it can be used
-            if len(group) > 1:
-                vehicles[name] = _together(group)
-        if any(one.is_new for one in group):
-            changed.add(name)
-    if out:
-        _write_summary(out, title, done, vehicles, changed)
+    vehicles = _vehicles(done)
+    document = {
+        "batch": title,
+        "counts": dict(Counter(one.verdict for one in done)),
+        "failures": [one.row["name"] for one in done if one.row["error"]],
+        "vehicles": {name: each.to_dict() for name, each in vehicles.items()},
+    }
+    if arguments.out:
+        from hand_eye_calib.io.results import save_result
+
+        with waiting_for("writing the summary"):
+            save_text(arguments.out / names.SUMMARY, json_text(document) + "\n")
+            for name, each in vehicles.items():
+                save_result(each, arguments.out / names.VEHICLES / name)
+        _write_rows_and_page(arguments.out, title, done, vehicles, names.INDEX)
     if arguments.json:
-        _print_document(title, done, vehicles)
+        # Their outcomes one by one: they may be many.
+        print(json_text(document).removesuffix("\n}") + ',\n  "results": [')
+        print(",\n".join(f"    {one.text}" for one in done) + "\n  ]\n}")
     else:
         _print_results(done, vehicles)
     alone = sum(bool(one.row["verdict"] and not one.row["vehicle"]) for one in done)
@@ -94,7 +94,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
             f"{alone} recordings are not compared with each other: give --vehicle with the place "
             "of the vehicle in their paths, such as 'fleet/{vehicle}/*'"
         )
-    return _exit_code(done)
+    codes = {one.code for one in done}
+    return 1 if 1 in codes else max(codes)
 
 
 def run_together(
@@ -103,179 +104,163 @@ def run_together(
     """Calibrate from several recordings of one rig, each given by its bags or files, for one
     result; returns the exit code.
     """
-    out: Path | None = arguments.out
     entries = [{"bag": list(map(str, group))} for group in groups]
     done = _all_done(_tasks(arguments, entries, "rig", are_files=are_files), arguments)
-    if not any(one.row["verdict"] for one in done):
+    usable = {one.row["name"]: one.calibration for one in done if one.row["verdict"]}
+    if not usable:
         raise InputError("; ".join(f"{one.row['name']}: {one.row['error']}" for one in done))
-    found = _together([one for one in done if one.row["verdict"]])
-    if out:
-        _write_rows_and_page(out, "recordings of one rig", done, {"rig": found}, REPORT)
-    inputs = {"recordings": {one.row["name"]: one.outcome["inputs"] for one in done}}
+    found = together(usable)
+    if arguments.out:
+        _write_rows_and_page(arguments.out, "recordings of one rig", done, {"rig": found}, REPORT)
+    inputs = {"recordings": {one.row["name"]: json.loads(one.text)["inputs"] for one in done}}
     code = deliver(found, arguments, inputs, None)
-    failed = any(one.row["error"] for one in done)
-    _note_errors(done)
-    return _EXIT_FAILED if failed else code
+    return 1 if any(one.row["error"] for one in done) else code
 
 
 def _tasks(arguments: argparse.Namespace, given: Any, vehicle: str, **flags: bool) -> list[Task]:
-    sources = {
-        name: value if isinstance(value, str) else ":".join(value)
-        for name in SOURCES
-        if (value := getattr(arguments, name))
-    }
     with_report = bool(arguments.out) and not arguments.no_report and can_draw(REPORT)
     flags |= {"with_fingerprints": bool(arguments.out), "with_report": with_report}
-    return read_batch(given, options_from(arguments), sources, vehicle, **flags)
+    return read_batch(given, options_from(arguments), sources_from(arguments), vehicle, **flags)
 
 
-def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[_Done]:
+def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[Done]:
     """The recordings of an earlier run, and of this one, in the order of the tasks."""
     out: Path | None = arguments.out
-    found: dict[str, _Done] = {}
-    if out:
-        for task in with_progress(tasks, len(tasks), "looking for earlier results"):
-            if outcome := stored(task, out):
-                found[task.name] = _done(outcome, is_new=False)
+    found: dict[str, Done] = {}
+    for task in with_progress(tasks, len(tasks), "looking for earlier results") if out else ():
+        if earlier := stored(task, arguments.out):
+            found[task.name] = earlier
     if found:
         note(f"{len(found)} of {len(tasks)} bags are done already; their results are in {out}")
     waiting = [task for task in tasks if task.name not in found]
-    jobs = min(arguments.jobs or os.cpu_count() or 1, max(len(waiting), 1))
-    with on_dask(arguments.dask) if arguments.dask else on_cores(jobs) as do:
-        for task, outcome in with_progress(do(waiting), len(waiting), "calibrating"):
-            page = outcome.pop("page", None)
-            found[task.name] = one = _done(outcome, is_new=True)
-            if out:
-                store(task, outcome, page, out)
-            if not sys.stderr.isatty():
-                told = one.row["error"] or one.row["headline"]
-                note(f"{len(found)} of {len(tasks)}: {task.name}: {told}")
+    jobs = min(arguments.jobs or os.cpu_count() or 1, len(waiting))
+    doing = outcomes(waiting, jobs, arguments.dask) if waiting else ()
+    for task, outcome in with_progress(doing, len(waiting), "calibrating"):
+        page = outcome.pop("page", None)
+        found[task.name] = one = Done.of(outcome)
+        if out:
+            _store(task, outcome, page, out)
+        told = one.row["error"] or one.row["headline"]
+        if one.row["error"] or not sys.stderr.isatty():
+            note(f"{len(found)} of {len(tasks)}: {task.name}: {told}")
     return [found[task.name] for task in tasks]
 
 
-def _done(outcome: Outcome, is_new: bool) -> _Done:
-    calibration, code = outcome["calibration"], 0
-    if outcome["error"] or not calibration:
-        code = _EXIT_FAILED
-    else:
-        silent = {"rotations": "xyz", "positions": "rollpitchyaw"}.get(calibration["measured"], "")
-        hidden = any(
-            dof["verdict"] == "unobservable" and dof["name"] not in silent
-            for dof in calibration["observability"]
-        )
-        is_poor = calibration["verdict"] == Verdict.DO_NOT_USE.name
-        code = _EXIT_NOT_ALL if hidden or is_poor else 0
-    return _Done(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code, is_new)
+def stored(task: Task, directory: Path) -> Done | None:
+    """What an earlier run did; None if there is nothing, it failed, or something has changed since.
+
+    Raises
+    ------
+    InputError
+        If its folder is a link out of the directory.
+    """
+    folder = directory / task.name
+    if folder.is_symlink() and not folder.resolve().is_relative_to(directory.resolve()):
+        raise InputError(f"{folder} is a link out of {directory}; remove it")
+    try:
+        state = json.loads((folder / names.STATE).read_text(encoding="utf-8"))
+        is_same = state["key"] == task.key() and not state["outcome"]["error"]
+        return Done.of(state["outcome"]) if is_same else None
+    except Exception:  # to be done again, whatever is wrong with it
+        return None
 
 
-def _together(group: Sequence[_Done]) -> Calibration:
-    return together(
-        {one.row["name"]: Calibration.from_dict(one.outcome["calibration"]) for one in group}
-    )
-
-
-def _exit_code(done: Sequence[_Done]) -> int:
-    _note_errors(done)
-    codes = {one.code for one in done}
-    return _EXIT_FAILED if _EXIT_FAILED in codes else max(codes)
-
-
-def _note_errors(done: Sequence[_Done]) -> None:
-    failed = [one.row for one in done if one.row["error"]]
-    for row in failed[:_MOST_LINES]:
-        note(f"{row['name']} failed: {row['error']}")
-
-
-def _document(title: str, done: Sequence[_Done], vehicles: Mapping[str, Calibration]) -> Row:
-    """What there is to say of all together, as plain values."""
-    return {
-        "batch": title,
-        "counts": dict(Counter(one.verdict for one in done)),
-        "failures": [one.row["name"] for one in done if one.row["error"]],
-        "vehicles": {name: each.to_dict() for name, each in vehicles.items()},
-    }
-
-
-def _print_document(title: str, done: Sequence[_Done], vehicles: Mapping[str, Calibration]) -> None:
-    """Print the document with the outcome of every recording, one by one: they may be many."""
-    print(json_text(_document(title, done, vehicles)).rstrip().removesuffix("}").rstrip() + ",")
-    print('  "results": [')
-    for number, one in enumerate(done, start=1):
-        print(f"    {one.text}{',' if number < len(done) else ''}")
-    print("  ]\n}")
-
-
-def _write_summary(
-    directory: Path,
-    title: str,
-    done: Sequence[_Done],
-    vehicles: Mapping[str, Calibration],
-    changed: Collection[str],
-) -> None:
-    """Write everything that is said of all together, and the results of vehicles that changed."""
+def _store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> None:
+    """Write the results of a task into its folder."""
     from hand_eye_calib.io.results import save_result
 
-    with waiting_for("writing the summary"):
-        text = json_text(_document(title, done, vehicles)) + "\n"
-        save_text(directory / SUMMARY, text)
-        for name, each in vehicles.items():
-            folder = directory / VEHICLES / name.replace("/", "_")
-            if name in changed or not folder.exists():
-                save_result(each, folder)
-        _write_rows_and_page(directory, title, done, vehicles, INDEX)
+    folder = directory / task.name
+    if outcome["calibration"]:
+        save_result(Calibration.from_dict(outcome["calibration"]), folder, outcome["inputs"])
+    if page:
+        save_text(folder / REPORT, page)
+    # What failed is done again in any case, and its bag may be out of reach.
+    key = "" if outcome["error"] else task.key()
+    save_text(folder / names.STATE, json_text({"key": key, "outcome": outcome}) + "\n")
+
+
+def row_of(outcome: Outcome) -> Row:
+    """The row of an outcome in plain values, for tables of other programs."""
+    inputs, calibration = outcome["inputs"], outcome["calibration"]
+    row: Row = {"name": outcome["name"], "vehicle": outcome["vehicle"]}
+    row |= {"bags": " ".join(outcome["bags"]), "error": outcome["error"], "start": None}
+    row |= {"verdict": None, "headline": None}
+    stamps = [inputs[each] for each in STREAMS if each in inputs]
+    starts = [stream["first_stamp_ns"] for stream in stamps]
+    if starts and None not in starts:
+        date = datetime.fromtimestamp(max(starts) // 1_000_000_000, UTC)
+        row["start"] = date.isoformat(timespec="seconds")
+        row["duration_s"] = (min(each["last_stamp_ns"] for each in stamps) - max(starts)) * 1e-9
+    if calibration:
+        row |= row_of_result(calibration) | {"warnings": "; ".join(calibration["warnings"])}
+        row["findings"] = " ".join(finding["code"] for finding in outcome["findings"])
+    return row
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write a CSV file of rows: text in quotes, numbers without, what is not known empty."""
+    text = io.StringIO()
+    columns = [*max(rows, key=len)]
+    writer = csv.DictWriter(text, columns, None, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
+    writer.writeheader()
+    for row in rows:
+        # An apostrophe stands before text that would be a formula.
+        formulas = {
+            name: f"'{value}"
+            for name, value in row.items()
+            if isinstance(value, str) and value.lstrip().startswith(_FORMULA)
+        }
+        writer.writerow(row | formulas)
+    save_text(path, text.getvalue())
+
+
+def _vehicles(done: Sequence[Done]) -> dict[str, Calibration]:
+    """What the recordings of each vehicle say together; those of other frames are another rig."""
+    rigs: dict[tuple[str, ...], list[Done]] = {}
+    for one in done:
+        if one.row["vehicle"] and one.row["verdict"]:
+            rig = tuple(one.row[name] for name in ("vehicle", "parent_frame", "child_frame"))
+            rigs.setdefault(rig, []).append(one)
+    found: dict[str, Calibration] = {}
+    for rig, group in sorted(rigs.items()):
+        name = rig[0] if rig[0] not in found else "_".join(rig).replace("/", "_")
+        with contextlib.suppress(InputError):  # no recording of it can be used
+            if len(group) > 1:
+                found[name] = together({one.row["name"]: one.calibration for one in group})
+    return found
 
 
 def _write_rows_and_page(
     directory: Path,
     title: str,
-    done: Sequence[_Done],
+    done: Sequence[Done],
     vehicles: Mapping[str, Calibration],
     page: str,
 ) -> None:
-    paths = [directory / TABLE]
     rows = [one.row for one in done]
-    write_rows(paths[0], rows)
+    write_rows(directory / names.TABLE, rows)
+    note(f"wrote {directory / names.TABLE}")
     if can_draw(page):
         from hand_eye_calib.report.batch_page import render_batch
 
         linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
-        paths.append(directory / page)
-        save_text(paths[1], render_batch(title, rows, vehicles, linked))
-    for path in paths:
-        note(f"wrote {path}")
+        save_text(directory / page, render_batch(title, rows, vehicles, linked))
+        note(f"wrote {directory / page}")
 
 
-def _print_results(done: Sequence[_Done], vehicles: Mapping[str, Calibration]) -> None:
-    """Print a row for each recording, the worst first if they are many, and what those of each
-    vehicle say together.
-    """
-    shown = list(done)
+def _print_results(done: Sequence[Done], vehicles: Mapping[str, Calibration]) -> None:
+    """Print a line for each recording, the worst first, and what those of each vehicle say."""
+    in_order = sorted(done, key=lambda one: _GRAVITY.index(one.verdict))
+    for one in in_order[:_MOST_LINES]:
+        told = f"failed: {one.row['error']}" if one.row["error"] else one.row["headline"]
+        print("\n".join(wrapped(f"{one.row['name']}: {told}", "", "  ")))
     if len(done) > _MOST_LINES:
-        shown = sorted(done, key=lambda one: _GRAVITY.index(one.verdict))[:_MOST_LINES]
-    of_vehicle = ["vehicle"] if any(one.row["vehicle"] for one in done) else []
-    headings = ("recording", *of_vehicle, "verdict", *_HEADINGS)
-    print_table("", headings, (_cells(one, of_vehicle) for one in shown))
-    if len(shown) < len(done):
-        print(f"{len(done) - len(shown)} more, none with a worse verdict")
-    counts = Counter(one.verdict for one in done)
+        print(f"{len(done) - _MOST_LINES} more, none with a worse verdict")
+    counts = Counter(one.verdict for one in in_order)
     failed = counts.pop("failed", 0)
     print(f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed")
     if counts:
-        print(listing([f"{count} {verdict}" for verdict, count in counts.most_common()]))
+        print(listing([f"{count} {verdict}" for verdict, count in counts.items()]))
     for name, each in vehicles.items():
         sentence = each.together.sentence if each.together else ""
         print("\n".join(wrapped(f"{name}: {each.headline}. {sentence}", "", "  ")))
-
-
-def _cells(one: _Done, of_vehicle: Sequence[str]) -> Iterator[str]:
-    """Names, verdict, numbers with their standard deviations, counts."""
-    row = one.row
-    yield from (row[name] for name in ("name", *of_vehicle))
-    yield one.verdict
-    if one.verdict == "failed":
-        return
-    for axis in ("x", "y", "z", "roll", "pitch", "yaw"):
-        unit, decimals = ("m", 3) if axis in "xyz" else ("deg", 2)
-        yield with_sigma(row[f"{axis}_{unit}"], row[f"sigma_{axis}_{unit}"], decimals)
-    yield str(row["n_poses"])
-    yield str(len(row["warnings"].split("; ")) if row["warnings"] else 0)

@@ -3,22 +3,24 @@
 import hashlib
 import json
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
 from itertools import chain, count
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.cli.options import STREAMS, Options
+from hand_eye_calib.cli.console import STREAMS, told_apart
+from hand_eye_calib.cli.options import Options
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io import remote
 from hand_eye_calib.text import split_frames
 
-SOURCES = ("parent_topic", "child_topic", "parent_tf", "child_tf")
-_KEYS = ("bag", "name", "vehicle", "options", *SOURCES)
+_KEYS = (
+    *("bag", "name", "vehicle", "options"),
+    *(f"{stream}_{kind}" for stream in STREAMS for kind in ("topic", "tf")),
+)
 STATE = "batch.json"
 SUMMARY, TABLE, INDEX, VEHICLES = "summary.json", "rows.csv", "index.html", "vehicles"
 # Names in the folder of the results, which a recording cannot have.
@@ -42,7 +44,9 @@ class Task:
         Paths or URLs of its parts, the directory of a journal, or the files of parent and child.
     vehicle : str
         The rig; recordings of one are put together. Empty if it is not known.
-    options, sources : dict
+    options : dict
+    sources : dict
+        "parent" and "child" to a topic or WORLD:SENSOR, if they are given.
     with_fingerprints, with_report : bool
     are_files : bool
         They are trajectory files.
@@ -93,68 +97,72 @@ def read_batch(
     if files:
         from hand_eye_calib.io.yaml_files import read_yaml
 
-        shown = str(given[0])
-        folder = Path(shown).parent
+        shown, folder = str(given[0]), Path(str(given[0])).parent
         document = read_yaml(Path(shown))
     if isinstance(document, list):
         document = {"bags": document}
-    bags = document.get("bags") if isinstance(document, dict) else None
+    bags = document.pop("bags", None) if isinstance(document, dict) else None
     if not isinstance(bags, list) or not bags:
         raise ConfigError(f"{shown}: expected a list of bags, or a mapping with one under 'bags'")
-    common = {name: value for name, value in document.items() if name != "bags"}
-    base = {"options": options, "vehicle": vehicle} | dict(sources)
-    defaults = _merged(base, _checked(f"{shown}, beside 'bags'", common))
-    recordings: list[_Recording] = []
-    for number, entry in enumerate(bags, start=1):
+    base = {"vehicle": vehicle, "options": options, **sources}
+    base = _merged(base, document, f"{shown}, beside 'bags'")
+    recordings: list[tuple[str, dict[str, Any], list[str]]] = []
+    for number, each in enumerate(bags, start=1):
         where = f"{shown}, entry {number}"
-        entry = _checked(where, entry if isinstance(entry, dict) else {"bag": entry})
-        merged = _merged(defaults, entry)
-        recordings += [(where, found, merged) for found in _expanded(folder, entry, where)]
-    return [
-        Task(name=name, bags=tuple(found), **_settings(where, entry, found[0]), **flags)
-        for name, (where, found, entry) in zip(_names(recordings), recordings, strict=True)
-    ]
+        entry = _merged(base, each if isinstance(each, dict) else {"bag": each}, where)
+        found = _expanded(folder, entry.get("bag"), where)
+        recordings += [(where, entry, places) for places in found]
+    unnamed = [places[0] for _, entry, places in recordings if not entry.get("name")]
+    stems = [str(Path(place.partition("?")[0]).with_suffix("")) for place in unnamed]
+    by_path = iter(told_apart(stems))
+    tasks: dict[str, Task] = {}
+    for where, entry, places in recordings:
+        name = _name(entry.get("name") or next(by_path), where)
+        numbered = chain([name], (f"{name}_{number}" for number in count(2)))
+        name = next(one for one in numbered if one not in tasks)
+        tasks[name] = Task(
+            name=name,
+            bags=tuple(places),
+            vehicle=_vehicle(entry, places[0], where),
+            options=entry["options"],
+            sources={stream: entry[stream] for stream in STREAMS if stream in entry},
+            **flags,
+        )
+    return [*tasks.values()]
 
 
-# Where it stands in the file, its bags, what holds for it.
-_Recording = tuple[str, list[str], dict[str, Any]]
-
-
-def _checked(where: str, entry: dict[str, Any]) -> dict[str, Any]:
-    unknown = [str(name) for name in entry if name not in _KEYS]
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """``over`` before ``base``, with the source of each stream under its name."""
+    unknown = [str(name) for name in over if name not in _KEYS]
     if unknown:
         raise ConfigError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
-    if not isinstance(entry.get("options", {}), dict):
+    options = over.get("options", {})
+    if not isinstance(options, dict):
         raise ConfigError(f"{where}: options must be a mapping of names to values")
-    return entry
+    merged = {**base, **over, "options": base["options"] | options}
+    try:
+        CalibratorConfig.from_options(merged["options"])
+        for stream in STREAMS:
+            if f"{stream}_topic" in over:
+                merged[stream] = str(over[f"{stream}_topic"])
+            elif f"{stream}_tf" in over:
+                merged[stream] = ":".join(split_frames(str(over[f"{stream}_tf"])))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    return merged
 
 
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``over`` before ``base``; the topic of a stream replaces its frames, and the reverse."""
-    replaced = {
-        f"{stream}_{other}"
-        for stream in STREAMS
-        for kind, other in (("topic", "tf"), ("tf", "topic"))
-        if f"{stream}_{kind}" in over
-    }
-    merged = {name: value for name, value in base.items() if name not in replaced} | dict(over)
-    return merged | {"options": base.get("options", {}) | over.get("options", {})}
-
-
-def _expanded(folder: Path, entry: Mapping[str, Any], where: str) -> Iterator[list[str]]:
+def _expanded(folder: Path, given: Any, where: str) -> Iterator[list[str]]:
     """Bags of each recording: one recording, or several if a pattern stands for many."""
-    bags = entry.get("bag")
-    named: list[Any] = bags if isinstance(bags, list) else [bags]
-    if not named or not all(isinstance(bag, str) and bag for bag in named):
-        raise ConfigError(f"{where}: expected a bag's path or a list of paths; got {bags!r}")
-    if any("\0" in bag for bag in named):
-        raise ConfigError(f"{where}: a bag's path has a zero byte")
-    places = [bag if remote.is_url(bag) else str(folder / bag) for bag in named]
+    bags = given if isinstance(given, list) else [given]
+    if not bags or not all(isinstance(bag, str) and bag and "\0" not in bag for bag in bags):
+        raise ConfigError(f"{where}: expected a bag's path or a list of paths; got {given!r}")
+    places = [bag if remote.is_url(bag) else str(folder / bag) for bag in bags]
     found = matching(places[0])
     if len(places) > 1 or found is None:
         yield places
     elif not found:
-        raise ConfigError(f"{where}: no bag matches {named[0]}")
+        raise ConfigError(f"{where}: no bag matches {bags[0]}")
     else:
         yield from ([place] for place in found)
 
@@ -176,69 +184,22 @@ def _is_recording(path: Path) -> bool:
     return path.suffix in _BAGS and not (path.parent / "metadata.yaml").exists()
 
 
-def _settings(where: str, entry: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Vehicle, options and sources of a recording."""
-    sources = {source: str(entry[source]) for source in SOURCES if source in entry}
-    given = entry.get("vehicle", "")
-    if isinstance(given, bool) or not isinstance(given, (str, int, float)):
-        raise ConfigError(f"{where}: expected the name of a vehicle; got {given!r}")
-    vehicle = str(given)
-    if _PLACE in vehicle:
+def _vehicle(entry: Mapping[str, Any], place: str, where: str) -> str:
+    """The vehicle's name, which may stand in the path."""
+    vehicle = entry["vehicle"]
+    if isinstance(vehicle, str) and _PLACE in vehicle:
         pattern = re.escape(vehicle).replace(re.escape(_PLACE), "([^/]+)")
         pattern = pattern.replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
         match = re.search(pattern, place)
         vehicle = match[1] if match else ""
-    if not vehicle.isprintable() or len(vehicle.encode()) > _LONGEST_NAME:
-        raise ConfigError(f"{where}: {vehicle[:_LONGEST_NAME]!r} cannot name a vehicle")
-    try:
-        CalibratorConfig.from_options(entry["options"])
-        for source, text in sources.items():
-            if source.endswith("_tf"):
-                split_frames(text)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    return {"vehicle": vehicle, "options": dict(entry["options"]), "sources": sources}
+    return _name(vehicle, where) if vehicle else ""
 
 
-def _names(recordings: Sequence[_Recording]) -> list[str]:
-    """A name for each recording, none twice: its own, or that of its first bag. Bags that are
-    called alike are named by the folders in which they differ, as monday and tuesday of monday/bag
-    and tuesday/bag.
-    """
-    unnamed = [_place(paths[0]) for _, paths, entry in recordings if not entry.get("name")]
-    places = list(dict.fromkeys(unnamed))
-    stems = Counter(place[-1] for place in places)
-    alike = [place for place in places if stems[place[-1]] > 1]
-    first = last = 0
-    if alike:  # the parts in which they differ
-        first = next(k for k in count() if len({one[k : k + 1] for one in alike}) > 1)
-        last = next(k for k in count(1) if len({one[-k : len(one) - k + 1] for one in alike}) > 1)
-    names: dict[str, None] = {}
-    numbers: Counter[str] = Counter()
-    for where, paths, entry in recordings:
-        place = _place(paths[0])
-        distinct = place[first : len(place) - last + 1] if stems[place[-1]] > 1 else ()
-        name = _folder(where, entry.get("name") or "_".join(distinct or place[-1:]))
-        numbered = chain([name], (f"{name}_{number}" for number in count(max(numbers[name], 2))))
-        unique = next(one for one in numbered if one not in names)
-        numbers[name] = int(unique.rpartition("_")[2]) if unique != name else 0
-        names[unique] = None
-    return [*names]
-
-
-def _place(bag: str) -> tuple[str, ...]:
-    """Folders and name of a bag, the latter without its suffix."""
-    path = PurePosixPath(bag.partition("?")[0])
-    return (*path.parts[:-1], path.stem)
-
-
-def _folder(where: str, given: Any) -> str:
-    """Name of a recording, and of its folder in ``--out``."""
-    if not isinstance(given, (str, int, float)):
-        raise ConfigError(f"{where}: expected a name; got {given!r}")
+def _name(given: Any, where: str) -> str:
+    """A name that a folder of results can have."""
     name = str(given).replace("/", "_")
-    is_file_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME
-    if not is_file_name or name.strip(". ") == "" or name.lower() in _TAKEN:
+    is_file_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME and name.strip(". ")
+    if not is_file_name or not isinstance(given, str | int | float) or name.lower() in _TAKEN:
         raise ConfigError(
             f"{where}: {name[:_LONGEST_NAME]!r} cannot name a folder of results; give another name"
         )
