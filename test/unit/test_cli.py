@@ -27,7 +27,6 @@ from hand_eye_calib.cli.console import fail, note, told_apart, waiting_for, with
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.present import as_text, static_transform_command
 from hand_eye_calib.config import CalibratorConfig, option_name
-from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
