@@ -334,7 +334,7 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(tmp_path, he
 @pytest.mark.parametrize(
     ("lat", "lon", "message"),
     [
-        ([139.7, 139.8], [35, 35], "line 2: found latitude 139.7 .* seem to be swapped"),
+        ([139.7, 139.8], [35, 35], "line 2: found latitude 139.7, .* perhaps they are swapped"),
         ([60.0, 91.0], [1, 1], "line 3: found latitude 91, longitude 1; expected deg"),
     ],
 )
@@ -425,10 +425,7 @@ def test_repeated_stamps_are_dropped_with_a_note(tmp_path, streams, capsys):
     assert main(command) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["T_parent_child"] == whole["T_parent_child"]
-    assert err == (
-        f"hand_eye_calib: note: {files[1]}: dropped 2 whose stamp was there already; "
-        "1 of these with another pose\n"
-    )
+    assert err == (f"hand_eye_calib: note: {files[1]}: dropped 2 whose stamp was there already\n")
 
 
 def test_times_beside_a_kitti_file_are_found(tmp_path, streams, capsys):

@@ -23,14 +23,13 @@ named. Only with ``auto`` is it judged by the motion, and what was found is said
 """
 
 from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
-from hand_eye_calib.io.trajectory_files.formats import AUTO, FileOptions
 from hand_eye_calib.io.trajectory_files.reading import (
     FileReading,
     read_trajectory,
     read_trajectory_file,
     read_trajectory_files,
 )
-from hand_eye_calib.io.trajectory_files.table import layout_of_file
+from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, layout_of_file
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 __all__ = [

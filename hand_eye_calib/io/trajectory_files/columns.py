@@ -4,10 +4,11 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 
-# Columns that a message lists, and characters of a name that it shows.
-_MOST_LISTED, _MOST_SHOWN = 15, 120
+# Characters of a list of names that a message shows.
+_MOST_SHOWN = 600
 
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -15,15 +16,21 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 UNNAMED = ("q1", "q2", "q3", "q4")
 # The first three rows of a pose's matrix.
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
-# Sets of quantities that give a position or an orientation, the preferred first.
-POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
-ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"))
 RATES = ("wx", "wy", "wz")
-# Of a machine on a plane.
-_PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
+# Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
+# plane, fewer.
+_POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
+_ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"))
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
-_ALL_POSITIONS = (*POSITIONS, *_PLANAR_POSITIONS)
-_ALL_ORIENTATIONS = (*ORIENTATIONS, *_PLANAR_ORIENTATIONS)
+_ALL_POSITIONS = (*_POSITIONS, ("x", "y"), ("lat", "lon"))
+_ALL_ORIENTATIONS = (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS)
+
+
+def _ends(quantity: str, beginnings: str) -> dict[str, tuple[str, ...]]:
+    """Names of a quantity along each axis."""
+    axes = "xyzw" if quantity == "q" else "xyz"
+    return {f"{quantity}{a}": tuple(f"{name}{a}" for name in beginnings.split()) for a in axes}
+
 
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
@@ -44,29 +51,24 @@ _ALIASES = {
         *("header_stamp_nsecs", "header_stamp_nanosec", "stamp_nsecs", "stamp_nanosec"),
         *("nsecs", "nanosec"),
     ),
+    **_ends(
+        "w", "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_ w_rs_s_"
+    ),
+    **_ends("q", "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_"),
 }
-_RATE_NAMES = (
-    *("w", "w_", "omega_", "gyro_", "gyr_", "angvel_", "ang_vel_", "angular_velocity_"),
-    *("angular_rate_", "rate_", "w_rs_s_"),
-)
-_ALIASES |= {f"w{axis}": tuple(name + axis for name in _RATE_NAMES) for axis in "xyz"}
 # Names that stand for a part of an orientation, even if it is not known which.
 _ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.IGNORECASE)
-_QUATERNION_NAMES = (
-    *("q", "q_", "quat_", "quaternion_", "rot_", "orientation_", "rotation_", "q_rs_"),
-)
-_ALIASES |= {f"q{axis}": tuple(name + axis for name in _QUATERNION_NAMES) for axis in "xyzw"}
 
-_LENGTHS = ("m", "mm", "cm", "km")
-_ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg"} | dict.fromkeys(
-    ("rad", "radian", "radians"), "rad"
-)
-_UNITS = "|".join([*_LENGTHS, *_ANGLES])
-_STAMP_UNIT = re.compile(
-    r"[\[(]\s*(s|ms|us|ns)\s*[\])]\s*$|^\W*(?:t|time|timestamp|stamp)_(s|ms|us|ns)$"
-)
-_RATE_UNIT = re.compile(r"(?:\b|_)(?:(rad|deg|°)(?:_?ps|\s*/\s*s|[ _]s(?:\^?-1)?)|(dps))[\])\s]*$")
-_UNIT = re.compile(rf"[\[(]\s*({_UNITS})\s*[\])]\s*$|_({_UNITS})$")
+# Units as names have them, with a slash for what separates words.
+_UNITS = {
+    **{
+        unit: unit for unit in ("m", "mm", "cm", "km", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)
+    },
+    **dict.fromkeys(("degree", "degrees", "°"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("dps", "degps", "deg/ps", "°/s"), "deg/s"),
+    **dict.fromkeys(("radps", "rad/ps"), "rad/s"),
+}
 
 
 class Columns(NamedTuple):
@@ -78,6 +80,8 @@ class Columns(NamedTuple):
         One column, or those of seconds and nanoseconds.
     quantities : dict
         Name of each quantity to its column.
+    measures : str
+        What they measure, one of config.MEASURES.
     stamp_unit : str
         As the header has it; empty if it names none.
     units : dict
@@ -86,15 +90,14 @@ class Columns(NamedTuple):
 
     stamp: list[int]
     quantities: dict[str, int]
+    measures: str
     stamp_unit: str
     units: dict[str, str]
 
 
-def choose_columns(
-    path: object, names: Sequence[str], has_stamps: bool = True, measures: str = "auto"
-) -> Columns:
-    """Find the columns of stamp, unless stamps come from elsewhere, and of what is measured:
-    position and orientation, or what there is of them, or angular rates.
+def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -> Columns:
+    """Find the columns of stamp and of what is measured: position and orientation, or what there
+    is of them, or angular rates.
 
     Raises
     ------
@@ -103,95 +106,65 @@ def choose_columns(
     """
     found = _matches(names)
     # The stamp of the message's header rather than the time of its arrival.
-    stamp: tuple[str, ...] = ()
-    if has_stamps:
-        stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",)
-    measured = _quantities(found, names, measures)
-    wanted = (*stamp, *measured)
-    missing = [name for name in wanted if name not in found]
+    stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",)
+    if measures == "auto":
+        measures = _what_is_there(found, names)
+    measured = _quantities(found, measures)
+    missing = [name for name in (*stamp, *measured) if name not in found]
     if missing:
         raise InputError(
             f"{path}: no column for {', '.join(missing)} among {listed(names)}; name all columns "
             "with `columns`, such as t,x,y,z,qw,qx,qy,qz"
         )
-    for name in wanted:
+    for name in (*stamp, *measured):
         if len(found[name]) > 1:
             raise InputError(
                 f"{path}: columns {listed([names[index] for index in found[name]])} could all be "
                 f"{name}; name them with `columns`"
             )
-    quantities = {name: found[name][0] for name in measured}
-    return Columns(
-        stamp=[found[name][0] for name in stamp],
-        quantities=quantities,
-        stamp_unit=_stamp_unit(names[found["t"][0]]) if stamp == ("t",) else "ns",
-        units={name: unit for name, at in quantities.items() if (unit := _unit(names[at]))},
-    )
+    at = {name: found[name][0] for name in measured}
+    units = {name: unit for name, column in at.items() if (unit := _split(names[column])[1])}
+    unit = "ns" if stamp != ("t",) else _split(names[found["t"][0]])[1]
+    return Columns([found[name][0] for name in stamp], at, measures, unit, units)
 
 
-def _quantities(
-    found: dict[str, list[int]], names: Sequence[str], measures: str
-) -> tuple[str, ...]:
-    """The quantities to read: of poses, or of the part of them that is measured or is there."""
-    orientation = _first_complete(_ALL_ORIENTATIONS, found)
-    is_planar = orientation in _PLANAR_ORIENTATIONS
-    position = _first_complete(_ALL_POSITIONS if is_planar else POSITIONS, found)
-    if measures == "auto":
-        measures = _what_is_there(found, names)
+def _quantities(found: dict[str, list[int]], measures: str) -> tuple[str, ...]:
+    """The quantities to read: of poses, or of the part of them that is measured."""
+    if measures == "rates":
+        return RATES
     if measures == "positions":
         return _first_complete(_ALL_POSITIONS, found)
-    parts = {"rates": RATES, "rotations": orientation}
-    return parts.get(measures, (*position, *orientation))
+    orientation = _first_complete(_ALL_ORIENTATIONS, found)
+    if measures == "rotations":
+        return orientation
+    is_planar = orientation in _PLANAR_ORIENTATIONS
+    return (*_first_complete(_ALL_POSITIONS if is_planar else _POSITIONS, found), *orientation)
 
 
 def _what_is_there(found: dict[str, list[int]], names: Sequence[str]) -> str:
     """What the columns measure; poses in doubt, so that what is missing is named."""
-    has_position, has_orientation, has_rates = (
-        any(set(group) <= found.keys() for group in groups)
-        for groups in (_ALL_POSITIONS, ORIENTATIONS, (RATES,))
-    )
-    if has_position:
-        is_oriented = _has_any(_ALL_ORIENTATIONS, found) or any(map(_ORIENTED.search, names))
+
+    def has_any(groups: Sequence[tuple[str, ...]]) -> bool:
+        return any(name in found for group in groups for name in group)
+
+    if _has_all(_ALL_POSITIONS, found):
+        is_oriented = has_any(_ALL_ORIENTATIONS) or any(map(_ORIENTED.search, names))
         return "poses" if is_oriented else "positions"
-    if _has_any(POSITIONS, found):
+    if has_any(_POSITIONS):
         return "poses"
-    if has_rates:
+    if _has_all((RATES,), found):
         return "rates"
-    return "rotations" if has_orientation else "poses"
+    return "rotations" if _has_all(_ORIENTATIONS, found) else "poses"
 
 
-def _has_any(groups: Sequence[tuple[str, ...]], found: dict[str, list[int]]) -> bool:
-    return any(name in found for group in groups for name in group)
-
-
-def measured_by(quantities: Sequence[str]) -> str:
-    """What quantities of :func:`choose_columns` measure, one of config.MEASURES."""
-    if not {"x", "lat", "m11"} & {*quantities}:
-        return "rates" if RATES[0] in quantities else "rotations"
-    last = quantities[-1]
-    return "positions" if any(last == group[-1] for group in _ALL_POSITIONS) else "poses"
+def _has_all(groups: Sequence[tuple[str, ...]], found: dict[str, list[int]]) -> bool:
+    """Whether there are columns for all of a group."""
+    return any(set(group) <= found.keys() for group in groups)
 
 
 def are_columns(names: Sequence[str]) -> bool:
     """Whether these are names of columns, or some other text."""
-    found = _matches(names)
-    return any(set(group) <= found.keys() for group in (*_ALL_POSITIONS, RATES))
-
-
-def _matches(names: Sequence[str]) -> dict[str, list[int]]:
-    """Columns of each quantity, of those that have any."""
-    plain = [_plain(name) for name in names]
-    found = {wanted: _matching(plain, aliases) for wanted, aliases in _ALIASES.items()}
-    return {wanted: columns for wanted, columns in found.items() if columns}
-
-
-def _matching(plain: list[str], aliases: Sequence[str]) -> list[int]:
-    """Columns of one of these names; if there is none, of paths that end in one."""
-    # Of paths, the longest end that is known: position_x rather than x.
-    ends = tuple(f"_{alias}" for alias in aliases if "_" in alias)
-    return [index for index, name in enumerate(plain) if name in aliases] or [
-        index for index, name in enumerate(plain) if name.endswith(ends)
-    ]
+    return _has_all((*_ALL_POSITIONS, RATES), _matches(names))
 
 
 def _first_complete(
@@ -201,32 +174,38 @@ def _first_complete(
     return next((group for group in groups if set(group) <= found.keys()), groups[0])
 
 
+def _matches(names: Sequence[str]) -> dict[str, list[int]]:
+    """Columns of each quantity, of those that have any: of one of its names; if there is none, of
+    paths that end in one.
+    """
+    plain = [_split(name)[0] for name in names]
+    found = {}
+    for wanted, aliases in _ALIASES.items():
+        # Of paths, the longest end that is known: position_x rather than x.
+        ends = tuple(f"_{alias}" for alias in aliases if "_" in alias)
+        found[wanted] = [index for index, name in enumerate(plain) if name in aliases] or [
+            index for index, name in enumerate(plain) if name.endswith(ends)
+        ]
+    return {wanted: columns for wanted, columns in found.items() if columns}
+
+
+def _split(name: str) -> tuple[str, str]:
+    """A column's name without its unit, and the unit, empty if there is none:
+    ``.pose.position.x [mm]`` to pose_position_x and mm, wx_deg_s to wx and deg/s.
+    """
+    name = name.strip().lower()
+    words = re.findall("[a-z0-9°]+", re.sub(r"\[.*?\]|\(.*?\)", "", name))
+    if in_brackets := re.search(r"[\[(]\s*([^\])]*?)\s*(?:\^?-1)?\s*[\])]$", name):
+        return "_".join(words), _UNITS.get(re.sub(r"[\s/_]+", "/", in_brackets[1]), "")
+    is_time = re.match("(t|time.*|stamp.*)$", words[0] if words else "") is not None
+    for count in (2, 1):
+        unit = _UNITS.get("/".join(words[-count:]), "")
+        if len(words) > count and unit and (unit in STAMP_UNITS) == is_time:
+            return "_".join(words[:-count]), unit
+    return "_".join(words), ""
+
+
 def listed(names: Sequence[str]) -> str:
     """Names of columns for a message, which must not grow with the file."""
-    text = ", ".join(name[:_MOST_SHOWN] for name in names[:_MOST_LISTED])
-    return text if len(names) <= _MOST_LISTED else f"{text} and {len(names) - _MOST_LISTED} more"
-
-
-def _plain(name: str) -> str:
-    """A column's name without its unit: ``.pose.position.x [m]`` to ``pose_position_x``."""
-    name = re.sub(r"\[.*?\]|\(.*?\)", "", name).strip().lower()
-    name = _RATE_UNIT.sub("", name)
-    name = re.sub(r"[^a-z0-9°]+", "_", name).strip("_")
-    if name.startswith(("t_", "time", "stamp")):
-        return re.sub(r"_(s|ms|us|ns)$", "", name)
-    return re.sub(rf"_({_UNITS})$", "", name)
-
-
-def _stamp_unit(name: str) -> str:
-    """Unit of the stamps in a column's name, empty if it has none."""
-    found = _STAMP_UNIT.search(name.strip().lower())
-    return (found[1] or found[2]) if found else ""
-
-
-def _unit(name: str) -> str:
-    """Unit of a length, an angle or a rate in a column's name, empty if it has none."""
-    if rate := _RATE_UNIT.search(name.strip().lower()):
-        return "deg/s" if rate[1] != "rad" else "rad/s"
-    found = _UNIT.search(name.strip().lower())
-    unit = (found[1] or found[2]) if found else ""
-    return _ANGLES.get(unit, unit)
+    text = ", ".join(names)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."

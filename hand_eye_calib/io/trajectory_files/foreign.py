@@ -5,10 +5,12 @@ A format is a function that knows its files by their first bytes. What cannot be
 sentence that says what it is and what to do.
 """
 
+import csv
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -40,13 +42,6 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-# What a file that is not what it begins like may raise.
-_MALFORMED = (
-    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
-    ElementTree.ParseError,
-)
-
-
 class Rows(NamedTuple):
     """The rows of a file under names of columns, and what a person should know."""
 
@@ -56,13 +51,8 @@ class Rows(NamedTuple):
 
 
 def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
-    """The rows of a file in one of these formats; None for any other.
-
-    Parameters
-    ----------
-    path : str or path-like
-    choice : str, optional
-        Which of several bodies is meant.
+    """The rows of a file in one of these formats; None for any other. ``choice`` says which of
+    several bodies is meant.
 
     Raises
     ------
@@ -77,64 +67,61 @@ def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
             head = file.read(_HEAD_BYTES)
     except (OSError, ValueError):
         return None  # the reader of tables says why
-    if head.startswith(b"\x93NUMPY"):
-        return _of_numpy(path)
-    if head.startswith(b"ULog\x01\x12\x35"):
-        return _of_ulog(path)
     for start, sentence in _NOT_READ.items():
         if head.startswith(start):
             raise InputError(f"{path}: {sentence}")
     text = head.decode("utf-8-sig", "replace").lstrip()
-    for pattern, read in _FORMATS:
-        if re.search(pattern, text):
-            whole = read_text(path, "a trajectory", LARGEST_TEXT)
-            try:
-                return read(whole, choice)
-            except _MALFORMED as error:
-                reason = " ".join(str(error).split())[:200]
-                raise InputError(f"{path}: {reason or type(error).__name__}") from None
-    return None
+    read: Callable[[], Rows] | None = None
+    if head.startswith(b"\x93NUMPY"):
+        read = partial(_of_numpy, path)
+    elif head.startswith(b"ULog\x01\x12\x35"):
+        read = partial(_of_ulog, path)
+    else:
+        of_text = next((each for pattern, each in _FORMATS if re.search(pattern, text)), None)
+        if of_text is not None:
+            read = partial(of_text, read_text(path, "a trajectory", LARGEST_TEXT), choice)
+    try:
+        return read() if read is not None else None
+    except MissingDependencyError:
+        raise
+    except Exception as error:  # of many kinds, in a file that is not what it begins like
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: {reason or type(error).__name__}") from None
 
 
 # ---- positions on the earth
 
 
 def _of_nmea(text: str, _: str | None) -> Rows:
-    """GGA sentences; the day is that of RMC or ZDA, if there is one."""
-    rows: list[tuple[float, float, float, float]] = []
-    day, seconds = 0.0, -1.0
+    """GGA sentences; the day is that of RMC, if there is one."""
+    rows: list[Sequence[float]] = []
+    day, has_date, before = 0.0, False, 0.0
     for line in text.splitlines():
         cells = line.partition("*")[0].strip().split(",")
         kind = cells[0][-3:]
         if kind == "RMC" and len(cells) > 9 and cells[9]:
             day = datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-        elif kind == "ZDA" and len(cells) > 4 and all(cells[1:5]):
-            year, month, date = map(int, cells[4:1:-1])
-            day = datetime(year, month, date, tzinfo=UTC).timestamp()
+            has_date = True
         elif kind == "GGA" and len(cells) > 11 and cells[6] not in ("", "0") and cells[9]:
             clock, lat, north, lon, east = cells[1:6]
             now = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
-            if now < seconds - 43_200 and not day:  # past midnight
-                rows = [(t - 86_400, *rest) for t, *rest in rows]  # type: ignore[misc]
-            seconds = now
+            if not has_date and now < before - 43_200:  # past midnight
+                day += 86_400
+            before = now
             degrees = (
                 (-1 if side in "SW" else 1) * (int(each[:n]) + float(each[n:]) / 60)
                 for each, n, side in ((lat, 2, north), (lon, 3, east))
             )
-            height = float(cells[9]) + float(cells[11] or 0)
-            rows.append((day + now, *degrees, height))  # type: ignore[arg-type]
+            rows.append([day + now, *degrees, float(cells[9]) + float(cells[11] or 0)])
     if not rows:
         raise ValueError("NMEA without positions: expected GGA sentences with a fix")
-    note = "" if day else "NMEA without a date: stamps are seconds of the day, in UTC"
-    return Rows("t [s],lat [deg],lon [deg],height [m]", rows, tuple(filter(None, [note])))
+    note = () if has_date else ("NMEA without a date: stamps are seconds of the day, in UTC",)
+    return Rows("t [s],lat [deg],lon [deg],height [m]", rows, note)
 
 
 def _of_gpx(text: str, _: str | None) -> Rows:
-    if "<!DOCTYPE" in text:
-        raise ValueError("GPX with a document type is not read; remove it")
-    points = ElementTree.fromstring(text).iterfind(".//{*}trkpt")
     rows = []
-    for point in points:
+    for point in ElementTree.fromstring(text).iterfind(".//{*}trkpt"):
         time, height = point.findtext("{*}time"), point.findtext("{*}ele")
         if time is None:
             raise ValueError("a point of the GPX track has no time; record it with times")
@@ -145,28 +132,22 @@ def _of_gpx(text: str, _: str | None) -> Rows:
 def _of_rtklib(text: str, _: str | None) -> Rows:
     lines = text.splitlines()
     header = next(line for line in lines if re.match(r"%\s+(GPST|UTC|JST)\b", line))
-    names = {"latitude(deg)": "lat [deg],lon [deg],height [m]", "e-baseline": "x [m],y [m],z [m]"}
-    names["x-ecef"] = names["e-baseline"]
-    columns = next((each for name, each in names.items() if name in header), None)
-    if columns is None:
+    columns = "lat [deg],lon [deg],height [m]" if "latitude(deg)" in header else "x,y,z"
+    if columns == "x,y,z" and not ("e-baseline" in header or "x-ecef" in header):
         raise ValueError(
             "RTKLIB with angles in degrees, minutes, seconds: set out-solformat to llh, degrees"
         )
-    gps_epoch = 315_964_800
-
-    def rows() -> Iterator[Sequence[Any]]:
-        for line in lines:
-            cells = line.replace(",", " ").split()
-            if not cells or cells[0].startswith("%"):
-                continue
+    gps_epoch, rows = 315_964_800, []
+    for line in lines:
+        cells = line.replace(",", " ").split()
+        if cells and not cells[0].startswith("%"):
             if "/" in cells[0]:
-                stamp: Any = f"{cells[0].replace('/', '-')}T{cells[1]}Z"
+                stamp = f"{cells[0].replace('/', '-')}T{cells[1]}Z"
             else:
                 stamp = repr(gps_epoch + 604_800 * int(cells[0]) + float(cells[1]))
-            yield stamp, *cells[2:5]
-
-    note = "stamps are of GPS time, 18 s ahead of UTC since 2017" if "GPST" in header else ""
-    return Rows(f"t,{columns}", [*rows()], tuple(filter(None, [note])))
+            rows.append((stamp, *cells[2:5]))
+    note = "stamps are of GPS time, 18 s ahead of UTC since 2017"
+    return Rows(f"t,{columns}", rows, (note,) if "GPST" in header else ())
 
 
 # ---- poses
@@ -178,7 +159,7 @@ def _of_g2o(text: str, _: str | None) -> Rows:
         tag, *cells = line.split() or [""]
         if tag == "VERTEX_SE3:QUAT":
             rows.append(cells[:8])
-        elif tag in ("VERTEX_SE2", "VERTEX2"):
+        elif tag == "VERTEX_SE2":
             half = float(cells[3]) / 2
             rows.append([*cells[:3], "0", "0", "0", repr(np.sin(half)), repr(np.cos(half))])
     if not rows:
@@ -218,78 +199,68 @@ def _of_json(text: str, _: str | None) -> Rows:
 
 def _of_motive(text: str, choice: str | None) -> Rows:
     """A take of OptiTrack's Motive with rigid bodies."""
-    import csv
-
     lines = [*csv.reader(text.splitlines())]
-    about = dict(zip(lines[0][::2], lines[0][1::2], strict=False))
     top = next((row for row, cells in enumerate(lines) if "Time (Seconds)" in cells), 0)
     kinds = next((row for row in range(1, top) if "Rigid Body" in lines[row]), None)
     if kinds is None:
         raise ValueError("Motive without rigid bodies: export them")
-    parts = lines[top - 1]
     found: dict[str, dict[str, int]] = {}
-    for at, (kind, name, part, axis) in enumerate(
-        zip(lines[kinds], lines[kinds + 1], parts, lines[top], strict=False)
-    ):
-        if (
-            kind == "Rigid Body"
-            and part in ("Rotation", "Position")
-            and axis in ("X", "Y", "Z", "W")
-        ):
+    heads = zip(lines[kinds], lines[kinds + 1], lines[top - 1], lines[top], strict=False)
+    for at, (kind, name, part, axis) in enumerate(heads):
+        if kind == "Rigid Body" and part in ("Rotation", "Position"):
             key = axis.lower() if part == "Position" else f"q{axis.lower()}"
             found.setdefault(name, {})[key] = at
-    body = _chosen(found, choice, "rigid bodies")
-    wanted = _POSE.split(",")
+    body, wanted = _chosen(found, choice, "rigid bodies"), _POSE.split(",")
     if {*wanted} - found[body].keys():
         raise ValueError("Motive with Euler angles: export with rotation type Quaternion")
-    unit = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}[
-        about.get("Length Units", "Meters")
-    ]
+    about = dict(zip(lines[0][::2], lines[0][1::2], strict=False))
+    units = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
     places = [lines[top].index("Time (Seconds)"), *(found[body][name] for name in wanted)]
     rows = [[row[k] for k in places] for row in lines[top + 1 :] if len(row) > max(places)]
-    rows = [row for row in rows if all(row)]  # not tracked
-    header = f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
-    return Rows(header, rows, (f"poses of rigid body {body}",))
+    header = _with_unit(units[about.get("Length Units", "Meters")])
+    return Rows(header, [row for row in rows if all(row)], (f"poses of rigid body {body}",))
 
 
 def _of_vicon(text: str, choice: str | None) -> Rows:
     """Segments of Vicon Nexus or Tracker, whose rotations are rotation vectors."""
-    import csv
-
     lines = [*csv.reader(text.splitlines())]
     rate_hz, names, columns, units = float(lines[1][0]), lines[2], lines[3], lines[4]
     if "RX" not in columns:
         raise ValueError("Vicon without segments: export Segments or Objects (global), not markers")
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
     body = _chosen(starts, choice, "segments")
-    at, unit = starts[body], units[starts[body] + 3]
+    at = starts[body]
     rows = [cells for cells in lines[5:] if len(cells) >= at + 6 and all(cells[at : at + 6])]
     values = np.array([[float(each) for each in cells[at : at + 6]] for cells in rows])
     angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
-    poses = se3.from_rotation_translation(se3.rotation_exp(angles), np.zeros((len(rows), 3)))
-    quats = se3.to_quat_xyzw(poses)
-    joined = np.c_[[int(cells[0]) / rate_hz for cells in rows], values[:, 3:], quats].tolist()
-    header = f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
-    return Rows(header, joined, (f"poses of {body}; rotations read as rotation vectors",))
+    poses = se3.from_rotation_translation(se3.rotation_exp(angles), values[:, 3:])
+    quats, seconds = se3.to_quat_xyzw(poses), [int(cells[0]) / rate_hz for cells in rows]
+    note = f"poses of {body}; rotations read as rotation vectors"
+    joined = np.c_[seconds, values[:, 3:], quats].tolist()
+    return Rows(_with_unit(units[at + 3]), joined, (note,))
+
+
+def _with_unit(unit: str) -> str:
+    return f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
 
 
 def _of_numpy(path: Path) -> Rows:
     try:
         values = np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
+        raise ValueError(f"cannot read the array: {error}") from None
     if values.dtype.names:
         return Rows(",".join(values.dtype.names), values.tolist())
     if values.ndim != 2 or values.shape[1] not in (4, 8) or values.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, "
-            "z, qx, qy, qz, qw, or (N, 4) of t, x, y, z"
+        raise ValueError(
+            f"an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, z, qx, "
+            "qy, qz, qw, or (N, 4) of t, x, y, z"
         )
     return Rows(f"t,{_POSE}" if values.shape[1] == 8 else "t,x,y,z", values.tolist())
 
 
 def _of_ulog(path: Path) -> Rows:
-    """A log of PX4: the odometry of its estimator, or its position and attitude."""
+    """A log of PX4: the odometry of its estimator."""
     try:
         from pyulog import ULog
     except ImportError:
@@ -301,17 +272,17 @@ def _of_ulog(path: Path) -> Rows:
         by_name = {each.name: each.data for each in log.data_list}
         data = by_name.get("vehicle_odometry") or by_name["vehicle_visual_odometry"]
         stamps_us = data["timestamp_sample" if "timestamp_sample" in data else "timestamp"]
-        quats = np.stack([data[f"q[{k}]"] for k in (1, 2, 3, 0)], axis=1).astype(float)
         names = "xyz" if "x" in data else [f"position[{k}]" for k in range(3)]
-        positions = np.stack([data[name] for name in names], axis=1).astype(float)
+        names = [*names, *(f"q[{k}]" for k in (1, 2, 3, 0))]
+        values = np.stack([data[name] for name in names], axis=1).astype(float)
     except Exception as error:  # of many kinds, at damaged logs
-        reason = " ".join([type(error).__name__, *str(error).split()])
-        raise InputError(f"{path}: a log of PX4 without vehicle_odometry ({reason})") from None
-    good = np.isfinite(quats).all(axis=1) & np.isfinite(positions).all(axis=1)
-    quats, positions = quats[good], positions[good] @ _ENU_NED.T
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    rotations = _ENU_NED @ se3.from_quat_xyzw(np.zeros_like(positions), quats)[:, :3, :3] @ _FLIP
-    poses = se3.from_rotation_translation(rotations, positions)
+        reason = f"{type(error).__name__} {error}"
+        raise ValueError(f"a log of PX4 without vehicle_odometry ({reason})") from None
+    good = np.isfinite(values).all(axis=1)
+    positions, quats = values[good, :3], values[good, 3:]
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    rotations = _ENU_NED @ se3.from_quat_xyzw(positions, quats)[:, :3, :3] @ _FLIP
+    poses = se3.from_rotation_translation(rotations, positions @ _ENU_NED.T)
     stamps = [f"{int(each) / 1e6:.6f}" for each in stamps_us[good]]
     note = "axes: x forward, y left, z up, in east, north, up; PX4 has forward, right, down"
     return _of_poses(stamps, poses, True, "")._replace(notes=(note,))
@@ -357,14 +328,14 @@ def _chosen(found: Any, choice: str | None, what: str) -> str:
     return str(names[0])
 
 
-_Reader = Callable[[str, str | None], Rows]
-_FORMATS: tuple[tuple[str, _Reader], ...] = (
+# The text of a file begins so.
+_FORMATS: tuple[tuple[str, Callable[[str, str | None], Rows]], ...] = (
     (r"\A<\?xml[^>]*>\s*(<!--.*?-->\s*)*<gpx|\A<gpx", _of_gpx),
     (r"\A\{", _of_json),
     (r"(?m)\A\$[A-Z]{5},", _of_nmea),
     (r"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)", _of_rtklib),
     (r"(?m)\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW", _of_colmap),
-    (r"(?m)^(VERTEX_SE3:QUAT|VERTEX_SE2|VERTEX2) ", _of_g2o),
+    (r"(?m)^VERTEX_SE(3:QUAT|2) ", _of_g2o),
     (r"\AFormat Version,", _of_motive),
     (r"\A(Segments|Objects|Trajectories)\b.*\r?\n\d+", _of_vicon),
 )

@@ -6,12 +6,13 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files.columns import POSITION, QUATERNION
 from hand_eye_calib.io.trajectory_files.poses import unit_by_size
+from hand_eye_calib.io.trajectory_files.table import check_stamp_unit
 
 _POSE = (*POSITION, *QUATERNION)
 _KINDS = "a path, an array (N, 4, 4), (N, 8) or (N, 7), or a table with named columns"
@@ -49,14 +50,20 @@ def trajectory_from_object(
             raise ConfigError("a Trajectory has stamps and poses already: give no other option")
         return source, []
     names = [name.strip() for name in columns.split(",")] if columns is not None else None
+    values = np.empty(0)
     if hasattr(source, "columns"):
         cells = [np.asarray(source[key]) for key in source.columns]
         names = names or [str(name) for name in source.columns]
     else:
-        values = _array(source)
+        try:
+            values = np.asarray(source, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
+        if values.ndim != 2 and values.shape[1:] != (4, 4):
+            raise InputError(f"expected {_KINDS}; found an array {values.shape}")
         cells = [*values.T] if values.ndim == 2 else []
         names = names or [*(("t", *_POSE) if times is None else _POSE)]
-    if cells or values.ndim != 3:
+    if values.ndim != 3:
         cell_of = _by_name(cells, names, times is None)
         times = cell_of["t"] if times is None else times
         values = np.stack([cell_of[name] for name in _POSE], axis=1).astype(float)
@@ -80,17 +87,6 @@ def trajectory_from_object(
     return Trajectory.from_quat_xyzw(stamps_ns, values[:, :3], values[:, 3:]), notes
 
 
-def _array(source: Any) -> FloatArray:
-    """Matrices (N, 4, 4), or rows (N, k)."""
-    try:
-        values = np.asarray(source, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
-    if values.ndim != 2 and values.shape[1:] != (4, 4):
-        raise InputError(f"expected {_KINDS}; found an array {values.shape}")
-    return values
-
-
 def _by_name(
     cells: Sequence[np.ndarray], names: Sequence[str], needs_times: bool
 ) -> dict[str, np.ndarray]:
@@ -107,14 +103,8 @@ def _by_name(
 
 
 def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:
-    """Stamps (N,) in nanoseconds from numbers or from datetimes.
-
-    Parameters
-    ----------
-    times : (N,) array-like
-        datetime64, or numbers in ``stamp_unit``.
-    stamp_unit : str, optional
-        "s", "ms", "us" or "ns"; if left out, seconds, and for whole numbers as their size tells.
+    """Stamps (N,) in nanoseconds from datetimes, or from numbers in ``stamp_unit``: if left out,
+    seconds, and for whole numbers as their size tells.
 
     Raises
     ------
@@ -123,10 +113,7 @@ def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:
     ConfigError
         For a unit that is not known.
     """
-    if stamp_unit is not None and stamp_unit not in STAMP_UNITS:
-        raise ConfigError(
-            f"unknown unit of stamps {stamp_unit!r}; known are {', '.join(STAMP_UNITS)}"
-        )
+    check_stamp_unit(stamp_unit)
     if getattr(getattr(times, "dtype", None), "tz", None) is not None:
         times = np.asarray(times, dtype="datetime64[ns]")
     stamps = np.asarray(times)

@@ -6,11 +6,12 @@ wrong convention that direction wanders as the vehicle turns. Hand-held sensors 
 all directions; of them this says nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE
@@ -21,18 +22,14 @@ from hand_eye_calib.io.trajectory_files.table import Table
 RADIANS = {"deg": np.pi / 180, "rad": 1.0}
 LARGEST_RAD = 2 * np.pi + 0.01
 # A first orientation so close to the identity is where an odometry starts.
-_IDENTITY_WITHIN = 1e-4
-_SCALAR_FIRST = [1, 2, 3, 0]  # indices that put the scalar last
+_IDENTITY_WITHIN = 1e-8
+# Of eight numbers in files so called, the scalar is the last.
+_SUFFIXES_OF_TUM = ("", ".txt", ".tum")
 
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
 # The inverse rotation in roll, pitch and yaw, as pyboreas has it.
 _INVERSE = "that of the world in the sensor's frame"
-_AXES = {
-    _COMPASS: "x forward, y left, z up",
-    _MATHEMATICAL: "x forward, y left, z up",
-    _INVERSE: "x, y, z of the world where all angles are 0",
-}
 
 # Steps are this share of the extent of the positions, and at least so many are needed.
 _STEPS_IN_EXTENT, _FEWEST_STEPS = 50, 10
@@ -44,20 +41,31 @@ _SMALLEST_SCATTER, _CLEARLY = 0.05, 4.0
 Columns = dict[str, FloatArray]
 
 
-def orientations(table: Table, columns: Columns, positions: FloatArray) -> FloatArray:
-    """Quaternions (N, 4), scalar last; level where there are none."""
-    if UNNAMED[0] in columns:
-        return _of_unknown_order(table, np.stack([columns[name] for name in UNNAMED], 1), positions)
-    if QUATERNION[0] in columns:
-        quats_xyzw = np.stack([columns[name] for name in QUATERNION], axis=1)
-        _check_quaternions(table, quats_xyzw)
-        return quats_xyzw
+def orientations(
+    table: Table, columns: Columns, positions: FloatArray, convention: str = ""
+) -> FloatArray:
+    """Quaternions (N, 4), scalar last; level where there are none. A ``convention`` of angles goes
+    before that which the motion fits.
+    """
+    if UNNAMED[0] in columns or QUATERNION[0] in columns:
+        names = QUATERNION if QUATERNION[0] in columns else UNNAMED
+        quats = np.stack([columns[name] for name in names], axis=1)
+        with np.errstate(over="ignore"):
+            norms = np.linalg.norm(quats, axis=1)
+        table.refuse(
+            np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,
+            lambda index: (
+                f"found a quaternion of length {norms[index]:.4g}, expected 1 within "
+                f"{QUATERNION_NORM_TOLERANCE}; check the column order ({table.expected})"
+            ),
+        )
+        return quats if names == QUATERNION else _in_order(table, quats, positions)
     if not {"yaw", "heading"} & columns.keys():
         return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
-    return _from_angles(table, columns, positions)
+    return _from_angles(table, columns, positions, convention)
 
 
-def unit_of(table: Table, name: str, known: dict[str, float]) -> str:
+def unit_of(table: Table, name: str, known: Mapping[str, float]) -> str:
     """Unit of a quantity in the header; empty if it has none."""
     unit = table.units.get(name, "")
     if unit and unit not in known:
@@ -70,9 +78,11 @@ def unit_of(table: Table, name: str, known: dict[str, float]) -> str:
 def from_matrices(table: Table, rotations: FloatArray) -> FloatArray:
     """Quaternions (N, 4), scalar last, of the nearest rotations: files have few digits."""
     with np.errstate(over="ignore", invalid="ignore"):
-        wrong = ~_is_rotation(rotations)
+        products = np.swapaxes(rotations, 1, 2) @ rotations
+        is_rotation = np.abs(products - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
+    is_rotation[is_rotation] = np.linalg.det(rotations[is_rotation]) > 0
     table.refuse(
-        wrong,
+        np.asarray(~is_rotation, dtype=bool),
         lambda _: (
             f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
             "of the values"
@@ -81,48 +91,23 @@ def from_matrices(table: Table, rotations: FloatArray) -> FloatArray:
     return se3.to_quat_xyzw(se3.nearest_rotation(rotations))
 
 
-def _is_rotation(matrices: FloatArray) -> BoolArray:
-    """Mask of the matrices (N, 3, 3) that are rotations within the tolerance."""
-    products = np.swapaxes(matrices, 1, 2) @ matrices
-    is_orthogonal = np.abs(products - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
-    is_orthogonal[is_orthogonal] = np.linalg.det(matrices[is_orthogonal]) > 0
-    return np.asarray(is_orthogonal, dtype=bool)
-
-
-# ---- quaternions
-
-
-def _check_quaternions(table: Table, quats: FloatArray) -> None:
-    with np.errstate(over="ignore"):
-        norms = np.linalg.norm(quats, axis=1)
-    table.refuse(
-        np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,
-        lambda index: (
-            f"found a quaternion of length {norms[index]:.4g}, expected 1 within "
-            f"{QUATERNION_NORM_TOLERANCE}; check the column order ({table.expected})"
-        ),
-    )
-
-
-def _of_unknown_order(table: Table, quats: FloatArray, positions: FloatArray) -> FloatArray:
-    """Quaternions, scalar last, in the order that start and motion speak for; the scalar is last
+def _in_order(table: Table, quats: FloatArray, positions: FloatArray) -> FloatArray:
+    """Quaternions, scalar last, in the order that motion and start speak for; the scalar is last
     if they say nothing.
     """
-    _check_quaternions(table, quats)
-    scalar_first = quats[:, _SCALAR_FIRST]
-    first_fits, last_fits = (
-        _fits_better(positions, one, other)
-        for one, other in ((quats, scalar_first), (scalar_first, quats))
-    )
+    ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
+    fitting = _fitting(positions, ways)
+    level = [way for way, each in ways.items() if abs(abs(each[0, 3]) - 1.0) < _IDENTITY_WITHIN]
     reason = ""
-    if first_fits:
+    if fitting == ["first"]:
         reason = "the motion keeps a steady direction that way"
-    elif _starts_level(scalar_first) and not last_fits:
+    elif "first" in level and "first" in fitting:
         reason = "the first orientation is the identity that way"
     if reason:
         table.guess(f"quaternions read with the scalar first, t x y z qw qx qy qz: {reason}")
-        return scalar_first
-    if not (_starts_level(quats) or last_fits or table.is_scalar_last_usual):
+        return ways["first"]
+    is_clear = fitting == ["last"] or "last" in level
+    if not is_clear and Path(table.path).suffix.lower() not in _SUFFIXES_OF_TUM:
         table.guess(
             "no columns are named, and nothing tells the order of the quaternion; read with the "
             "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
@@ -130,14 +115,12 @@ def _of_unknown_order(table: Table, quats: FloatArray, positions: FloatArray) ->
     return quats
 
 
-def _starts_level(quats_xyzw: FloatArray) -> bool:
-    return bool(abs(abs(quats_xyzw[0, 3]) - 1.0) < _IDENTITY_WITHIN**2)
-
-
 # ---- angles
 
 
-def _from_angles(table: Table, columns: Columns, positions: FloatArray) -> FloatArray:
+def _from_angles(
+    table: Table, columns: Columns, positions: FloatArray, convention: str
+) -> FloatArray:
     """Quaternions from roll, pitch and yaw (about the fixed axes x, y, z) or heading."""
     given = [name for name in ("roll", "pitch", "yaw", "heading") if name in columns]
     factors = _angle_factors(table, columns, given)
@@ -147,37 +130,32 @@ def _from_angles(table: Table, columns: Columns, positions: FloatArray) -> Float
         columns[name] * factors[name] if name in columns else np.zeros(len(positions))
         for name in ("roll", "pitch")
     )
-    usual, other = (_COMPASS, _MATHEMATICAL) if "heading" in columns else (_MATHEMATICAL, _COMPASS)
-    angles = columns[given[-1]] * factors[given[-1]]
-    ways = {each: _turned(roll, pitch, angles, each) for each in (usual, other, _INVERSE)}
-    table.conventions = [
-        each
-        for each, quats in ways.items()
-        if not any(_fits_better(positions, quats, others) for others in ways.values())
-    ]
-    way = table.convention or table.conventions[0]
+    angle = columns[given[-1]] * factors[given[-1]]
+    # With a compass heading, a positive pitch is nose up, as on aircraft and in INS; with a yaw it
+    # is about y, as in REP 103. Axes of the body are x forward, y left and z up, in a frame with z
+    # up.
+    rpy = {
+        _COMPASS: (roll, -pitch, np.pi / 2 - angle),
+        _MATHEMATICAL: (roll, pitch, angle),
+        _INVERSE: (roll, pitch, angle),
+    }
+    rotations = {
+        way: se3.rotation_from_rpy(np.stack(angles, axis=1)) for way, angles in rpy.items()
+    }
+    rotations[_INVERSE] = np.swapaxes(rotations[_INVERSE], 1, 2)
+    ways = {way: se3.to_quat_xyzw(each) for way, each in rotations.items()}
+    usual = _COMPASS if "heading" in columns else _MATHEMATICAL
+    table.conventions = sorted(_fitting(positions, ways), key=lambda way: way != usual)
+    way = convention or table.conventions[0]
     if way != _MATHEMATICAL or usual != way:
-        if table.convention:
+        why = "" if way == usual else ", because the motion fits that and not the usual"
+        if convention:
             why = ", because that fits the other file with the same columns, too"
-        else:
-            why = "" if way == usual else ", because the motion fits that and not the usual"
-        table.guess(f"{given[-1]} read as {way}{why}; axes of the sensor: {_AXES[way]}")
+        axes = "x forward, y left, z up"
+        if way == _INVERSE:
+            axes = "x, y, z of the world where all angles are 0"
+        table.guess(f"{given[-1]} read as {way}{why}; axes of the sensor: {axes}")
     return ways[way]
-
-
-def _turned(roll: FloatArray, pitch: FloatArray, angle: FloatArray, convention: str) -> FloatArray:
-    """Quaternions of a body with x forward, y left and z up, in a frame with z up.
-
-    With a compass heading, a positive pitch is nose up, as on aircraft and in INS; with a yaw it
-    is about y, as in REP 103.
-    """
-    if convention == _INVERSE:
-        in_sensor = se3.rotation_from_rpy(np.stack([roll, pitch, angle], axis=1))
-        return se3.to_quat_xyzw(np.swapaxes(in_sensor, 1, 2))
-    is_compass = convention == _COMPASS
-    yaw = np.pi / 2 - angle if is_compass else angle
-    rpy = np.stack([roll, -pitch if is_compass else pitch, yaw], axis=1)
-    return se3.to_quat_xyzw(se3.rotation_from_rpy(rpy))
 
 
 def _angle_factors(table: Table, columns: Columns, given: Sequence[str]) -> dict[str, float]:
@@ -199,29 +177,31 @@ def _angle_factors(table: Table, columns: Columns, given: Sequence[str]) -> dict
 # ---- what the motion says
 
 
-def _fits_better(positions: FloatArray, quats_xyzw: FloatArray, others_xyzw: FloatArray) -> bool:
-    """Whether the motion fits other orientations of the sensor in the frame of the positions
-    clearly better; false if it says nothing.
+def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]:
+    """Of ways to read the sensor's orientations (N, 4) in the frame of the positions (N, 3), those
+    that the motion does not contradict: another does not fit it clearly better.
     """
-    rows = _apart(positions)
-    if len(rows) <= _FEWEST_STEPS:
-        return False
+    moved = _steps(positions)
+    if moved.sum() <= _FEWEST_STEPS:
+        return [*ways]
+    rows = np.flatnonzero(moved)
     steps = np.diff(positions[rows], axis=0)
-    scatter = _scatter(steps, quats_xyzw[rows[:-1]])
-    other = _scatter(steps, others_xyzw[rows[:-1]])
-    return scatter > _SMALLEST_SCATTER and scatter > _CLEARLY * other
+    scatters = {way: _scatter(steps, quats[rows[:-1]]) for way, quats in ways.items()}
+    largest = max(_SMALLEST_SCATTER, _CLEARLY * min(scatters.values()))
+    return [way for way, scatter in scatters.items() if scatter <= largest]
 
 
-def _apart(positions: FloatArray) -> IntArray:
-    """Rows between which the sensor has moved on by a step."""
+def _steps(positions: FloatArray) -> BoolArray:
+    """Whether the sensor has moved on by a step at each row."""
     step = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
     if not step > 0:
-        return np.arange(0)
+        return np.zeros(len(positions), dtype=bool)
     travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
-    rows = np.flatnonzero(np.diff(np.floor(travelled / step), prepend=-1.0))
+    moved = np.diff(np.floor(travelled / step), prepend=-1.0) != 0
     # Of a sensor that stands still, the noise of the positions adds up to a path.
-    moved = np.linalg.norm(np.diff(positions[rows], axis=0), axis=1) > step / 3
-    return rows[np.r_[True, moved]]
+    rows = np.flatnonzero(moved)[1:]
+    moved[rows] = np.linalg.norm(np.diff(positions[moved], axis=0), axis=1) > step / 3
+    return np.asarray(moved, dtype=bool)
 
 
 def _scatter(steps: FloatArray, quats_xyzw: FloatArray) -> float:

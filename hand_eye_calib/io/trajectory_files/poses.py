@@ -8,7 +8,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first, wrong_latitude
+from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
 from hand_eye_calib.io.plausibility import check_positions
 from hand_eye_calib.io.trajectory_files.columns import MATRIX
 from hand_eye_calib.io.trajectory_files.orientations import (
@@ -56,13 +56,14 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     largest = max(map(abs, table.stamps))
     recognised = unit or unit_by_size(largest)
     factor = STAMP_UNITS[recognised]
-    if largest > Decimal(_LARGEST_NS) / factor:
-        index = max(range(len(table.stamps)), key=lambda index: abs(table.stamps[index]))
-        raise InputError(
-            f"{table.path}, line {table.line_numbers[index]}: the timestamp "
-            f"{table.stamps[index]:.6g} is too large for {recognised}; name its unit with "
-            "`stamp_unit`"
-        )
+    is_large = np.array([abs(stamp) > Decimal(_LARGEST_NS) / factor for stamp in table.stamps])
+    table.refuse(
+        is_large,
+        lambda index: (
+            f"the timestamp {table.stamps[index]:.6g} is too large for {recognised}; name its unit "
+            "with `stamp_unit`"
+        ),
+    )
     rounded = (int((stamp * factor).to_integral_value()) for stamp in table.stamps)
     stamps_ns = np.fromiter(rounded, dtype=np.int64, count=len(table.stamps))
     # Stamps with a fraction are in seconds.
@@ -97,20 +98,16 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
                 "and drop repeated timestamps, or have that done with `repair`"
             ),
         )
-    order = np.argsort(stamps_ns, kind="stable")
-    repeated = np.r_[False, stamps_ns[order][1:] == stamps_ns[order][:-1]]
-    backward, dropped = int((stamps_ns[1:] < stamps_ns[:-1]).sum()), np.flatnonzero(repeated)
+    keep = np.unique(stamps_ns, return_index=True)[1]
+    backward, n_dropped = int((np.diff(stamps_ns) < 0).sum()), len(stamps_ns) - len(keep)
     repairs = []
     if backward:
         repairs.append(
             f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"
         )
-    if len(dropped):
-        repairs.append(f"dropped {len(dropped)} whose stamp was there already")
-        values = table.values[order]
-        differing = int((values[dropped] != values[dropped - 1]).any(axis=1).sum())
-        repairs += [f"{differing} of these with another pose"] if differing else []
-    return order[~repeated], [f"{table.path}: {'; '.join(repairs)}"]
+    if n_dropped:
+        repairs.append(f"dropped {n_dropped} whose stamp was there already")
+    return keep, [f"{table.path}: {'; '.join(repairs)}"]
 
 
 def seconds(stamp_ns: int) -> str:
@@ -122,9 +119,9 @@ def seconds(stamp_ns: int) -> str:
 # ---- poses
 
 
-def poses_of(table: Table) -> tuple[FloatArray, FloatArray]:
+def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, FloatArray]:
     """Positions (N, 3), m, and quaternions (N, 4), scalar last, of a table; what had to be guessed
-    is added to its ``guesses``.
+    is added to its ``guesses``. A ``convention`` of its angles goes before what the motion says.
 
     Raises
     ------
@@ -138,12 +135,12 @@ def poses_of(table: Table) -> tuple[FloatArray, FloatArray]:
         return positions, from_matrices(table, matrices[:, :, :3])
     columns = dict(zip(table.quantities, values.T, strict=True))
     if "lat" in columns:
-        return _in_local_frame(table, columns)
+        return _in_local_frame(table, columns, convention)
     positions = np.zeros((len(values), 3))
     if "x" in columns:
         names = ("x", "y", "height" if "height" in columns else "z")
         positions = np.stack([_lengths(table, columns, name) for name in names], axis=1)
-    return _checked(table, positions), orientations(table, columns, positions)
+    return _checked(table, positions), orientations(table, columns, positions, convention)
 
 
 def rates_of(table: Table) -> FloatArray:
@@ -197,26 +194,27 @@ def _lengths(table: Table, columns: Columns, name: str) -> FloatArray:
     return np.zeros(len(table.line_numbers))
 
 
-def _in_local_frame(table: Table, columns: Columns) -> tuple[FloatArray, FloatArray]:
+def _in_local_frame(
+    table: Table, columns: Columns, convention: str
+) -> tuple[FloatArray, FloatArray]:
     """Poses from latitude, longitude and height, in the frame of the first one."""
     lats, lons = columns["lat"], columns["lon"]
-    is_small = max(np.abs(lats).max() * 2, np.abs(lons).max()) <= np.pi
     named = unit_of(table, "lat", RADIANS) or unit_of(table, "lon", RADIANS)
-    factor = RADIANS[named or ("rad" if is_small else "deg")]
-    lat, lon = lats * factor, lons * factor
-    are_swapped = bool(np.abs(lat).min() > np.pi / 2 >= np.abs(lon).max())
+    is_small = max(np.abs(lats).max() * 2, np.abs(lons).max()) <= np.pi
+    unit = named or ("rad" if is_small else "deg")
+    lat, lon = lats * RADIANS[unit], lons * RADIANS[unit]
     table.refuse(
         (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > LARGEST_RAD),
         lambda index: (
-            f"{wrong_latitude(lats[index], lons[index])}, or the names of the columns"
-            if are_swapped
-            else f"found latitude {lats[index]:.7g}, longitude {lons[index]:.7g}; expected degrees "
-            "or radians"
+            f"found latitude {lats[index]:.7g}, longitude {lons[index]:.7g}; expected degrees or "
+            "radians, and no latitude beyond 90 deg: perhaps they are swapped"
         ),
     )
     positions = LocalOrigin().local(lat, lon, _lengths(table, columns, "height"))
-    unit = "" if named else f", in {'radians' if is_small else 'degrees'} by their size,"
-    table.guess(f"latitude and longitude{unit} became metres east and north of the first position")
-    quats_xyzw = orientations(table, columns, _checked(table, positions))
+    by_size = "" if named else f", in {unit} by their size,"
+    table.guess(
+        f"latitude and longitude{by_size} became metres east and north of the first position"
+    )
+    quats_xyzw = orientations(table, columns, _checked(table, positions), convention)
     in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
     return positions, se3.to_quat_xyzw(rotations_to_first(lat, lon) @ in_local)

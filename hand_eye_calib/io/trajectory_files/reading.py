@@ -10,11 +10,9 @@ from numpy.typing import ArrayLike
 
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.columns import measured_by
-from hand_eye_calib.io.trajectory_files.formats import AUTO, FileOptions
 from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, rates_of, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import Table, read_table
+from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
 from hand_eye_calib.io.transforms import TfSource
 
 _Path = str | Path
@@ -22,15 +20,8 @@ _USUAL = FileOptions.format
 
 
 class FileReading(NamedTuple):
-    """A trajectory, and what a person should know of the file.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-    repairs : list of str
-        What was wrong with the stamps.
-    guesses : list of str
-        What the file does not say and had to be found or assumed.
+    """A trajectory; what was wrong with its stamps; and what the file does not say and had to be
+    found or assumed.
     """
 
     trajectory: Trajectory
@@ -143,7 +134,7 @@ def read_trajectory_file(path: _Path, format: str = _USUAL, **options: Any) -> F
     """Read a text file as :func:`read_trajectory`, with the options of FileOptions, and without
     warnings.
     """
-    return _read(path, FileOptions(format=format, **options))[0]
+    return read_trajectory_files([(path, FileOptions(format=format, **options))])[0]
 
 
 def read_trajectory_files(files: Sequence[tuple[_Path, FileOptions]]) -> list[FileReading]:
@@ -159,41 +150,38 @@ def read_trajectory_files(files: Sequence[tuple[_Path, FileOptions]]) -> list[Fi
     for header in {table.header for _, table in read if table.conventions}:
         rows = [row for row, (_, table) in enumerate(read) if table.header == header]
         tables = [read[row][1] for row in rows]
-        if len({table.conventions[0] for table in tables}) < 2:
-            continue
-        sets = [table.conventions for table in tables]
-        common = [each for each in sets[0] if all(each in others for others in sets)]
-        if not common:
-            raise InputError(
-                f"{' and '.join(str(table.path) for table in tables)} have the same columns, but "
-                "no convention of their angles fits the motion of all; write quaternions instead, "
-                "or name the column of one yaw (counterclockwise) and of the other heading "
-                "(clockwise from north) if that is what they are"
-            )
-        for row in rows:
-            read[row] = _read(*files[row], convention=common[0])
+        if len({table.conventions[0] for table in tables}) > 1:
+            common = set(tables[0].conventions).intersection(*(each.conventions for each in tables))
+            if not common:
+                raise InputError(
+                    f"{' and '.join(str(table.path) for table in tables)} have the same columns, "
+                    "but no convention of their angles fits the motion of all; write quaternions "
+                    "instead, or name the column of one yaw (counterclockwise) and of the other "
+                    "heading (clockwise from north) if that is what they are"
+                )
+            way = next(each for each in tables[0].conventions if each in common)
+            for row in rows:
+                read[row] = _read(*files[row], convention=way)
     return [reading for reading, _ in read]
 
 
 def _read(path: _Path, options: FileOptions, convention: str = "") -> tuple[FileReading, Table]:
     """The trajectory of a file, and the table it was made from."""
     table = read_table(path, options)
-    table.convention = convention
     if not table.stamps:
         raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
     stamps_ns = stamps_in_ns(table, options.stamp_unit)
-    found = measured_by(table.quantities)
-    if found == "rates":
+    if table.measures == "rates":
         rates = rates_of(table)
         keep, repairs = in_order(table, stamps_ns, options.repair)
         trajectory = Trajectory.from_rates(stamps_ns[keep], rates[keep])
         return FileReading(trajectory, repairs, table.guesses), table
-    positions, quats_xyzw = poses_of(table)
+    positions, quats_xyzw = poses_of(table, convention)
     keep, repairs = in_order(table, stamps_ns, options.repair)
     trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
-    if found != "poses":
-        table.guesses.append(f"{path}: {found} alone, as its columns have it")
-    kind = found if options.measures == AUTO else options.measures
+    if table.measures != "poses":
+        table.guess(f"{table.measures} alone, as its columns have it")
+    kind = table.measures if options.measures == AUTO else options.measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
     return FileReading(trajectory, repairs, table.guesses), table

@@ -2,6 +2,7 @@
 have, and what stands in which column.
 """
 
+import csv
 import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,28 +16,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE, MOST_COLUMNS
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
+    QUATERNION,
     UNNAMED,
     are_columns,
     choose_columns,
     listed,
 )
 from hand_eye_calib.io.trajectory_files.foreign import rows_of
-from hand_eye_calib.io.trajectory_files.formats import (
-    AUTO,
-    FIXED_FORMATS,
-    TUM_COLUMNS,
-    FileOptions,
-)
 
 _Path = str | Path
 # A line and its number, from 1.
 Line = tuple[int, str]
+
+#: The format that the lines look like.
+AUTO = "auto"
+TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 _NS_PER_S = 1_000_000_000
 # Characters of a line that a message shows, and of a reason.
@@ -52,45 +53,62 @@ _NUMBER = re.compile(
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
-# Of eight numbers in files so called, the scalar is the last.
-_SUFFIXES_OF_TUM = ("", ".txt", ".tum")
 _TIMES = "times.txt"
 # What four columns without names are.
 _OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`.
+
+    Raises
+    ------
+    ConfigError
+        For what is not known or does not go together.
+    """
+
+    format: str = "tum"
+    columns: str | None = None
+    times: str | Path | None = None
+    stamp_unit: str | None = None
+    repair: bool = False
+    measures: str = AUTO
+
+    def __post_init__(self) -> None:
+        check_stamp_unit(self.stamp_unit)
+        known = (*TRAJECTORY_FORMATS, AUTO)
+        if self.format not in known:
+            raise ConfigError(
+                f"unknown trajectory format {self.format!r}; known are {', '.join(known)}"
+            )
+        for given, of, what in (
+            (self.columns, "csv", "columns are named for"),
+            (self.times, "kitti", "a file of times belongs to"),
+        ):
+            if given is not None and self.format not in (of, AUTO):
+                raise ConfigError(f"{what} format {of} only; the format is {self.format}")
+
+
+def check_stamp_unit(unit: str | None) -> None:
+    """Refuse a unit of stamps that is not known, with a ConfigError."""
+    if unit is not None and unit not in STAMP_UNITS:
+        raise ConfigError(f"unknown unit of stamps {unit!r}; known are {', '.join(STAMP_UNITS)}")
+
 
 # ---- lines
 
 
 class Lines:
-    """The lines of a text that are not empty, with their numbers.
+    """The lines of a text file that are not empty, with their numbers; an InputError if it cannot
+    be read.
 
     They are found anew each time: a list of them would take many times the memory of the text.
-
-    Parameters
-    ----------
-    path : str or path-like
-        For messages.
-    text : str
-        Its lines end with a line feed, a carriage return or both.
-    after : int
-        Lines up to this number are left out.
     """
 
-    def __init__(self, path: _Path, text: str, after: int = 0) -> None:
-        if "\r" in text:
-            text = text.replace("\r\n", "\n").replace("\r", "\n")
-        self._path, self._text, self._after = path, text, after
-
-    @classmethod
-    def of_file(cls, path: _Path, expected: str) -> "Lines":
-        """Of a text file.
-
-        Raises
-        ------
-        InputError
-            If it cannot be read.
-        """
-        return cls(path, read_text(path, f"lines of {expected}", LARGEST_TEXT))
+    def __init__(self, path: _Path, expected: str = "a trajectory") -> None:
+        text = read_text(path, f"lines of {expected}", LARGEST_TEXT)
+        self._path, self._text = path, text.replace("\r\n", "\n").replace("\r", "\n")
 
     def __iter__(self) -> Iterator[Line]:
         number, end = 1, 0
@@ -101,37 +119,46 @@ class Lines:
                 raise InputError(
                     f"{self._path}, line {number}: longer than {LONGEST_LINE} characters"
                 )
-            if number > self._after:
-                yield number, found.group()
+            yield number, found.group()
 
-    def after(self, number: int) -> "Lines":
-        """The lines after one."""
-        return Lines(self._path, self._text, number)
-
-    def data(self) -> Iterator[Line]:
-        """The lines that are neither blank nor comments."""
+    def data(self, after: int = 0) -> Iterator[Line]:
+        """The lines after one that are neither blank nor comments."""
         for number, text in self:
             stripped = text.strip()
-            if stripped and not stripped.startswith("#"):
+            if number > after and stripped and not stripped.startswith("#"):
                 yield number, text
 
     def first(self) -> Line:
         """The first of them; 0 and nothing if there is none."""
         return next(self.data(), (0, ""))
 
+    def header(self) -> tuple[list[str] | None, int]:
+        """Names of the columns, if the file has any, and the number of the line that they take.
+
+        They are the first line that is no comment, unless it is a row of numbers; otherwise the
+        last comment above the data that has as many cells.
+        """
+        number, row = self.first()
+        cells = _cells_of(row)
+        if number and not _is_row(cells):
+            return cells, number
+        header = None
+        for _, text in takewhile(lambda line: line[0] != number, self):
+            names = _cells_of(text.strip().lstrip("#").strip())
+            header = names if len(names) == len(cells) and not _is_row(names) else header
+        return header or None, 0
+
 
 def _cells_of(text: str) -> list[str]:
     """The cells of a line: separated by commas, semicolons or white space."""
     if "," not in text and ";" not in text:
         return text.split()
-    import csv
-
     delimiter = ";" if ";" in text else ","
     row = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))
     cells = [cell.strip() for cell in row]
     if delimiter == ";" and "," in text:
         return [
-            cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells
+            each.replace(",", ".") if _DECIMAL_COMMA.fullmatch(each) else each for each in cells
         ]
     return cells
 
@@ -145,30 +172,27 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 class Layout(NamedTuple):
-    """What a file looks like.
-
-    Attributes
-    ----------
-    format : str
-        One of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`; tum in doubt, so that its reader
-        says what is wrong.
-    is_named : bool
-        Whether the file itself names its columns.
+    """What a file looks like: one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum in
+    doubt, so that its reader says what is wrong; and whether the file itself names its columns.
     """
 
     format: str
     is_named: bool
 
 
-def layout_of(lines: Lines) -> Layout:
-    """The layout that the first lines of a file have."""
+def layout_of_file(path: _Path) -> Layout:
+    """What the lines of a file look like; an InputError if it cannot be read."""
+    return _layout_of(Lines(path))
+
+
+def _layout_of(lines: Lines) -> Layout:
     data = lines.first()[1].strip()
     cells = _cells_of(data)
     is_separated, n_cells = "," in data or ";" in data, len(cells)
     if not _is_row(cells):
         is_table = is_separated or n_cells >= 8 or are_columns(cells)
         return Layout("csv" if is_table else "tum", is_table)
-    names, _ = _header_of(lines)
+    names, _ = lines.header()
     if names is not None and are_columns(names):
         is_tum = not is_separated and " ".join(names).lower().endswith(TUM_COLUMNS[10:])
         return Layout("tum" if is_tum else "csv", True)
@@ -178,80 +202,42 @@ def layout_of(lines: Lines) -> Layout:
     return Layout("euroc" if is_ns and n_cells >= 8 else "csv", False)
 
 
-def layout_of_file(path: _Path) -> Layout:
-    """What the lines of a file look like.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    return layout_of(Lines.of_file(path, "a trajectory"))
-
-
-def _header_of(lines: Lines) -> tuple[list[str] | None, Lines]:
-    """Names of the columns, if the file has any, and the lines after a header.
-
-    The header is the first line that is no comment, unless it is a row of numbers; otherwise the
-    last comment above the data that has as many cells.
-    """
-    number, row = lines.first()
-    cells = _cells_of(row)
-    if number and not _is_row(cells):
-        return cells, lines.after(number)
-    header = None
-    for _, text in takewhile(lambda line: line[0] != number, lines):
-        names = _cells_of(text.strip().lstrip("#").strip())
-        header = names if len(names) == len(cells) and not _is_row(names) else header
-    return header or None, lines
-
-
 # ---- tables
 
 
 @dataclass
 class Table:
-    """The rows of a file.
+    """The rows of a file: their line numbers, stamps, and values, one row after the other.
 
     Attributes
     ----------
-    path : str or path-like
     expected : str
         What a row should be, for messages.
     quantities : tuple of str
         What the values of a row are, in their order, such as "x" or "qw".
-    stamp_unit : str
-        Unit of the stamps; empty if it has to be recognised.
-    units : dict
-        Units of quantities that the header names.
-    line_numbers : array of int
-    stamps : list of Decimal
-    numbers : array of float
-        The values of all rows, one row after the other.
+    measures : str
+        What they measure, one of config.MEASURES.
+    stamp_unit, units : str, dict
+        Those of the stamps and of quantities that the header names.
     guesses : list of str
         What a person should know of how the file was read.
-    is_scalar_last_usual : bool
-        Whether in such files the scalar of a quaternion is the last as a rule.
     header : tuple of str
         The names of all columns; empty without.
-    convention : str
-        How to read angles; empty to find out from the motion.
     conventions : list of str
-        Those of the angles that the motion does not contradict, the usual first.
+        Those of its angles that the motion does not contradict, the usual first.
     """
 
     path: _Path
     expected: str
     quantities: tuple[str, ...]
+    measures: str = "poses"
     stamp_unit: str = ""
     units: dict[str, str] = field(default_factory=dict)
     line_numbers: "array[int]" = field(default_factory=lambda: array("q"))
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
     guesses: list[str] = field(default_factory=list)
-    is_scalar_last_usual: bool = False
     header: tuple[str, ...] = ()
-    convention: str = ""
     conventions: list[str] = field(default_factory=list)
 
     @property
@@ -345,17 +331,16 @@ def read_table(path: _Path, options: FileOptions) -> Table:
     """
     if (found := rows_of(path, options.columns)) is not None:
         names, rows = found.header.split(","), enumerate(found.rows, 1)
-        table = table_of(path, names, rows, texts, options.measures)
+        table = table_of(path, names, rows, lambda row: [*map(str, row)], options.measures)
         table.guesses += [f"{path}: {note}" for note in found.notes]
         return table
-    lines = Lines.of_file(path, "a trajectory")
-    layout = Layout(options.format, True)
-    columns, times, guesses = options.columns, options.times, list[str]()
+    lines = Lines(path)
+    layout, guesses = Layout(options.format, True), list[str]()
+    columns, times = options.columns, options.times
     if options.format == AUTO:
-        layout = layout_of(lines)
+        layout = _layout_of(lines)
         if columns is None and times is None:
-            n_columns = len(_cells_of(lines.first()[1]))
-            if n_columns == 4 and not layout.is_named:
+            if not layout.is_named and len(_cells_of(lines.first()[1])) == 4:
                 columns = _OF_FOUR.get(options.measures)
                 if columns is None:
                     raise InputError(
@@ -374,11 +359,73 @@ def read_table(path: _Path, options: FileOptions) -> Table:
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
     if layout.format == "csv":
         table = _read_csv(path, lines, columns, options)
+    elif layout.format == "kitti":
+        table = _read_kitti(path, lines, times)
     else:
-        table = _read_fixed(path, lines, layout, times)
+        table = _read_poses(path, lines, layout)
     table.guesses[:0] = guesses
-    is_auto_tum = options.format == AUTO and layout.format == "tum"
-    table.is_scalar_last_usual = is_auto_tum and Path(path).suffix.lower() in _SUFFIXES_OF_TUM
+    return table
+
+
+def _read_poses(path: _Path, lines: Lines, layout: Layout) -> Table:
+    """A stamp, a position and a quaternion, in the order of tum or of euroc."""
+    if layout.format == "euroc":
+        expected = "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz"
+        table = Table(path, expected, (*POSITION, "qw", "qx", "qy", "qz"), stamp_unit="ns")
+        table.fill(
+            lines.data(),
+            lambda text: [*map(str.strip, text.split(","))],
+            *(8, range(1, 8)),
+            may_have_more=True,
+        )
+        return table
+    quaternion = QUATERNION if layout.is_named else UNNAMED
+    table = Table(path, f"8 numbers, {TUM_COLUMNS}", (*POSITION, *quaternion))
+    table.fill(lines.data(), str.split, 8, range(1, 8))
+    return table
+
+
+def _read_kitti(path: _Path, lines: Lines, times: _Path | None) -> Table:
+    """Matrices, whose stamps are in a file of their own."""
+    if times is None:
+        raise ConfigError(
+            f"{path}: the poses of format kitti have no stamps; name their file with `times`"
+        )
+    table = Table(path, "12 numbers, the first three rows of a pose", MATRIX)
+    table.fill(lines.data(), str.split, len(MATRIX), range(len(MATRIX)), ())
+    stamps = Table(times, "a stamp", ())
+    stamps.fill(Lines(times, "stamps").data(), str.split, 1, (), may_have_more=True)
+    table.stamps = stamps.stamps
+    if len(stamps.stamps) != len(table.line_numbers):
+        raise InputError(
+            f"{path}: {len(table.line_numbers)} poses, but {times} has {len(stamps.stamps)} "
+            "stamps; they belong to different recordings"
+        )
+    return table
+
+
+def _read_csv(path: _Path, lines: Lines, columns: str | None, options: FileOptions) -> Table:
+    """Columns by the names in the header, or by those given."""
+    number, row = lines.first()
+    cells = _cells_of(row)
+    if columns is None:
+        header, after = lines.header()
+    else:
+        header = [name.strip() for name in columns.split(",")]
+        after = 0 if any(map(_NUMBER.fullmatch, cells)) else number
+    if header is None:  # a stamp, a position and a quaternion, whose order is to be found
+        if cells and not (options.format == AUTO and len(cells) == 8):
+            raise InputError(
+                f"{path}: the first line names no columns, so the order of the quaternion is "
+                "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
+                f"{len(cells)}"
+            )
+        expected = "8 columns: a stamp, a position and a quaternion"
+        table = Table(path, expected, (*POSITION, *UNNAMED))
+        table.fill(lines.data(), _cells_of, 8, range(1, 8))
+        return table
+    table = table_of(path, header, lines.data(after), _cells_of, options.measures)
+    table.header = tuple(header)
     return table
 
 
@@ -398,69 +445,9 @@ def table_of(
     """
     if len(names) > MOST_COLUMNS:
         raise InputError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
-    chosen = choose_columns(path, names, measures=measures)
+    chosen = choose_columns(path, names, measures)
     expected = f"{len(names)} columns: {listed(names)}"
-    table = Table(path, expected, tuple(chosen.quantities), chosen.stamp_unit, chosen.units)
-    table.fill(lines, cells_of, len(names), [*chosen.quantities.values()], chosen.stamp)
-    return table
-
-
-def texts(row: Sequence[Any]) -> list[str]:
-    """The cells of a row of any values."""
-    return [*map(str, row)]
-
-
-def _read_fixed(path: _Path, lines: Lines, layout: Layout, times: _Path | None) -> Table:
-    """A format whose columns have fixed places; kitti has its stamps in a file of their own."""
-    format = FIXED_FORMATS[layout.format]
-    quantities = (
-        format.quantities if layout.is_named or layout.format != "tum" else (*POSITION, *UNNAMED)
-    )
-    table = Table(path, format.expected, quantities, format.stamp_unit)
-    has_stamps = quantities != MATRIX
-    if not has_stamps and times is None:
-        raise ConfigError(
-            f"{path}: the poses of format kitti have no stamps; name their file with `times`"
-        )
-
-    def cells_of(text: str) -> list[str]:
-        return [cell.strip() for cell in text.split(format.separator)]
-
-    at, more = range(has_stamps, format.n_columns), format.separator is not None
-    table.fill(lines.data(), cells_of, format.n_columns, at, (0,) * has_stamps, more)
-    if times is not None:
-        stamps = Table(times, "a stamp", ())
-        stamps.fill(Lines.of_file(times, "stamps").data(), str.split, 1, (), may_have_more=True)
-        table.stamps = stamps.stamps
-        if len(stamps.stamps) != len(table.line_numbers):
-            raise InputError(
-                f"{path}: {len(table.line_numbers)} poses, but {times} has {len(stamps.stamps)} "
-                "stamps; they belong to different recordings"
-            )
-    return table
-
-
-def _read_csv(path: _Path, lines: Lines, columns: str | None, options: FileOptions) -> Table:
-    """Columns by the names in the header, or by those given."""
-    if columns is None:
-        header, lines = _header_of(lines)
-    else:
-        header = [name.strip() for name in columns.split(",")]
-        number, row = lines.first()
-        if number and not any(map(_NUMBER.fullmatch, _cells_of(row))):
-            lines = lines.after(number)
-    if header is None:  # a stamp, a position and a quaternion, whose order is to be found
-        n_columns = len(_cells_of(lines.first()[1]))
-        if n_columns and not (options.format == AUTO and n_columns == 8):
-            raise InputError(
-                f"{path}: the first line names no columns, so the order of the quaternion is "
-                "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
-                f"{n_columns}"
-            )
-        expected = "8 columns: a stamp, a position and a quaternion"
-        table = Table(path, expected, (*POSITION, *UNNAMED))
-        table.fill(lines.data(), _cells_of, 8, range(1, 8))
-        return table
-    table = table_of(path, header, lines.data(), _cells_of, options.measures)
-    table.header = tuple(header)
+    quantities, at = zip(*chosen.quantities.items(), strict=True)
+    table = Table(path, expected, quantities, chosen.measures, chosen.stamp_unit, chosen.units)
+    table.fill(lines, cells_of, len(names), at, chosen.stamp)
     return table

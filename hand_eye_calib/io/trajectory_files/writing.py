@@ -9,8 +9,8 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.files import write_atomically
-from hand_eye_calib.io.trajectory_files.formats import TUM_COLUMNS
 from hand_eye_calib.io.trajectory_files.poses import seconds
+from hand_eye_calib.io.trajectory_files.table import TUM_COLUMNS
 
 
 def write_trajectory(
