@@ -4,6 +4,7 @@ The one engine of the node, of the replay of bags and of the Python API. It know
 files.
 """
 
+import contextlib
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,6 +33,9 @@ from hand_eye_calib.results.calibration import Calibration
 # Bounds of a quaternion's squared length.
 _MIN_NORM2 = (1 - QUATERNION_NORM_TOLERANCE) ** 2
 _MAX_NORM2 = (1 + QUATERNION_NORM_TOLERANCE) ** 2
+
+# Share of the poses that are paired if a buffer is full.
+_PAIRED_IF_FULL = 0.9
 
 
 class UnusablePose(InputError):
@@ -113,7 +117,7 @@ class Calibrator:
 
     def statistics(self, stream: str) -> StreamStatistics:
         """StreamStatistics of "parent" or "child"."""
-        return self._buffers[stream].statistics
+        return replace(self._buffers[stream].statistics)
 
     def frame(self, stream: str) -> str:
         """Name of a stream's sensor frame, as its messages give it; empty if it is not known."""
@@ -129,9 +133,7 @@ class Calibrator:
             If the name is empty, or another than before.
         """
         known = self._buffers[stream].frame
-        if sensor_frame == known and known:
-            return
-        if getattr(self._config, f"{stream}_frame"):
+        if getattr(self._config, f"{stream}_frame") or (sensor_frame and sensor_frame == known):
             return
         if not sensor_frame:
             raise InputError(
@@ -178,7 +180,7 @@ class Calibrator:
             raise _what_is_wrong(position, quat_xyzw)
         buffer = self._buffers[stream]
         if buffer.is_full:
-            self._make_pairs(1 - self._limits.share_kept)
+            self._make_pairs(_PAIRED_IF_FULL)
             for each in self._buffers.values():
                 if each.is_full:
                     # The other stream has no poses at these times: they cannot be paired.
@@ -233,8 +235,7 @@ class Calibrator:
             stop = others[bisect_left(others, first)]
             for name, rows in rows_of.items():
                 due = int(rows.searchsorted(first)) + self._buffers[name].room_until_pairing
-                if due < len(rows):
-                    stop = min(stop, int(rows[due]))
+                stop = min(stop, int(rows[due])) if due < len(rows) else stop
             for name, rows in rows_of.items():
                 part = rows[rows.searchsorted(first) : rows.searchsorted(stop)]
                 if len(part):
@@ -288,34 +289,31 @@ class Calibrator:
         """Make the oldest poses into pairs, keep the pairs, and drop the poses.
 
         Poses are settled if no late arrivals are expected among them: those older than the newest
-        by a while, or the given share of them.
+        by a while, or the given share of them; at most a batch.
         """
         parent, child = self._buffers["parent"], self._buffers["child"]
-        if not len(parent) or not len(child):
-            return
         config = self._config_with_time_offset(estimate=settled_share is not None)
-        if config is None:
+        if config is None or not len(parent) or not len(child):
             return
-        offset_ns = round(fixed_time_offset(config) * 1e9)
-        horizon_ns = min(
-            self._settled_until_ns(parent, settled_share),
-            self._settled_until_ns(child, settled_share) + offset_ns,
-        )
+        offset_ns, limits = round(fixed_time_offset(config) * 1e9), self._limits
+
+        def settled_until_ns(buffer: PoseBuffer) -> int:
+            late_ns = limits.late_ns if settled_share is None else 0
+            newest_ns = buffer.stamp_at(1.0 if settled_share is None else settled_share)
+            return min(newest_ns - late_ns, buffer.stamp_of(limits.batch))
+
+        horizon_ns = min(settled_until_ns(parent), settled_until_ns(child) + offset_ns)
         if settled_share is None:
             # At least half a batch of the longer buffer is settled.
             longer, ahead_ns = (parent, 0) if len(parent) >= len(child) else (child, offset_ns)
-            if horizon_ns < longer.stamp_of(self._limits.batch // 2) + ahead_ns:
+            if horizon_ns < longer.stamp_of(limits.batch // 2) + ahead_ns:
                 return
         if self._paired_at is None:
             self._paired_at = slower_stream(parent.stamps_ns, child.stamps_ns)
+        of_parent = parent.poses(horizon_ns).trajectory
         of_child = child.poses(horizon_ns - offset_ns).trajectory
-        made = pair_poses(
-            config,
-            parent.poses(horizon_ns).trajectory,
-            self._time_offset.steadied(of_child) if self._time_offset else of_child,
-            self._paired_at,
-            self._kept_parts[-1],
-        )
+        of_child = self._time_offset.steadied(of_child) if self._time_offset else of_child
+        made = pair_poses(config, of_parent, of_child, self._paired_at, self._kept_parts[-1])
         made = made[made.stamps_ns <= horizon_ns]
         if len(made):
             self._kept_parts.append(made)
@@ -324,14 +322,6 @@ class Calibrator:
         unpaired = parent.stamp_of(0) > horizon_ns or child.stamp_of(0) + offset_ns > horizon_ns
         parent.drop(horizon_ns, unpaired=unpaired)
         child.drop(horizon_ns - offset_ns, unpaired=unpaired)
-
-    def _settled_until_ns(self, buffer: PoseBuffer, settled_share: float | None) -> int:
-        """Stamp up to which the poses of a buffer are settled, at most a batch of them."""
-        if settled_share is None:
-            settled_ns = buffer.stamp_at(1) - self._limits.late_ns
-        else:
-            settled_ns = buffer.stamp_at(settled_share)
-        return min(settled_ns, buffer.stamp_of(self._limits.batch))
 
     @property
     def _kept(self) -> PosePairs:
@@ -346,17 +336,14 @@ class Calibrator:
         """
         if not isinstance(self._config.time_offset, str):
             return self._config
-        if self._time_offset is None and not estimate:
-            return None
-        if self._time_offset is None:
+        if self._time_offset is None and estimate:
             parent, child = self._buffers["parent"].poses(), self._buffers["child"].poses()
-            try:
+            with contextlib.suppress(NotEnoughDataError):
                 self._time_offset = self._proposed_offset or estimated_time_offset(
                     self._config, parent.trajectory, child.trajectory
                 )
-            except NotEnoughDataError:
-                return None
-        return replace(self._config, time_offset=self._time_offset.seconds)
+        found = self._time_offset
+        return replace(self._config, time_offset=found.seconds) if found else None
 
 
 def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:
@@ -369,14 +356,12 @@ def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:
 
 def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> InputError:
     """The InputError for values that are not a pose."""
-    x, y, z = position
     if not np.isfinite(position).all():
-        return InputError(f"position ({x}, {y}, {z}) is not finite")
-    if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
-        return InputError(far_position(x, y, z))
-    qx, qy, qz, qw = quat_xyzw
-    length = (qx * qx + qy * qy + qz * qz + qw * qw) ** 0.5
+        return InputError("position ({}, {}, {}) is not finite".format(*position))
+    if np.abs(position).max() > FARTHEST_M:
+        return InputError(far_position(*position))
     return InputError(
-        f"quaternion (x {qx}, y {qy}, z {qz}, w {qw}) has length {length:.4g}, expected 1 within "
+        "quaternion (x {}, y {}, z {}, w {}) ".format(*quat_xyzw)
+        + f"has length {np.linalg.norm(quat_xyzw):.4g}, expected 1 within "
         f"{QUATERNION_NORM_TOLERANCE}"
     )

@@ -1,8 +1,6 @@
 """The poses of one stream that are not paired yet: in order of their stamps, in bounded memory."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +18,7 @@ class BufferLimits:
     ----------
     capacity : int
         Most poses of a stream. A buffer fills up if the other stream lags behind, or if the time
-        offset is still to be estimated.
+        offset is still to be estimated; then all but a tenth are paired.
     pairing_starts : int
         Number of poses from which on the oldest are made into pairs. Until then, messages may come
         in any order: 20 s at 100 Hz.
@@ -30,8 +28,6 @@ class BufferLimits:
     late_ns : int
         Poses closer than this to the newest of their stream are not paired yet, in case others
         arrive late.
-    share_kept : float
-        Share of the newest poses that are not paired if a buffer is full.
     """
 
     capacity: int = 20_000
@@ -39,25 +35,13 @@ class BufferLimits:
     batch: int = 256
     batch_every: int = 32
     late_ns: int = 1_000_000_000
-    share_kept: float = 0.1
 
 
 @dataclass(kw_only=True)
 class StreamStatistics:
-    """What a stream has delivered in this session.
-
-    Attributes
-    ----------
-    received : int
-        Poses taken.
-    refused_duplicate : int
-        Poses with a stamp that the stream already had.
-    refused_late : int
-        Late arrivals: poses older than those that were already paired and dropped.
-    dropped_unpaired : int
-        Poses dropped because the other stream had none at their time.
-    first_stamp_ns, last_stamp_ns : int or None
-        Range of the stamps taken.
+    """What a stream has delivered in this session: poses taken; refused, as the stream had a pose
+    with that stamp, or as older ones than those were paired and dropped already; and dropped, as
+    the other stream had none at their time. The range of the stamps taken.
     """
 
     received: int = 0
@@ -67,33 +51,27 @@ class StreamStatistics:
     first_stamp_ns: int | None = None
     last_stamp_ns: int | None = None
 
+    def note(self, first_ns: int, last_ns: int, count: int) -> None:
+        """Count poses that were taken."""
+        self.received += count
+        if self.first_stamp_ns is None or self.last_stamp_ns is None:
+            self.first_stamp_ns, self.last_stamp_ns = first_ns, last_ns
+        else:
+            self.first_stamp_ns = min(self.first_stamp_ns, first_ns)
+            self.last_stamp_ns = max(self.last_stamp_ns, last_ns)
+
     def to_dict(self) -> dict[str, int | None]:
         """What a result says of its inputs."""
-        return {
-            "messages": self.received,
-            "refused_duplicate": self.refused_duplicate,
-            "refused_late": self.refused_late,
-            "first_stamp_ns": self.first_stamp_ns,
-            "last_stamp_ns": self.last_stamp_ns,
-        }
+        values = {name: each for name, each in vars(self).items() if name != "dropped_unpaired"}
+        return {"messages": values.pop("received"), **values}
 
 
 @dataclass(frozen=True)
 class RawPoses:
-    """Poses as they came in, in order of time.
-
-    Attributes
-    ----------
-    stamps_ns : (N,) int64 array
-    poses : (N, 7) array
-        x y z qx qy qz qw.
-    """
+    """Poses as they came in, in order of time: stamps (N,) int64, and x y z qx qy qz qw (N, 7)."""
 
     stamps_ns: IntArray
     poses: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -104,14 +82,11 @@ class RawPoses:
 class PoseBuffer:
     """Poses of one sensor, in order of their stamps.
 
-    Parameters
-    ----------
-    limits : BufferLimits
-
     Attributes
     ----------
     frame : str
         Name of the sensor frame; empty until it is known.
+    statistics : StreamStatistics
     """
 
     def __init__(self, limits: BufferLimits) -> None:
@@ -119,9 +94,9 @@ class PoseBuffer:
         self._stamps_ns = np.empty(limits.capacity, dtype=np.int64)
         self._poses = np.empty((limits.capacity, 7))  # x y z qx qy qz qw
         self._count = 0
-        self._dropped_until_ns: int | None = None
+        self._dropped_until_ns = -(2**63)
         self.frame = ""
-        self._seen = StreamStatistics()
+        self.statistics = StreamStatistics()
 
     def __len__(self) -> int:
         return self._count
@@ -132,63 +107,6 @@ class PoseBuffer:
         return self._stamps_ns[: self._count]
 
     @property
-    def statistics(self) -> StreamStatistics:
-        """StreamStatistics so far."""
-        return replace(self._seen)
-
-    def add(self, stamp_ns: int, position: Any, quat_xyzw: Any) -> bool:
-        """Take a pose; False if the stamp is a duplicate or too late."""
-        if self._dropped_until_ns is not None and stamp_ns <= self._dropped_until_ns:
-            self._seen.refused_late += 1
-            return False
-        index, seen = self._count, self._seen
-        if seen.first_stamp_ns is None or seen.last_stamp_ns is None:
-            seen.first_stamp_ns = seen.last_stamp_ns = stamp_ns
-        elif stamp_ns > seen.last_stamp_ns:
-            seen.last_stamp_ns = stamp_ns
-        else:
-            index = int(np.searchsorted(self.stamps_ns, stamp_ns))
-            if index < self._count and self._stamps_ns[index] == stamp_ns:
-                seen.refused_duplicate += 1
-                return False
-            self._stamps_ns[index + 1 : self._count + 1] = self._stamps_ns[index : self._count]
-            self._poses[index + 1 : self._count + 1] = self._poses[index : self._count]
-            seen.first_stamp_ns = min(seen.first_stamp_ns, stamp_ns)
-        self._stamps_ns[index] = stamp_ns
-        row = self._poses[index]
-        row[0], row[1], row[2] = position
-        row[3], row[4], row[5], row[6] = quat_xyzw
-        self._count += 1
-        seen.received += 1
-        return True
-
-    def extend(self, stamps_ns: IntArray, poses: FloatArray) -> None:
-        """Take poses (N, 7), each newer than all before; there must be room for them."""
-        end = self._count + len(stamps_ns)
-        self._stamps_ns[self._count : end] = stamps_ns
-        self._poses[self._count : end] = poses
-        self._seen.last_stamp_ns = int(stamps_ns[-1])
-        if self._seen.first_stamp_ns is None:
-            self._seen.first_stamp_ns = int(stamps_ns[0])
-        self._count = end
-        self._seen.received += len(stamps_ns)
-
-    def are_newer(self, stamps_ns: IntArray) -> BoolArray:
-        """(N,) whether each stamp is newer than all before it."""
-        last_ns = self._seen.last_stamp_ns
-        last_ns = np.iinfo(np.int64).min if last_ns is None else last_ns
-        return stamps_ns > np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns]))[:-1]
-
-    @property
-    def room_until_pairing(self) -> int:
-        """Number of newer poses that :meth:`extend` may take before the buffer is full or pairs are
-        due.
-        """
-        until_start = max(self._limits.pairing_starts + 1 - self._count, 0)
-        until_due = until_start + -(self._seen.received + until_start) % self._limits.batch_every
-        return min(until_due, self._limits.capacity - self._count)
-
-    @property
     def is_full(self) -> bool:
         """Whether there is no room for another pose."""
         return self._count == self._limits.capacity
@@ -196,10 +114,51 @@ class PoseBuffer:
     @property
     def pairing_is_due(self) -> bool:
         """Whether it is time to make a batch of pairs."""
-        return (
-            self._count > self._limits.pairing_starts
-            and self._seen.received % self._limits.batch_every == 0
-        )
+        is_many = self._count > self._limits.pairing_starts
+        return is_many and self.statistics.received % self._limits.batch_every == 0
+
+    @property
+    def room_until_pairing(self) -> int:
+        """Number of newer poses that :meth:`extend` may take before the buffer is full or pairs are
+        due.
+        """
+        until_start = max(self._limits.pairing_starts + 1 - self._count, 0)
+        received = self.statistics.received + until_start
+        until_due = until_start + -received % self._limits.batch_every
+        return min(until_due, self._limits.capacity - self._count)
+
+    def add(self, stamp_ns: int, position: Any, quat_xyzw: Any) -> bool:
+        """Take a pose; False if the stamp is a duplicate or too late."""
+        if stamp_ns <= self._dropped_until_ns:
+            self.statistics.refused_late += 1
+            return False
+        index, end = self._count, self._count
+        if index and stamp_ns <= self._stamps_ns[index - 1]:
+            index = int(np.searchsorted(self.stamps_ns, stamp_ns))
+            if self._stamps_ns[index] == stamp_ns:
+                self.statistics.refused_duplicate += 1
+                return False
+            self._stamps_ns[index + 1 : end + 1] = self._stamps_ns[index:end]
+            self._poses[index + 1 : end + 1] = self._poses[index:end]
+        self._stamps_ns[index] = stamp_ns
+        self._poses[index, :3], self._poses[index, 3:] = position, quat_xyzw
+        self._count += 1
+        self.statistics.note(stamp_ns, stamp_ns, 1)
+        return True
+
+    def extend(self, stamps_ns: IntArray, poses: FloatArray) -> None:
+        """Take poses (N, 7), each newer than all before; there must be room for them."""
+        end = self._count + len(stamps_ns)
+        self._stamps_ns[self._count : end] = stamps_ns
+        self._poses[self._count : end] = poses
+        self._count = end
+        self.statistics.note(int(stamps_ns[0]), int(stamps_ns[-1]), len(stamps_ns))
+
+    def are_newer(self, stamps_ns: IntArray) -> BoolArray:
+        """(N,) whether each stamp is newer than all before it."""
+        last_ns = self.statistics.last_stamp_ns
+        last_ns = np.iinfo(np.int64).min if last_ns is None else last_ns
+        return stamps_ns > np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns]))[:-1]
 
     def stamp_at(self, share: float) -> int:
         """Stamp below which this share of the poses lies."""
@@ -226,7 +185,7 @@ class PoseBuffer:
         after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
         split = max(after - REACH, 0)
         if unpaired:
-            self._seen.dropped_unpaired += split
+            self.statistics.dropped_unpaired += split
         rest = self._count - split
         self._stamps_ns[:rest] = self._stamps_ns[split : self._count].copy()
         self._poses[:rest] = self._poses[split : self._count].copy()
