@@ -33,8 +33,6 @@ from hand_eye_calib.solvers.solution import Solution
 # trajectories it is a fifth.
 _MAX_JUMPS = 0.25
 
-_PROVED = {True: "yes", False: "no", None: "not tried"}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Solved:
@@ -309,8 +307,6 @@ def _solve_pairs(
             shift = possible_shift(model.part_products, model.misfit)
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
     found = method.solve(pairs)
-    if not is_beside:
-        found = method.prove(pairs, found)
     return Solved(
         solution=found,
         assessment=assess(
@@ -323,7 +319,7 @@ def _solve_pairs(
         stamps_ns=pose_pairs.stamps_ns,
         config=config,
         reference_reason=reason,
-        proved_global=_PROVED[found.is_proved_global],
+        proved_global="not tried" if is_beside else method.proved_global(pairs, found),
         shift=shift,
     )
 

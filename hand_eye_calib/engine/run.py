@@ -85,6 +85,12 @@ class Run:
         is_worse_fit = other._noise_fits and not self._noise_fits
         return self._n_serious <= other._n_serious - by and not is_worse_fit
 
+    def _improved(self, options: Options, by: int) -> "Run | None":
+        """A second run with other options, if it is sound or better by so many findings."""
+        second = _solved_with(self.snapshot, options)
+        is_better = second and (second._is_sound or second._is_better_than(self, by))
+        return second if is_better else None
+
 
 def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | None = None) -> Run:
     """Calibrate.
@@ -113,10 +119,11 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     tell(0.2, "pairing")
     snapshot.pose_pairs()
     tell(0.3, "solving")
-    found = Run(snapshot.estimate(cross_check=checks), snapshot)
+    calibration = snapshot.estimate(cross_check=checks)
+    found = Run(calibration, snapshot)
     if checks is not False:
         tell(0.8, "checking the streams")
-        found = review(found.calibration, snapshot)
+        found = review(calibration, snapshot)
     tell(1.0, "done")
     return found
 
@@ -156,10 +163,8 @@ def review(
     if "time_offset" not in given and snapshot.config.time_offset == "estimate":
         return _of_clear_offset(first, certain)
     options = _offset_of_model(calibration, snapshot, given) | certain
-    second = _solved_with(snapshot, options)
-    if second and (second._is_sound or second._is_better_than(first, by=int(bool(certain)))):
-        return _telling(second, options, first.check.findings)
-    return first
+    second = first._improved(options, by=int(bool(certain)))
+    return _telling(second, options, first.check.findings) if second else first
 
 
 def _of_clear_offset(first: Run, certain: Options) -> Run:
@@ -171,14 +176,12 @@ def _of_clear_offset(first: Run, certain: Options) -> Run:
     if clock and clock.rate and clock.rate.is_used:
         offset_s = replace(clock, seconds=offset_s).largest_s(first.snapshot.child.duration_s)
     is_large = _is_large(offset_s, first.calibration)
-    if is_large and first._is_sound:
-        return _telling(first, ahead, ())
     others = {name: value for name, value in certain.items() if name != "time_offset"}
-    if is_large and others:
-        second = _solved_with(first.snapshot, others)
-        if second and (second._is_sound or second._is_better_than(first, by=1)):
-            return _telling(second, ahead | others, first.check.findings)
-        return _telling(first, ahead, ())
+    if is_large and (others or first._is_sound):
+        second = None if first._is_sound else first._improved(others, by=1)
+        if second is None:
+            return _telling(first, ahead, ())
+        return _telling(second, ahead | others, first.check.findings)
     without = _solved_with(first.snapshot, {"time_offset": CalibratorConfig.time_offset} | others)
     if without is None:
         return _telling(first, ahead, ())
@@ -215,12 +218,9 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    usual = {
-        name: getattr(CalibratorConfig, name)
-        for stream in STREAMS
-        for name in conventions(config, stream)
-    }
     # As they are: what is put right is put right once.
+    names = {name for stream in STREAMS for name in conventions(config, stream)}
+    usual: dict[str, Any] = {name: getattr(CalibratorConfig, name) for name in names}
     parent, child = replace(snapshot, config=replace(snapshot.config, **usual)).streams
     max_gap_s = max(config.max_gap, GAP_INTERVALS * parent.interval_s)
     return replace(

@@ -19,29 +19,12 @@ from hand_eye_calib.solvers.solution import Solution
 
 
 def solve(pairs: MotionPairs) -> Solution:
-    """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X.
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs, K >= 1.
-
-    Returns
-    -------
-    Solution
-    """
+    """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, of K >= 1 pairs."""
     rows = residual_rows(pairs)
     minimum = quadratic_form.minimise(rows.T @ rows, start_rotations(pairs))
-    best = int(np.argmin(minimum.value))
-    T_parent_child = minimum.T_parent_child[best]
-    objective = squared_translation_residual(pairs, T_parent_child)
-    return Solution(
-        T_parent_child,
-        objective,
-        bool(minimum.converged[best]),
-        minimum.iterations,
-        np.ones(len(pairs)),
-    )
+    T, converged, iterations = minimum.lowest()
+    objective = squared_translation_residual(pairs, T)
+    return Solution(T, objective, converged, iterations, np.ones(len(pairs)))
 
 
 def residual_rows(pairs: MotionPairs) -> FloatArray:

@@ -14,17 +14,10 @@ alone is then constant, and what is left is a Newton iteration in 14 variables w
 9.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-
 import numpy as np
-from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
-from hand_eye_calib.solvers.solution import Solution
 
 # The bound may exceed the minimum by this share of it, and by this share of the form's mean
 # eigenvalue, which is rounding.
@@ -36,39 +29,16 @@ _MAX_STEPS = 60
 # close to the best that any multipliers give.
 _SHARPENING, _CLOSE = 10.0, 1e-12
 
-# Rotations that the search goes on from if there is no proof.
-_RESTARTS = 64
 
-
-@dataclass(frozen=True)
-class Certificate:
-    """What is known of a minimum.
-
-    Attributes
-    ----------
-    gap : float
-        The cost is at most so much above the global minimum.
-    is_global : bool
-        The gap is nothing but rounding.
-    """
-
-    gap: float
-    is_global: bool
-
-
-def certify(Q: FloatArray, T_parent_child: FloatArray) -> Certificate:
-    """Bound how far the cost at a transform is above the smallest over all of SE(3).
+def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
+    """Whether the cost at a transform is proved to be the smallest over all of SE(3).
 
     Parameters
     ----------
     Q : (13, 13) array
         The form, see `quadratic_form`.
     T_parent_child : (4, 4) array
-        Near a local minimum; anywhere else the gap is large.
-
-    Returns
-    -------
-    Certificate
+        Near a local minimum.
     """
     minimum = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
     nearest = minimum.T_parent_child[0]
@@ -77,52 +47,9 @@ def certify(Q: FloatArray, T_parent_child: FloatArray) -> Certificate:
     tolerance = _RELATIVE * max(float(minimum.value[0]), 0.0) / scale + _ROUNDING
     lowest = _highest_lowest_eigenvalue(M / scale, enough=-0.25 * tolerance)
     # |x|^2 is 4 for every rotation.
-    bound = 4.0 * max(-lowest, 0.0)
-    above = max(float(quadratic_form.decrease(Q, T_parent_child, nearest)), 0.0) / scale
-    return Certificate(scale * (bound + above), bool(bound + above <= tolerance))
-
-
-def prove(
-    pairs: MotionPairs, solution: Solution, solve_from: Callable[[FloatArray], Solution]
-) -> Solution:
-    """Prove that a solution is the global minimum over the pairs it counts, or look for a better.
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs.
-    solution : Solution
-        Its weights say which pairs count.
-    solve_from : function
-        Solves for all pairs again, from a transform (4, 4).
-
-    Returns
-    -------
-    Solution
-        The given one, or a better one, with ``is_proved_global``.
-    """
-    coefficients = quadratic_form.coefficients(pairs)
-
-    def form(of: Solution) -> FloatArray:
-        return quadratic_form.weighted_sum(coefficients, of.weights)
-
-    Q = form(solution)
-    if certify(Q, solution.T_parent_child).is_global:
-        return replace(solution, is_proved_global=True)
-    found = solve_from(_best_of_many(Q))
-    if not found.objective < solution.objective * (1 - _RELATIVE):
-        return replace(solution, is_proved_global=False)
-    is_global = certify(form(found), found.T_parent_child).is_global
-    return replace(found, is_proved_global=is_global)
-
-
-def _best_of_many(Q: FloatArray) -> FloatArray:
-    """The lowest minimum (4, 4) from rotations all over SO(3)."""
-    quats_xyzw = np.random.default_rng(0).standard_normal((_RESTARTS, 4))
-    quats_xyzw /= np.linalg.norm(quats_xyzw, axis=1, keepdims=True)
-    starts = se3.from_quat_xyzw(np.zeros(3), quats_xyzw)[:, :3, :3]
-    minimum = quadratic_form.minimise(Q, starts)
-    return minimum.T_parent_child[int(np.argmin(minimum.value))]
+    gap = 4.0 * max(-lowest, 0.0)
+    gap += max(float(quadratic_form.decrease(Q, T_parent_child, nearest)), 0.0) / scale
+    return gap <= tolerance
 
 
 def _turned(M: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -172,7 +99,7 @@ def _newton_step(free: FloatArray, unknowns: FloatArray, weight: float) -> tuple
     return step * min(1.0, max(inside, 1.0 / (1.0 + decrement))), decrement
 
 
-def _equations() -> NDArray[np.float64]:
+def _equations() -> FloatArray:
     """Symmetric matrices (21, 10, 10) of the equations, independent of each other; the last
     variable's is among them.
     """

@@ -15,38 +15,12 @@ _HALF_TURNS = np.array(
 
 
 def solve(pairs: MotionPairs) -> Solution:
-    """Minimise ``sum |A X - X B|_F^2`` over X.
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs, K >= 1.
-
-    Returns
-    -------
-    Solution
-    """
-    return _solve_from(pairs, start_rotations(pairs))
-
-
-def solve_from(pairs: MotionPairs, T_parent_child: FloatArray) -> Solution:
-    """Minimise the same from a transform (4, 4)."""
-    return _solve_from(pairs, T_parent_child[None, :3, :3])
-
-
-def _solve_from(pairs: MotionPairs, rotations: FloatArray) -> Solution:
-    """The lowest of the minima from several rotations."""
+    """Minimise ``sum |A X - X B|_F^2`` over X, of K >= 1 pairs."""
     coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
-    minimum = quadratic_form.minimise(quadratic_form.weighted_sum(coefficients, weights), rotations)
-    best = int(np.argmin(minimum.value))
-    T_parent_child = minimum.T_parent_child[best]
-    return Solution(
-        T_parent_child,
-        float(quadratic_form.costs(coefficients, T_parent_child).sum()),
-        bool(minimum.converged[best]),
-        minimum.iterations,
-        weights,
-    )
+    Q = quadratic_form.weighted_sum(coefficients, weights)
+    T, converged, iterations = quadratic_form.minimise(Q, start_rotations(pairs)).lowest()
+    objective = float(quadratic_form.costs(coefficients, T).sum())
+    return Solution(T, objective, converged, iterations, weights)
 
 
 def solve_without(pairs: MotionPairs, solution: Solution, left_out: BoolArray) -> FloatArray:
@@ -62,9 +36,7 @@ def solve_without(pairs: MotionPairs, solution: Solution, left_out: BoolArray) -
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
-    """Costs ``|A X - X B|_F^2`` (K,) from the matrices themselves, which cancel less than the
-    condensed forms.
-    """
+    """Costs ``|A X - X B|_F^2`` (K,), which cancel less than those of condensed forms."""
     return quadratic_form.costs(quadratic_form.coefficients(pairs), T_parent_child)
 
 

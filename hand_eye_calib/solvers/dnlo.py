@@ -78,19 +78,14 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
         ``objective`` is eq. (5) with the outliers' c included; ``weights`` are alpha.
     """
     searched = pairs[_searched(len(pairs))]
-    T_found = _search(searched, threshold, min_inlier_fraction * len(searched))
-    return solve_from(pairs, T_found, threshold, min_inlier_fraction)
+    T = _search(searched, threshold, min_inlier_fraction * len(searched))
+    return _improved(pairs, T, threshold, min_inlier_fraction * len(pairs))
 
 
-def solve_from(
-    pairs: MotionPairs, T_parent_child: FloatArray, threshold: float, min_inlier_fraction: float
-) -> Solution:
-    """Improve weights and X in turn on all pairs, from a transform (4, 4).
-
-    Ends when the objective falls no more. Parameters as for :func:`solve`. The costs come from the
-    matrices, which cancel least.
+def _improved(pairs: MotionPairs, T: FloatArray, threshold: float, floor: float) -> Solution:
+    """Improve weights and X in turn on all pairs, from a transform (4, 4), until the objective
+    falls no more. The costs come from the matrices, which cancel least.
     """
-    T, floor = T_parent_child, min_inlier_fraction * len(pairs)
     coefficients = quadratic_form.coefficients(pairs)
     weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
     Q = quadratic_form.weighted_sum(coefficients, weights)
@@ -130,18 +125,12 @@ def solve_without(
 
     Parameters
     ----------
-    pairs : MotionPairs
-        K pairs.
-    solution : Solution
-        The solution with all of them.
-    left_out : (B, K) bool array
-        Pairs to leave out, for each of B answers.
-    threshold, min_inlier_fraction : float
+    pairs, threshold, min_inlier_fraction
         As for :func:`solve`.
-
-    Returns
-    -------
-    (B, 4, 4) array
+    solution : Solution
+        The solution with all K pairs.
+    left_out : (B, K) bool array
+        Pairs to leave out, for each of B answers (B, 4, 4).
     """
     near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
     condensed, some = quadratic_form.condense(pairs), _searched(len(pairs))
@@ -205,11 +194,9 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
 
 def _searched(n_pairs: int) -> slice | IntArray:
     """Index of the pairs that are searched: all, or an even sample."""
-    return (
-        slice(None)
-        if n_pairs <= _MAX_SEARCHED
-        else np.linspace(0, n_pairs - 1, _MAX_SEARCHED).astype(int)
-    )
+    if n_pairs <= _MAX_SEARCHED:
+        return slice(None)
+    return np.linspace(0, n_pairs - 1, _MAX_SEARCHED).astype(int)
 
 
 def _search(pairs: MotionPairs, threshold: float, floor: float) -> FloatArray:
@@ -257,11 +244,8 @@ def _rivals(
     for _ in range(_FIRST_ROUNDS):
         Ts = _refit(condensed, weights, Ts)
         weights, objectives = truncate(_costs(condensed, Ts), threshold, floor)
-    promising = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")[:, :_FOLLOWED] + [
-        [0],
-        [started],
-    ]
-    return Ts[promising.ravel()]
+    promising = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")[:, :_FOLLOWED]
+    return Ts[(promising + [[0], [started]]).ravel()]
 
 
 def _anneal(
@@ -284,10 +268,8 @@ def _anneal(
     largest = np.max(costs, axis=1, initial=0.0, where=costs < _NEVER)
     sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
     while sharpness.min() < _SHARP:
-        ratio = (
-            np.sqrt((cut * sharpness * (sharpness + 1))[:, None] / np.maximum(costs, 1e-300))
-            - sharpness[:, None]
-        )
+        cuts = (cut * sharpness * (sharpness + 1))[:, None]
+        ratio = np.sqrt(cuts / np.maximum(costs, 1e-300)) - sharpness[:, None]
         Ts = _refit(condensed, ratio.clip(0.0, 1.0), Ts)
         costs, cut = costs_and_cut(Ts)
         sharpness = sharpness * _SHARPENING

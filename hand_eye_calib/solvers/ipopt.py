@@ -27,20 +27,16 @@ except ImportError as error:
 _Expression: TypeAlias = Any
 
 _IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-# Rotation vector to start from (rad); at zero the rotation angle has no derivative.
-_IDENTITY_START = 1e-6
+# Rotation vector and translation to start from; at zero the rotation angle has no derivative.
+_START = np.repeat([1e-6, 0.0], 3)
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
     """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
     pose = casadi.MX.sym("pose", 6)
-    solver = casadi.nlpsol(
-        "dnl",
-        "ipopt",
-        {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))},
-        _IPOPT_OPTIONS,
-    )
-    answer = solver(x0=np.r_[np.full(3, _IDENTITY_START), np.zeros(3)])
+    problem = {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))}
+    solver = casadi.nlpsol("dnl", "ipopt", problem, _IPOPT_OPTIONS)
+    answer = solver(x0=_START)
     T_parent_child = _transform(answer["x"])
     objective = float(dnl.pair_costs(pairs, T_parent_child).sum())
     return _solution(solver, T_parent_child, objective, np.ones(len(pairs)))
@@ -61,7 +57,7 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
     }
     solver = casadi.nlpsol("dnlo", "ipopt", problem, _IPOPT_OPTIONS)
     answer = solver(
-        x0=np.r_[np.full(3, _IDENTITY_START), np.zeros(3), np.ones(n_pairs)],
+        x0=np.r_[_START, np.ones(n_pairs)],
         lbx=np.r_[np.full(6, -np.inf), np.zeros(n_pairs)],
         ubx=np.r_[np.full(6, np.inf), np.ones(n_pairs)],
         lbg=floor,
@@ -73,9 +69,7 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
 
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
-    """(1, K) expression of ``|A X - X B|_F^2`` of each pair, mapped over the pairs so that the
-    expression graph stays small.
-    """
+    """(1, K) expression of ``|A X - X B|_F^2``, mapped over the pairs: a small graph."""
     motion_a, motion_b = casadi.SX.sym("A", 3, 4), casadi.SX.sym("B", 3, 4)
     x = casadi.SX.sym("x", 6)
     rotation, translation = _rodrigues(x[:3]), x[3:]
@@ -112,11 +106,6 @@ def _transform(x: _Expression) -> FloatArray:
 def _solution(
     solver: _Expression, T_parent_child: FloatArray, objective: float, weights: FloatArray
 ) -> Solution:
-    statistics = solver.stats()
-    return Solution(
-        T_parent_child,
-        objective,
-        bool(statistics["success"]),
-        int(statistics["iter_count"]),
-        weights,
-    )
+    stats = solver.stats()
+    settled, iterations = bool(stats["success"]), int(stats["iter_count"])
+    return Solution(T_parent_child, objective, settled, iterations, weights)

@@ -21,18 +21,9 @@ _RANK_TOLERANCE = 1e-12
 
 
 def solve(pairs: MotionPairs) -> Solution:
-    """Solve AX = XB in two closed-form stages.
+    """Solve AX = XB of K >= 1 pairs in two closed-form stages.
 
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs, K >= 1.
-
-    Returns
-    -------
-    Solution
-        ``objective`` is the sum of squared translation residuals, the cost of the second stage, in
-        m^2.
+    ``objective`` is the sum of squared translation residuals, the cost of the second stage, in m^2.
     """
     rotation = align_rotation_vectors(pairs)
     # (R_A - I) t = R t_B - t_A; 0 along directions that no rotation reveals.

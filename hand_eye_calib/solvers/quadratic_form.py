@@ -25,9 +25,10 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 DIMENSION = 13
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
 _UPPER = _ROWS * DIMENSION + _COLUMNS
+_MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 _TRIANGLE_OF_SQUARE = np.empty((DIMENSION, DIMENSION), dtype=int)
 _TRIANGLE_OF_SQUARE[_ROWS, _COLUMNS] = _TRIANGLE_OF_SQUARE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
-_ROTATION, _TRANSLATION, _ONE = slice(0, 9), slice(9, 12), 12
+_TRANSLATION, _REST = slice(9, 12), np.append(np.arange(9), 12)
 
 # Positions of x in the sixteen entries of X: x = X.ravel()[_X_IN_T].
 _X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
@@ -56,37 +57,16 @@ _GENERATORS = se3.skew(np.eye(3))
 
 
 def condense(pairs: MotionPairs) -> FloatArray:
-    """Upper triangles of every pair's Q_k.
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs.
-
-    Returns
-    -------
-    (K, 91) array
-        In the order of ``numpy.triu_indices(13)``; ``condensed @ monomials(X)`` gives all costs.
+    """Upper triangles (K, 91) of every pair's Q_k, in the order of ``numpy.triu_indices(13)``:
+    ``condensed @ monomials(X)`` gives all costs.
     """
-    condensed = np.empty((len(pairs), len(_UPPER)))
-    # New large arrays take time to allocate: these are used for every block.
-    residuals, again = np.empty((2, _BLOCK, 12, DIMENSION))
-    forms = np.empty((_BLOCK, DIMENSION, DIMENSION))
-    u = coefficients(pairs)
+    condensed, u = np.empty((len(pairs), len(_UPPER))), coefficients(pairs)
     for start in range(0, len(pairs), _BLOCK):
-        block = slice(start, min(start + _BLOCK, len(pairs)))
-        part = slice(block.stop - start)
-        np.matmul(
-            u[block],
-            _RESIDUAL.reshape(24, -1),
-            out=residuals[part].reshape(-1, 12 * DIMENSION),
-        )
+        block = slice(start, start + _BLOCK)
+        residuals = (u[block] @ _RESIDUAL.reshape(24, -1)).reshape(-1, 12, DIMENSION)
         # numpy multiplies two arrays of small matrices faster than it squares one.
-        np.copyto(again[part], residuals[part])
-        np.matmul(np.swapaxes(residuals[part], 1, 2), again[part], out=forms[part])
-        np.take(
-            forms[part].reshape(-1, DIMENSION**2), _UPPER, axis=1, out=condensed[block], mode="clip"
-        )
+        forms = np.swapaxes(residuals, 1, 2) @ residuals.copy()
+        condensed[block] = forms.reshape(-1, DIMENSION**2).take(_UPPER, axis=1)
     return condensed
 
 
@@ -139,24 +119,13 @@ def decrease(
 
 
 def monomials(T_parent_child: FloatArray) -> FloatArray:
-    """Products of two variables, which map condensed forms to costs.
-
-    Parameters
-    ----------
-    T_parent_child : (..., 4, 4) array
-
-    Returns
-    -------
-    (..., 91) array
-        ``x_i x_j``, doubled off the diagonal.
+    """Products ``x_i x_j`` (..., 91) of two variables of transforms (..., 4, 4), doubled off the
+    diagonal, which map condensed forms to costs.
     """
     entries = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
     return entries.take(_X_IN_T[_ROWS], axis=-1) * (
         entries.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY
     )
-
-
-_MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 
 
 def expand(condensed: FloatArray) -> FloatArray:
@@ -191,6 +160,11 @@ class Minimum:
     value: FloatArray
     converged: BoolArray
     iterations: int
+
+    def lowest(self) -> tuple[FloatArray, bool, int]:
+        """The lowest minimum (4, 4), whether it converged, and the iterations."""
+        best = int(np.argmin(self.value))
+        return self.T_parent_child[best], bool(self.converged[best]), self.iterations
 
 
 def minimise(
@@ -246,29 +220,13 @@ def minimise(
 
 
 def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Forms of the rotation alone, at the best translation for it.
-
-    Parameters
-    ----------
-    Q : (B, 13, 13) array
-
-    Returns
-    -------
-    reduced : (B, 10, 10) array
-        Forms of ``(vec R, 1)``.
-    to_translation : (B, 3, 10) array
-        Minus the best translation, m, is this times ``(vec R, 1)``.
+    """Forms (B, 10, 10) of ``(vec R, 1)`` at the best translation for R, and what gives minus that,
+    m, times ``(vec R, 1)`` (B, 3, 10).
     """
+    translation_rest = Q[:, _TRANSLATION][:, :, _REST]
     gain = _pseudo_inverse(Q[:, _TRANSLATION, _TRANSLATION])
-    Q_translation_rest = np.concatenate(
-        [Q[:, _TRANSLATION, _ROTATION], Q[:, _TRANSLATION, _ONE, None]], axis=2
-    )
-    reduced = np.empty((len(Q), 10, 10))
-    reduced[:, :9, :9] = Q[:, _ROTATION, _ROTATION]
-    reduced[:, :9, 9] = reduced[:, 9, :9] = Q[:, _ROTATION, _ONE]
-    reduced[:, 9, 9] = Q[:, _ONE, _ONE]
-    reduced -= np.swapaxes(Q_translation_rest, 1, 2) @ gain @ Q_translation_rest
-    return reduced, gain @ Q_translation_rest
+    eliminated = np.swapaxes(translation_rest, 1, 2) @ gain @ translation_rest
+    return Q[:, _REST[:, None], _REST] - eliminated, gain @ translation_rest
 
 
 def _newton_step(
@@ -292,19 +250,8 @@ def _newton_step(
 
 
 def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
-    """Take one Gauss-Newton step of each form from its own transform.
-
-    It is fast, for searches whose result is refined afterwards.
-
-    Parameters
-    ----------
-    Q : (B, 13, 13) array
-        Sums of the forms of pairs, with weights that are not negative.
-    Ts_parent_child : (B, 4, 4) array
-
-    Returns
-    -------
-    (B, 4, 4) array
+    """Transforms (B, 4, 4) after one Gauss-Newton step of each form Q (B, 13, 13), a sum of those
+    of pairs, from its own transform. It is fast, for searches whose result is refined afterwards.
     """
     n_forms = len(Ts_parent_child)
     # The derivatives of x along the six tangents at X, and x itself, are linear in X.

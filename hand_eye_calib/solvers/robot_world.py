@@ -62,10 +62,8 @@ class Stops:
         A_i, in the parent's world, such as hand poses in the frame of a robot's base.
     Ts_world_child : (N, 4, 4) array
         B_i, in the child's world, such as poses of a camera in the frame of a target.
-    child : (N,) int array
-        Which child sensor (camera) it was; zeros if there is one.
-    world : (N,) int array
-        Which world of a child (target) it was; zeros if there is one.
+    child, world : (N,) int arrays
+        Which child sensor (camera) and which world of it (target) it was; zeros if there is one.
     """
 
     Ts_world_parent: FloatArray
@@ -185,10 +183,8 @@ def _likelihood(fit: RobotWorld) -> float:
 def _in_one_frame(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str) -> RobotWorld:
     """Fit without outliers."""
     rough = _fit(stops, Xs, Zs, where, _OUTLIER_TAILS, _ROUGH_ROUNDS)
-    kept = rough.weights > 0.0
-    fit = _fit(
-        stops.take(kept), rough.Ts_parent_child, rough.Ts_world_world, where, _TAILS, _ROUNDS
-    )
+    kept, Xs, Zs = rough.weights > 0.0, rough.Ts_parent_child, rough.Ts_world_world
+    fit = _fit(stops.take(kept), Xs, Zs, where, _TAILS, _ROUNDS)
     weights = np.zeros(len(stops))
     weights[kept] = fit.weights
     return replace(fit, weights=weights)
@@ -269,16 +265,12 @@ def _logs_of_medians(errors: FloatArray) -> FloatArray:
     return np.asarray(np.log(distance_m + tiny) + np.log(angle_rad + tiny))
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """Errors of N stops and their derivatives."""
-
-    errors: FloatArray  # (N, 6)
-    jacobian: FloatArray  # (N, 6, 12), by one X and one Z
-    columns: IntArray  # (N, 12), which values of all X and Z these are
-
-
-def _linearise(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str) -> _Linear:
+def _linearise(
+    stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Errors (N, 6), their derivatives (N, 6, 12) by one X and one Z, and which values (N, 12) of
+    all X and Z these are.
+    """
     n = len(stops)
     predicted = se3.inverse(Zs[stops.world]) @ stops.Ts_world_parent @ Xs[stops.child]
     errors = se3.log(se3.inverse(stops.Ts_world_child) @ predicted)
@@ -290,20 +282,19 @@ def _linearise(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str) -> _Lin
         errors, jacobian = (moved @ errors[..., None])[..., 0], moved @ jacobian
     blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
     columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
-    return _Linear(errors, jacobian, columns)
+    return errors, jacobian, columns
 
 
 def _normal(
-    linear: _Linear, n_values: int, variances: FloatArray, weights: FloatArray
+    errors: FloatArray, jacobian: FloatArray, columns: IntArray, scale: FloatArray, n_values: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Information (n_values, n_values), and the gradient (N, 12) of each stop."""
-    scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
-    rows, errors = scale[..., None] * linear.jacobian, scale * linear.errors
+    """Information (n_values, n_values), and the gradient (N, 12) of each stop, of scaled errors."""
+    rows, errors = scale[..., None] * jacobian, scale * errors
     information = np.zeros((n_values, n_values))
-    pairs, of_pair = np.unique(linear.columns[:, [0, 6]], axis=0, return_inverse=True)
+    pairs, of_pair = np.unique(columns[:, [0, 6]], axis=0, return_inverse=True)
     for k in range(len(pairs)):
         which = np.flatnonzero(of_pair.ravel() == k)
-        own, values = rows[which].reshape(-1, 12), linear.columns[which[0]]
+        own, values = rows[which].reshape(-1, 12), columns[which[0]]
         information[np.ix_(values, values)] += own.T @ own
     return information, np.einsum("nki,nk->ni", rows, errors)
 
@@ -331,13 +322,14 @@ def _fit(
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)
     weights, converged = np.ones(n), False
     for _ in range(rounds):
-        linear = _linearise(stops, Xs, Zs, where)
-        squared = np.sum(linear.errors.reshape(n, 2, 3) ** 2, axis=2)
+        linear = errors, _, columns = _linearise(stops, Xs, Zs, where)
+        squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         variances = np.maximum(weights @ squared / n_free, _SMALLEST_VARIANCE)
         distance = squared @ (1.0 / variances)
         weights = (tails + 6.0) / (tails + distance)
-        information, gradients = _normal(linear, n_values, variances, weights)
-        gradient = _added(gradients, linear.columns, n_values)
+        scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
+        information, gradients = _normal(*linear, scale, n_values)
+        gradient = _added(gradients, columns, n_values)
         step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0]
         steps = step.reshape(-1, 6)
         Xs, Zs = Xs @ se3.exp(steps[: len(Xs)]), Zs @ se3.exp(steps[len(Xs) :])
@@ -347,13 +339,14 @@ def _fit(
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
     # modeling using the t distribution*, JASA 84, 1989, section 4.
     share = (tails + 6.0) / (tails + 8.0)
-    fisher, _ = _normal(linear, n_values, variances, np.full(n, share))
+    scale = np.sqrt(np.full((n, 1), share) * np.repeat(1.0 / variances, 3))
+    fisher, _ = _normal(*linear, scale, n_values)
     weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), n_values // 6) / _UNKNOWN**2)
     covariance = np.linalg.inv(fisher + weak)
     log_likelihood = (
         -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
     )
-    lasting = _lasting(gradients, linear.columns, information)
+    lasting = _lasting(gradients, columns, information)
     level_m, level_rad = (float(level) for level in np.sqrt(variances))
     return RobotWorld(
         Xs,

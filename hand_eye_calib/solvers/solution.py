@@ -22,9 +22,6 @@ class Solution:
         Iterations of the method's main loop.
     weights : (K,) array
         Weight of each motion pair; 1 for all with methods that do not reject outliers.
-    is_proved_global : bool or None
-        Whether no other X has a smaller cost over the pairs that count; None if that was not
-        tried.
     """
 
     T_parent_child: FloatArray
@@ -32,4 +29,3 @@ class Solution:
     converged: bool
     iterations: int
     weights: FloatArray
-    is_proved_global: bool | None = None

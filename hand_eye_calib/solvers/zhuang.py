@@ -41,24 +41,15 @@ _ROUNDING = 1e-12
 
 
 def solve(pairs: MotionPairs) -> Solution:
-    """Solve AX = XB by Gauss-Newton from the identity.
+    """Solve AX = XB of K >= 1 pairs by Gauss-Newton from the identity.
 
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs, K >= 1.
-
-    Returns
-    -------
-    Solution
-        ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is False if the iteration did
-        not settle or settled in a false minimum.
+    ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is False if the iteration did not
+    settle or settled in a false minimum.
     """
     residual_of_products = _condense(pairs)
     parameters, objective, settled, iterations = _gauss_newton(residual_of_products, np.zeros(6))
-    _, elsewhere, _, _ = _gauss_newton(
-        residual_of_products, _parameters(park.solve(pairs).T_parent_child)
-    )
+    near_park = _parameters(park.solve(pairs).T_parent_child)
+    _, elsewhere, _, _ = _gauss_newton(residual_of_products, near_park)
     rounding = _ROUNDING**2 * float((residual_of_products**2).sum())
     lowest = objective <= elsewhere / (1 - _LOWER) + rounding
     T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])
@@ -75,11 +66,8 @@ def _gauss_newton(
     while iterations < _MAX_ITERATIONS and not settled:
         iterations += 1
         products, derivative = _products(parameters)
-        step = np.linalg.lstsq(
-            residual_of_products @ derivative,
-            -residual_of_products @ products,
-            rcond=_RANK_TOLERANCE,
-        )[0]
+        rows, values = residual_of_products @ derivative, -residual_of_products @ products
+        step = np.linalg.lstsq(rows, values, rcond=_RANK_TOLERANCE)[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
     residuals = residual_of_products @ _products(parameters)[0]
@@ -90,15 +78,12 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     """Matrix (at most 20, 16) that maps the products to residuals of the same squared length as all
     f and g together.
     """
-    rotation_parent, translation_parent = (
-        pairs.Ts_parenti_parentj[:, :3, :3],
-        pairs.Ts_parenti_parentj[:, :3, 3],
-    )
-    translation_child = pairs.Ts_childi_childj[:, :3, 3]
-    axes_parent, axes_child = _axes(rotation_parent), _axes(pairs.Ts_childi_childj[:, :3, :3])
-    f = np.concatenate(
-        [(axes_parent - axes_child)[:, :, None], se3.skew(axes_parent + axes_child)], axis=2
-    )
+    Ts_parent, Ts_child = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
+    rotation_parent, translation_parent = Ts_parent[:, :3, :3], Ts_parent[:, :3, 3]
+    translation_child = Ts_child[:, :3, 3]
+    axes_parent, axes_child = _axes(rotation_parent), _axes(Ts_child[:, :3, :3])
+    apart, together = axes_parent - axes_child, axes_parent + axes_child
+    f = np.concatenate([apart[:, :, None], se3.skew(together)], axis=2)
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = (rotation_parent - np.eye(3))[:, :, None]
     g[:, :, 0, 0] = translation_parent - translation_child
