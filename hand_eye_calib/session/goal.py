@@ -132,7 +132,7 @@ class Goal:
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
             will_not_get_there=stuck,
-            axes=self._by_axis(calibration.sigmas, np.zeros(6) if is_done else left_s),
+            axes=self._by_axis(calibration.sigmas_with_floor, np.zeros(6) if is_done else left_s),
         )
         return self.progress
 
@@ -229,12 +229,11 @@ def _least_motion_s(calibration: Calibration) -> float:
 
 
 def _precision(calibration: Calibration) -> str:
-    metres, radians = calibration.sigmas[:3].max(), calibration.sigmas[3:].max()
-    told = [f"translation known to {length(metres)}", f"rotation to {angle(radians)}"]
-    if calibration.measured == "rotations" and calibration.out_of_reach:
-        told = [f"rotation known to {angle(radians)}"]
-    elif calibration.out_of_reach:
-        told = told[:1]
+    sigmas = calibration.sigmas_with_floor
+    told = []
+    for kind, of_kind, say in (("translation", slice(3), length), ("rotation", slice(3, 6), angle)):
+        if not {*AXES[of_kind]} & {*calibration.out_of_reach}:
+            told.append(f"{kind} known to {say(sigmas[of_kind].max())}")
     return f"{', '.join(told)} (one sigma)"
 
 

@@ -54,7 +54,7 @@ def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
     assert not goal.add(result(), seen(44.0)).done
     done = goal.add(result(), seen(46.0))
     assert (done.done, done.limiting_axis, max(seconds_left(done))) == (True, "", 0.0)
-    assert done.sentence.startswith("Done: translation known to 5 mm, rotation to 0.057 deg")
+    assert done.sentence.startswith("Done: translation known to 5 mm, rotation known to 0.057 deg")
 
 
 def test_every_axis_has_its_own_target():
@@ -250,3 +250,13 @@ def test_only_motion_counts_as_time():
     pairs = PosePairs((s * 1e9).astype(np.int64), poses, poses)
     assert excitation(pairs).motion_s == pytest.approx(20.0, abs=1.5)
     assert excitation(pairs[:50]).motion_s == 0.0
+
+
+def test_positions_alone_are_done_without_a_word_of_the_rotation():
+    goal = Goal(TARGETS)
+    hidden = dict.fromkeys(AXES[3:], DofVerdict.UNOBSERVABLE)
+    of_positions = result(sigmas_rad=np.inf, verdicts=hidden, measured="positions")
+    for motion_s in (40.0, 42.0, 44.0):
+        told = goal.add(of_positions, seen(motion_s))
+    assert told.done
+    assert told.sentence == "Done: translation known to 5 mm (one sigma). Stop and save."
