@@ -117,7 +117,7 @@ def read_paths(
         If it cannot be read, or something does not go together.
     """
     if are_files:
-        return read_pair(paths, [{"format": "auto"}] * 2, options)
+        return read_pair(paths, [{}] * 2, options)
     journal = journal_in(paths)
     if journal is None:
         return read_bags(paths, sources, CalibratorConfig.from_options(dict(options)))
@@ -213,8 +213,8 @@ def read_files(
     files = []
     for path, stream, given in zip(paths, streams, settings, strict=True):
         measures = options.get(f"{stream}_measures", "auto")
-        of_file = {name: value for name, value in given.items() if value} | {"measures": measures}
-        files.append((Path(path), FileOptions(**of_file, repair=True)))
+        of_file = {"format": "auto"} | {name: value for name, value in given.items() if value}
+        files.append((Path(path), FileOptions(**of_file, measures=measures, repair=True)))
     with waiting_for(f"reading {' and '.join(map(str, paths))}"):
         readings = read_trajectory_files(files)
     for reading, stream in zip(readings, streams, strict=True):
