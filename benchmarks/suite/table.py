@@ -94,15 +94,13 @@ def _growth(source, rows):
 
 
 def _side_by_side(title, rows):
-    own = next(row.seconds for row in rows if row.name == "dnlo fast")
     return Table(
         title,
-        ["time", "times dnlo fast", "objective", "e_at, m", "e_aR, deg"],
+        ["time", "objective", "e_at, m", "e_aR, deg"],
         [
             [
                 row.name,
                 _cell(row),
-                f"{row.seconds / own:.3g}",
                 f"{row.objective:.6f}" if row.name.startswith("dnl") else "",
                 f"{row.error_m:.3f}",
                 f"{np.degrees(row.error_rad):.3f}",

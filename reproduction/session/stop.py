@@ -200,8 +200,7 @@ def _row(kind: str, factor: float, stops: Sequence[Stop]) -> dict[str, object]:
         "number": len(stops),
         "told to stop": len(done),
         "worst axis within target": f"{np.mean(worst <= 1.0):.0%}" if done else "-",
-        "error / target: median": f"{np.median(worst):.2f}" if done else "-",
-        "largest": f"{worst.max():.2f}" if done else "-",
+        "largest error / target": f"{worst.max():.2f}" if done else "-",
         "seconds beyond earliest": f"{np.median(beyond):.0f}" if len(beyond) else "-",
         "not getting there": sum(stop.is_stuck for stop in stops),
     }
