@@ -5,7 +5,6 @@ one frame in another.
 from array import array
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -62,17 +61,11 @@ class PoseFields(NamedTuple):
     quat_xyzw: Sequence[float]
 
 
-@dataclass
 class _Kept:
     """The poses of a frame in its parent: N bag times, stamps and rows of seven."""
 
-    log_ns: list[int] = field(default_factory=list)
-    stamps_ns: list[int] = field(default_factory=list)
-    values: "array[float]" = field(default_factory=lambda: array("d"))
-
-    def poses(self) -> FloatArray:
-        """(N, 7) array of x y z qx qy qz qw."""
-        return np.array(self.values, dtype=float).reshape(-1, 7)
+    def __init__(self) -> None:
+        self.log_ns, self.stamps_ns, self.values = array("q"), array("q"), array("d")
 
 
 class TransformTree(FrameTree):
@@ -152,61 +145,46 @@ class TransformTree(FrameTree):
             If a transform is not a pose.
         """
         up, down = self.chain(source)
-        moving = {
-            frame: self._moving(frame) for frame in up + down if not self.edges[frame].is_static
-        }
-        slowest = max(moving, key=lambda frame: _interval(moving[frame][0]))
-        base, log_ns = moving[slowest]
+        found = {frame: self._edge(frame) for frame in up + down}
+        moving = {frame for frame in found if not self.edges[frame].is_static}
+        slowest = max(moving, key=lambda frame: _interval(found[frame][0]))
+        base, log_ns = found[slowest]
         known = np.ones(len(base), dtype=bool)
-        for edge, _ in moving.values():
-            if edge is not base:
-                known &= _is_known(edge.stamps_ns, base.stamps_ns, max_gap_s)
-        stamps_ns = base.stamps_ns[known]
+        for frame in moving - {slowest}:
+            known &= _is_known(found[frame][0].stamps_ns, base.stamps_ns, max_gap_s)
+        base = base[known]
 
         def at(frame: str) -> FloatArray:
-            if frame not in moving:
-                return self._static(frame)
-            return base.poses[known] if frame == slowest else _at(moving[frame][0], stamps_ns)
+            edge = base if frame == slowest else found[frame][0]
+            # As tf2 and the node have them; of a single pose it is that.
+            return edge.at(base.stamps_ns, straight=True) if len(edge) > 1 else edge.poses
 
-        Ts_world_sensor = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
+        Ts_world_sensor = np.broadcast_to(np.eye(4), (len(base), 4, 4))
         for frame in up:
             Ts_world_sensor = Ts_world_sensor @ se3.inverse(at(frame))
         for frame in down:
             Ts_world_sensor = Ts_world_sensor @ at(frame)
-        trajectory = Trajectory(stamps_ns, Ts_world_sensor, source.sensor_frame, source.world_frame)
+        trajectory = Trajectory(base.stamps_ns, Ts_world_sensor, *source[::-1])
         return trajectory, log_ns[known], int((~known).sum())
 
-    def _static(self, frame: str) -> FloatArray:
-        """(4, 4): the last pose of a static edge."""
-        stamps_ns = np.zeros(1, dtype=np.int64)
-        pose: FloatArray = self._checked(frame, stamps_ns, self._kept[frame].poses()[-1:]).poses[0]
-        return pose
-
-    def _moving(self, frame: str) -> tuple[Trajectory, IntArray]:
-        """Trajectory and bag times of an edge; of repeated transforms the first counts."""
+    def _edge(self, frame: str) -> tuple[Trajectory, IntArray]:
+        """Trajectory and bag times of an edge: of repeated transforms the first counts, of static
+        ones only the last.
+        """
         kept = self._kept[frame]
-        stamps_ns, first = np.unique(np.array(kept.stamps_ns, dtype=np.int64), return_index=True)
-        trajectory = self._checked(frame, stamps_ns, kept.poses()[first])
-        return trajectory, np.array(kept.log_ns, dtype=np.int64)[first]
-
-    def _checked(self, frame: str, stamps_ns: IntArray, poses: FloatArray) -> Trajectory:
+        stamps_ns, rows = np.unique(np.array(kept.stamps_ns), return_index=True)
+        if self.edges[frame].is_static:
+            stamps_ns, rows = np.zeros(1, dtype=np.int64), np.array([-1])
+        poses = np.reshape(kept.values, (-1, 7))[rows]
         try:
-            return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
+            trajectory = Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
         except InputError as error:
             raise InputError(f"transform {self.edges[frame].parent}:{frame}: {error}") from None
-
-
-def _at(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
-    """(N, 4, 4): poses at stamps that are known to be within the trajectory, as tf2 and the node
-    have them.
-    """
-    if len(trajectory) > 1:
-        return trajectory.at(stamps_ns, straight=True)
-    return np.repeat(trajectory.poses, len(stamps_ns), axis=0)
+        return trajectory, np.array(kept.log_ns)[rows]
 
 
 def _interval(trajectory: Trajectory) -> float:
-    return float(np.median(np.diff(trajectory.stamps_ns))) if len(trajectory) > 1 else np.inf
+    return trajectory.interval_s if len(trajectory) > 1 else np.inf
 
 
 def _is_known(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float) -> BoolArray:
