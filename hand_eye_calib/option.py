@@ -51,9 +51,7 @@ def option(
         For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
     metadata = dict(locals())
-    metadata["minimum"], metadata["maximum"] = metadata.pop("within") or (None, None)
-    del metadata["default"]
-    return dataclasses.field(default=default, metadata=metadata)
+    return dataclasses.field(default=metadata.pop("default"), metadata=metadata)
 
 
 def option_name(field: OptionField) -> str:
@@ -82,7 +80,16 @@ def check_value(field: OptionField, value: object) -> OptionValue:
     meta, name, words = field.metadata, option_name(field), field.metadata["words"]
     kind: type = float if words else type(field.default)
     if isinstance(value, str) and (value in words or kind is str):
-        return _checked_text(name, value, meta)
+        if meta["choices"] is not None and value not in meta["choices"]:
+            raise ConfigError(
+                f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
+                f"{did_you_mean(value, meta['choices'])}"
+            )
+        if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
+            raise ConfigError(f"{name} must be {meta['form']}; got {shown_value(value)}")
+        if meta["parse"] is not None:
+            meta["parse"](name, value)
+        return value
     if words and isinstance(value, str):
         with contextlib.suppress(ValueError):
             value = float(value)
@@ -95,28 +102,11 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         )
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
-    unit, least, most = (meta[key] for key in ("unit", "minimum", "maximum"))
-    if least is not None and not least <= value <= most:
+    least, most = meta["within"] or (value, value)
+    if not least <= value <= most:
         bound = f"at least {least}" if value < least else f"at most {most}"
-        raise ConfigError(f"{name} must be {f'{bound} {unit}'.rstrip()}; got {value}")
+        raise ConfigError(f"{name} must be {' '.join([bound, meta['unit']]).rstrip()}; got {value}")
     return value
-
-
-def _checked_text(name: str, value: str, meta: Mapping[str, Any]) -> str:
-    if meta["choices"] is not None and value not in meta["choices"]:
-        raise ConfigError(
-            f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
-            f"{did_you_mean(value, meta['choices'])}"
-        )
-    if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
-        raise ConfigError(f"{name} must be {meta['form']}; got {shown_value(value)}")
-    if meta["parse"] is not None:
-        meta["parse"](name, value)
-    return value
-
-
-def _fields(options: Any) -> tuple[OptionField, ...]:
-    return dataclasses.fields(options)
 
 
 class OptionSet:
@@ -125,8 +115,12 @@ class OptionSet:
     given: frozenset[str]
 
     def __post_init__(self) -> None:
-        for field in _fields(self):
+        for field in self._options():
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
+
+    @classmethod
+    def _options(cls) -> tuple[OptionField, ...]:
+        return dataclasses.fields(cls)  # type: ignore[arg-type]
 
     @classmethod
     def from_options(cls, options: Mapping[str, object]) -> Self:
@@ -137,7 +131,7 @@ class OptionSet:
         ConfigError
             If a name is unknown, with a list of the known ones, or a value is not allowed.
         """
-        known = {option_name(field): field.name for field in _fields(cls)}
+        known = {option_name(field): field.name for field in cls._options()}
         unknown = [name for name in options if name not in known]
         if unknown:
             raise ConfigError(
@@ -148,4 +142,4 @@ class OptionSet:
 
     def to_options(self) -> dict[str, OptionValue]:
         """Mapping of public names to values."""
-        return {option_name(field): getattr(self, field.name) for field in _fields(self)}
+        return {option_name(field): getattr(self, field.name) for field in self._options()}

@@ -11,7 +11,6 @@ from hand_eye_calib.cli.options import config_from, options_from
 from hand_eye_calib.cli.reading import file_settings, read_files
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.stops import read_arm_samples
 from hand_eye_calib.results.calibration import Calibration
 

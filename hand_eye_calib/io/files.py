@@ -39,14 +39,9 @@ def read_bytes(path: str | Path, largest: int) -> bytes:
         If it is not a regular file, or larger than ``largest`` bytes.
     """
     with open(open_regular(path), "rb") as file:
-        # The buffer is as large as what is asked for.
-        size = min(os.fstat(file.fileno()).st_size, largest)
-        data = file.read(size + 1)
-        if len(data) > size:  # it grows, or does not know its size
-            data += file.read(largest + 1 - len(data))
-    if len(data) > largest:
-        raise InputError(f"cannot read {path}: it is larger than {largest} bytes")
-    return data
+        if os.fstat(file.fileno()).st_size > largest:
+            raise InputError(f"cannot read {path}: it is larger than {largest} bytes")
+        return file.read()
 
 
 def read_text(path: str | Path, expected: str, largest: int) -> str:
@@ -67,13 +62,10 @@ def read_text(path: str | Path, expected: str, largest: int) -> str:
     """
     try:
         return read_bytes(path, largest).decode("utf-8-sig")
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        if isinstance(error, UnicodeDecodeError):
-            raise InputError(f"{path}: not a text file; expected {expected}") from None
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot read {path}: {reason}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected {expected}") from None
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
@@ -98,7 +90,11 @@ def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
     path = Path()
     try:
         for path, temporary in temporaries.items():
-            _write_new(temporary, contents[path])
+            content = contents[path]
+            with open(temporary, "xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
         for path, temporary in temporaries.items():
             os.replace(temporary, path)
     except OSError as error:
@@ -106,12 +102,3 @@ def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
     finally:
         for temporary in temporaries.values():
             temporary.unlink(missing_ok=True)
-
-
-def _write_new(path: Path, content: str | bytes) -> None:
-    """Write a file that must not exist, and wait until it is on the disk."""
-    data = content.encode() if isinstance(content, str) else content
-    with open(path, "xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())

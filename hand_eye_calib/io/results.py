@@ -245,22 +245,18 @@ def _xacro_text(calibration: Calibration) -> str:
 def _launch_text(calibrations: Sequence[Calibration]) -> str:
     """A launch file that publishes extrinsics as static transforms."""
     comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
-    headlines = [_remarks(each)[0] for each in calibrations]
-    logged = "\n".join(f"            LogInfo(msg={headline!r})," for headline in headlines)
     nodes = "\n".join(_node_text(each) for each in calibrations)
     return f"""\
 # Publishes the extrinsic on /tf_static. Only if no robot description has this edge: a frame has one
 # parent and one publisher.
 {comment}
 from launch import LaunchDescription
-from launch.actions import LogInfo
 from launch_ros.actions import Node
 
 
 def generate_launch_description():
     return LaunchDescription(
         [
-{logged}
 {nodes}
         ]
     )
@@ -269,15 +265,15 @@ def generate_launch_description():
 
 def _node_text(calibration: Calibration) -> str:
     """The node that publishes an extrinsic."""
-    arguments = [
-        (f"--{name}", value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}")
+    arguments = {
+        f"--{name}": value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
         for name, value in calibration.usable_numbers().items()
-    ]
-    arguments += [
-        ("--frame-id", printable(calibration.mounting[0])),
-        ("--child-frame-id", printable(calibration.child_frame)),
-    ]
-    lines = "\n".join(f"                    {option!r}, {value!r}," for option, value in arguments)
+    }
+    arguments["--frame-id"] = printable(calibration.mounting[0])
+    arguments["--child-frame-id"] = printable(calibration.child_frame)
+    lines = "\n".join(
+        f"                    {name!r}, {text!r}," for name, text in arguments.items()
+    )
     return f"""\
             Node(
                 package='tf2_ros',

@@ -148,8 +148,8 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
         read_only=meta["read_only"],
         dynamic_typing=is_dynamic,
     )
-    if meta["minimum"] is not None and not is_dynamic:
-        low, high = map(type(field.default), (meta["minimum"], meta["maximum"]))
+    if meta["within"] and not is_dynamic:
+        low, high = map(type(field.default), meta["within"])
         if isinstance(field.default, float):
             descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
         else:

@@ -51,10 +51,8 @@ def comment_of(field):
     parts = [meta["doc"]]
     if meta["choices"]:
         parts.append(f"One of {', '.join(meta['choices'])}.")
-    if meta["minimum"] is not None:
-        parts.append(
-            f"{number(meta['minimum'])} to {number(meta['maximum'])} {meta['unit']}".rstrip() + "."
-        )
+    if meta["within"]:
+        parts.append(f"{' to '.join(map(number, meta['within']))} {meta['unit']}".rstrip() + ".")
     if meta["read_only"]:
         parts.append("Fixed once the node runs.")
     return " ".join(parts)

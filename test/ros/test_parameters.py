@@ -35,11 +35,11 @@ def test_every_option_is_a_parameter_with_its_description_and_range(start_node, 
         assert peer.parameter(name) == FIELDS[name].default
     assert (
         peer.describe("threshold").floating_point_range[0].to_value
-        == FIELDS["threshold"].metadata["maximum"]
+        == FIELDS["threshold"].metadata["within"][1]
     )
     assert (
         peer.describe("max_pairs").integer_range[0].from_value
-        == FIELDS["max_pairs"].metadata["minimum"]
+        == FIELDS["max_pairs"].metadata["within"][0]
     )
     assert ", ".join(METHODS) in peer.describe("method").description
 

@@ -64,8 +64,9 @@ def allowed(field):
     if meta["choices"]:
         return ", ".join(f"`{choice}`" for choice in meta["choices"])
     words = [f"`{word}`" for word in meta["words"]]
-    if meta["minimum"] is not None and meta["maximum"] is not None:
-        return " or ".join([*words, f"{meta['minimum']:g} to {meta['maximum']:g}"])
+    if meta["within"]:
+        least, most = meta["within"]
+        return " or ".join([*words, f"{least:g} to {most:g}"])
     if words:
         return " or ".join(words)
     if meta["parse"] or meta["pattern"]:

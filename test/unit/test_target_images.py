@@ -104,7 +104,7 @@ def test_aprilgrid_has_the_frame_of_kalibr():
     target = Target.parse(f"aprilgrid:{columns}x{rows}:{size}:{gap}")
     images = [rendered(picture, T, rng) for T in Ts]
     found = poses_of_target(images, target, Camera(MATRIX, np.zeros(5), False))
-    off = se3.log(Ts[found.images] @ T_picture_target @ found.Ts_target_camera)
+    off = se3.log(Ts[found.images] @ T_picture_target @ se3.inverse(found.Ts_camera_target))
     assert found.images == [0, 1, 2]
     assert np.abs(off[:, :3]).max() < 5e-3
     assert np.degrees(np.abs(off[:, 3:]).max()) < 0.4
