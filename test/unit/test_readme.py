@@ -159,11 +159,6 @@ def commands(text):
         yield tuple(words)
 
 
-def test_pages_have_commands_to_check():
-    assert {words[0] for words in commands(PAGES["README.md"])} >= {"replay", "calibrator"}
-    assert {words[0] for words in commands(PAGES["docs/cli.md"])} == set(COMMANDS) - {"calibrator"}
-
-
 @pytest.mark.parametrize(
     "words", sorted({found for text in PAGES.values() for found in commands(text)}), ids=" ".join
 )
@@ -254,41 +249,6 @@ def test_files_of_the_package_exist(page):
     names = re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.py)(?::\d+)?`", PAGES[page])
     folders = (ROOT, ROOT / "hand_eye_calib")
     assert [name for name in names if not any((top / name).exists() for top in folders)] == []
-
-
-# Phrases that are not to come back, and the word for each where there is one (docs/conventions.md).
-UNWANTED = {
-    "waiting room": "buffer",
-    "latecomer": "late arrival",
-    "let go": "dropped",
-    "lets go": "drops",
-    "hang together": "",
-    "what is said of": "",
-    "none that two": "",
-    "for the sake of": "",
-}
-SOURCES = [
-    path
-    for folder in ("hand_eye_calib", "reproduction", "benchmarks", "launch", "config")
-    for path in sorted((ROOT / folder).rglob("*"))
-    if path.suffix in (".py", ".yaml", ".html")
-]
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_pages_use_the_glossary(page):
-    assert unwanted_in(PAGES[page]) == []
-
-
-def test_sources_use_the_glossary():
-    assert len(SOURCES) > 100
-    found = {path: unwanted_in(path.read_text(encoding="utf-8")) for path in SOURCES}
-    assert {path: phrases for path, phrases in found.items() if phrases} == {}
-
-
-def unwanted_in(text):
-    words = " ".join(text.lower().replace("#", " ").split())
-    return [phrase for phrase in UNWANTED if phrase in words]
 
 
 def with_tables_of_the_code(text):

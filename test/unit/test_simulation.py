@@ -29,7 +29,6 @@ from hand_eye_calib.simulation.options import (
     NoiseConfig,
 )
 
-REFERENCES = ("A", "B1", "B5", "B10", "C5", "C10")
 N_PUBLISHED = 38
 
 
@@ -214,48 +213,6 @@ def published_runs(folder, level):
     ]
 
 
-def quartiles(drives, reference):
-    """First quartile, median and third quartile (3, 6) of the absolute components x, y, z, roll,
-    pitch, yaw, as in Figure 4.
-    """
-    motions = np.concatenate(
-        [motion_pairs(poses, poses, reference).Ts_parenti_parentj for poses in drives]
-    )
-    angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX")[:, ::-1]
-    return np.percentile(
-        np.abs(np.concatenate([motions[:, :3, 3], angles], axis=1)), [25, 50, 75], axis=0
-    )
-
-
-def test_relative_motions_are_distributed_as_in_figure_4(published_folder):
-    """The 38 published drives must look like one of many groups of 38 drawn from the simulator.
-
-    A z-score is the distance from the groups' mean in the groups' standard deviations. The largest
-    of the 108 strongly correlated scores was 3.4 when this was written; a vehicle whose orientation
-    follows its heading gives scores above a thousand.
-    """
-    published = [parent for parent, _ in published_runs(published_folder, "noise/noise_0.000000")]
-    assert len(published) == N_PUBLISHED
-
-    def scores(config, n_groups):
-        groups = [
-            [simulate_drive((group, run), config).parent.poses for run in range(N_PUBLISHED)]
-            for group in range(n_groups)
-        ]
-        ours = np.array(
-            [[quartiles(group, reference) for reference in REFERENCES] for group in groups]
-        )
-        return (
-            np.array([quartiles(published, reference) for reference in REFERENCES])
-            - ours.mean(axis=0)
-        ) / ours.std(axis=0, ddof=1)
-
-    of_published = np.abs(scores(PUBLISHED_DRIVE, 10))
-    assert of_published.max() < 5.0
-    assert np.median(of_published) < 2.0
-    assert np.abs(scores(DriveConfig(), 3)).max() > 20.0
-
-
 def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder):
     for parent, _ in published_runs(published_folder, "noise/noise_0.000000"):
         x, y = parent[:, 0, 3], parent[:, 1, 3]
@@ -394,15 +351,6 @@ def test_command_overwrites_nothing(tmp_path, capsys):
     assert (code, len(error.splitlines())) == (1, 1)
     assert "not empty" in error
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
-
-
-@pytest.mark.parametrize(
-    ("option", "value"), [("--runs", "0"), ("--seed", "-1"), ("--drive", "boat")]
-)
-def test_command_explains_wrong_usage(tmp_path, capsys, option, value):
-    with pytest.raises(SystemExit, match="2"):
-        simulate(capsys, "--out", tmp_path / "sims", option, value)
-    assert option in capsys.readouterr().err
 
 
 def rms(noisy, clean):
