@@ -77,7 +77,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
             f"the target is seen in {n_child} of {len(images)} images, its corners to "
             f"{float((seen.rms_px**2).mean() ** 0.5):.2f} pixels (rms)"
         )
-        tracking = se3.inverse(seen.Ts_target_camera)
+        tracking = seen.Ts_camera_target
         found = calibrate_arm(parent.poses[seen.images], tracking, config)
     counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
     return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}
