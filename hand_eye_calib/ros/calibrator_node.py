@@ -83,7 +83,9 @@ class CalibratorNode(Node):
         self._session.reconfigure(config)
         tree = RobotTree(self, self._log)
         self._robot = Robot(self._log, options, tree)
-        self._tf = TfBroadcaster(self, self._log, tree, *[STATIC_TOPIC] * bool(needs_tf(options)))
+        if needs_tf(options):
+            tree.listen(STATIC_TOPIC)
+        self._tf = TfBroadcaster(self, self._log, tree)
         self._others = other_names(options.other_children)
         self._session.take_others(self._others)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]

@@ -93,20 +93,17 @@ class RobotTree(FrameTree):
         self._node, self._log = node, log
         self._subscriptions: dict[str, Subscription] = {}
 
-    def listen(self, *topics: str) -> None:
-        """Listen to these topics alone from now on, as if nothing had been heard yet."""
-        self.edges.clear()
-        self.ignore(*self._subscriptions)
-        for topic in topics:
+    def listen(self, topic: str) -> None:
+        """Listen to a topic from now on."""
+        if topic not in self._subscriptions:
             heard = partial(self._hear, topic)
             subscription = self._node.create_subscription(message_type(), topic, heard, _QOS[topic])
             self._subscriptions[topic] = subscription
 
-    def ignore(self, *topics: str) -> None:
-        """Listen to these topics no longer."""
-        for topic in topics:
-            if topic in self._subscriptions:
-                self._node.destroy_subscription(self._subscriptions.pop(topic))
+    def ignore(self, topic: str) -> None:
+        """Listen to a topic no longer."""
+        if topic in self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def what_forbids(self, parent: str, child: str) -> str:
         """Why the edge ``parent -> child`` must not be broadcast; empty if it may."""
@@ -236,16 +233,13 @@ class TfBroadcaster:
     node : rclpy.node.Node
     log : NodeLog
     tree : RobotTree
-    topics : str
-        What the tree is listened to for other reasons.
     """
 
-    def __init__(self, node: Node, log: NodeLog, tree: RobotTree, *topics: str) -> None:
-        self._node, self._log, self._tree, self._topics = node, log, tree, topics
+    def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
+        self._node, self._log, self._tree = node, log, tree
         self._is_on, self._began_s = False, 0.0
         self._publisher: Publisher | None = None
         self._sent: TransformStamped | None = None
-        self._tree.listen(*topics)
         self.restart()
 
     def restart(self) -> None:
@@ -271,7 +265,11 @@ class TfBroadcaster:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
         if on != self._is_on:
             self._is_on, self._began_s, self._refused = on, time.monotonic(), ""
-            self._tree.listen(*((STATIC_TOPIC, DYNAMIC_TOPIC) if on else self._topics))
+            if on:
+                self._tree.listen(STATIC_TOPIC)
+                self._tree.listen(DYNAMIC_TOPIC)
+            else:
+                self._tree.ignore(DYNAMIC_TOPIC)
             self.look()
 
     def add(self, calibration: Calibration, why_not: str) -> None:

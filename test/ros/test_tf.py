@@ -143,7 +143,7 @@ class TestNode:
         peer.solve(publishers, *(part[:400] for part in poses))
         early = "the goal is not reached"
         peer.spin_until(lambda: said and state(key="tf_static_reason") == early, "the state")
-        assert state() == "not yet"
+        assert state() == "not_yet"
         peer.solve(publishers, *(part[400:] for part in poses))
         peer.spin_until(lambda: state("progress", "done") == "true", "the goal")
         # Nothing comes in any more: the two results that reached the goal suffice.

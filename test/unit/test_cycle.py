@@ -23,6 +23,7 @@ from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.solving import Answer, Checked
 from hand_eye_calib.live.state import Level, NodeState
+from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
@@ -156,7 +157,7 @@ def shape(hint):
         hints = typing.get_type_hints(hint)
         return f"{{{', '.join(f'{name}: {shape(each)}' for name, each in hints.items())}}}"
     if hint not in words and issubclass(hint, Enum):
-        return "/".join(each.value for each in hint)
+        return "/".join(map(plain, hint))
     return words[hint]
 
 
