@@ -5,8 +5,11 @@ nothing here needs a lock.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -31,14 +34,7 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.inputs import TfInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
-from hand_eye_calib.ros.tf import (
-    STATIC_TOPIC,
-    Robot,
-    RobotTree,
-    TfBroadcaster,
-    message_type,
-    needs_tf,
-)
+from hand_eye_calib.ros.tf import Robot, RobotTree, TfBroadcaster, message_type, needs_tf
 
 _DISCOVERY_PERIOD_S = 0.2
 _STATE_PERIOD_S = 1.0
@@ -84,7 +80,7 @@ class CalibratorNode(Node):
         tree = RobotTree(self, self._log)
         self._robot = Robot(self._log, options, tree)
         if needs_tf(options):
-            tree.listen(STATIC_TOPIC)
+            tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
         self._others = other_names(options.other_children)
         self._session.take_others(self._others)
@@ -168,16 +164,16 @@ class CalibratorNode(Node):
     def _serve(self) -> None:
         # A group of its own: while it awaits a solve, it would hold up every other callback of its
         # group.
-        groups = {"solve": ReentrantCallbackGroup()}
-        for name, kind, answer in (
-            ("solve", Trigger, self._on_solve),
-            ("reset", Trigger, self._on_reset),
-            ("save", Trigger, self._on_save),
-            ("set_enabled", SetBool, self._on_set_enabled),
+        group, qos = ReentrantCallbackGroup(), _SERVICE_QOS
+        self.create_service(
+            Trigger, "~/solve", self._on_solve, qos_profile=qos, callback_group=group
+        )
+        for name, kind, act in (
+            ("reset", Trigger, self._reset),
+            ("save", Trigger, lambda request: self._saver.save(self._options.node)),
+            ("set_enabled", SetBool, self._set_enabled),
         ):
-            self.create_service(
-                kind, f"~/{name}", answer, qos_profile=_SERVICE_QOS, callback_group=groups.get(name)
-            )
+            self.create_service(kind, f"~/{name}", partial(_answer, act), qos_profile=qos)
 
     def _start_timers(self) -> None:
         # Steady time: these go on while a bag, and with it simulated time, is paused.
@@ -273,26 +269,19 @@ class CalibratorNode(Node):
         response.success, response.message = await solved
         return response
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self, request: Trigger.Request) -> tuple[bool, str]:
         self._begin_session()
-        response.success, response.message = True, "all poses forgotten, new session"
-        self._log.info(response.message)
-        return response
+        text = "all poses forgotten, new session"
+        self._log.info(text)
+        return True, text
 
-    def _on_save(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self._saver.save(self._options.node)
-        return response
-
-    def _on_set_enabled(
-        self, request: SetBool.Request, response: SetBool.Response
-    ) -> SetBool.Response:
+    def _set_enabled(self, request: SetBool.Request) -> tuple[bool, str]:
         for each in self._inputs:
             each.is_enabled = request.data
         ignored = sum(each.ignored for each in self._inputs)
-        verb = "accepting" if request.data else "not accepting"
-        response.success, response.message = True, f"{verb} poses; {ignored} ignored so far"
-        self._log.info(response.message)
-        return response
+        text = f"{'' if request.data else 'not '}accepting poses; {ignored} ignored so far"
+        self._log.info(text)
+        return True, text
 
     # ------------------------------------------------------------ parameters
 
@@ -330,3 +319,9 @@ class CalibratorNode(Node):
         if period_ns != self._solve_timer.timer_period_ns:
             self._solve_timer.timer_period_ns = period_ns
             self._solve_timer.reset()
+
+
+def _answer(act: Callable[[Any], tuple[bool, str]], request: Any, response: Any) -> Any:
+    """Answer a service with what was done: whether it worked, and a line about it."""
+    response.success, response.message = act(request)
+    return response

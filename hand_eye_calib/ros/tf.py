@@ -93,7 +93,7 @@ class RobotTree(FrameTree):
         self._node, self._log = node, log
         self._subscriptions: dict[str, Subscription] = {}
 
-    def listen(self, topic: str) -> None:
+    def listen(self, topic: str = STATIC_TOPIC) -> None:
         """Listen to a topic from now on."""
         if topic not in self._subscriptions:
             heard = partial(self._hear, topic)
@@ -266,7 +266,7 @@ class TfBroadcaster:
         if on != self._is_on:
             self._is_on, self._began_s, self._refused = on, time.monotonic(), ""
             if on:
-                self._tree.listen(STATIC_TOPIC)
+                self._tree.listen()
                 self._tree.listen(DYNAMIC_TOPIC)
             else:
                 self._tree.ignore(DYNAMIC_TOPIC)

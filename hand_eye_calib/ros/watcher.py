@@ -4,7 +4,6 @@ import json
 import os
 import time
 from functools import partial
-from types import TracebackType
 from typing import Any, Self
 
 import rclpy
@@ -12,7 +11,6 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -57,18 +55,13 @@ class Watcher:
         self._executor.add_node(self._node)
         self._node.create_timer(_LOOK_S, self._look)
         self._heard: set[str] = set()
-        self._asked: dict[str, tuple[Client, Future | None, float]] = {}
+        self._asked: dict[str, tuple[Client, Any, Future | None, float]] = {}
         self._look()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
@@ -84,12 +77,15 @@ class Watcher:
         in ``monitor:=false``; the answer goes to the board.
         """
         if self._board.node and request not in self._asked:
-            is_parameter = ":=" in request
-            kind, service = (
-                (SetParameters, "set_parameters") if is_parameter else (Trigger, request)
-            )
-            client = self._node.create_client(kind, f"{self._board.node}/{service}")
-            self._asked[request] = client, None, time.monotonic()
+            name, is_parameter, value = request.partition(":=")
+            kind, message = Trigger, Trigger.Request()
+            if is_parameter:
+                given = {"true": True, "false": False}.get(value, value)
+                parameter = Parameter(name, value=given).to_parameter_msg()
+                kind, message = SetParameters, SetParameters.Request(parameters=[parameter])
+                name = "set_parameters"
+            client = self._node.create_client(kind, f"{self._board.node}/{name}")
+            self._asked[request] = client, message, None, time.monotonic()
             self._answer(request, None, "asked ...")
 
     def _look(self) -> None:
@@ -110,11 +106,9 @@ class Watcher:
 
     def _told(self, topic: str, kind: str) -> str:
         publishers = self._node.get_publishers_info_by_topic(topic)
-        best_effort = ReliabilityPolicy.BEST_EFFORT
-        qos = {each.qos_profile.reliability == best_effort for each in publishers}
-        reliability = " and ".join("best effort" if each else "reliable" for each in sorted(qos))
-        count = counted(len(publishers), "publisher")
-        return f"{topic} ({kind}, {count}{', ' * bool(qos)}{reliability})"
+        qos = {each.qos_profile.reliability.name.lower().replace("_", " ") for each in publishers}
+        told = f"{kind}, {counted(len(publishers), 'publisher')}, {' and '.join(sorted(qos))}"
+        return f"{topic} ({told.removesuffix(', ')})"
 
     def _take(self, name: str, message: String) -> None:
         state = state_of(message.data)
@@ -123,34 +117,24 @@ class Watcher:
 
     def _follow(self, request: str) -> None:
         """Go on with a request: wait for the service, then for the answer."""
-        client, future, asked_s = self._asked[request]
+        client, message, future, asked_s = self._asked[request]
         if future is None and client.service_is_ready():
-            self._asked[request] = client, client.call_async(_message(request)), asked_s
+            self._asked[request] = client, message, client.call_async(message), asked_s
         elif future is not None and future.done():
             response: Any = future.result()
-            if ":=" in request:
-                done, text = response.results[0].successful, response.results[0].reason
+            if client.srv_type is Trigger:
+                self._end(request, response.success, response.message)
             else:
-                done, text = response.success, response.message
-            self._end(request, done, printable(text) or "done")
+                self._end(request, response.results[0].successful, response.results[0].reason)
         elif time.monotonic() - asked_s > _PATIENCE_S:
             self._end(request, False, f"no answer within {_PATIENCE_S:.0f} s")
 
     def _end(self, request: str, good: bool, text: str) -> None:
         self._node.destroy_client(self._asked.pop(request)[0])
-        self._answer(request, good, text)
+        self._answer(request, good, printable(text) or "done")
 
     def _answer(self, request: str, good: bool | None, text: str) -> None:
         self._board.answer(request, good, text, time.monotonic())
-
-
-def _message(request: str) -> Any:
-    """The message of a request to the node."""
-    name, is_parameter, value = request.partition(":=")
-    if not is_parameter:
-        return Trigger.Request()
-    given = {"true": True, "false": False}.get(value, value)
-    return SetParameters.Request(parameters=[Parameter(name, value=given).to_parameter_msg()])
 
 
 def state_of(text: str) -> NodeState | None:
