@@ -59,12 +59,6 @@ def test_control_characters_do_not_reach_the_log():
     assert written == ["frame a\\x1b[2J\nsecond line"] * 3
 
 
-def test_bytes_that_are_no_message_are_refused():
-    data = serialize_message(Odometry())
-    with pytest.raises(InputError, match="not a message of type nav_msgs/msg/Odometry"):
-        MessageReader("nav_msgs/msg/Odometry", "poses")(data[:40])
-
-
 @pytest.mark.parametrize(
     ("kind", "measures", "lacks"),
     [
@@ -84,9 +78,7 @@ def test_a_message_without_what_is_measured_is_refused(kind, measures, lacks):
         read(serialize_message(message))
 
 
-@pytest.mark.parametrize(
-    "stamp_ns", [0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789, -1, -1_500_000_000]
-)
+@pytest.mark.parametrize("stamp_ns", [0, 999_999_999, 1_700_000_000_123_456_789, -1_500_000_000])
 def test_stamps_survive_a_round_trip(stamp_ns):
     assert conversions.to_ns(conversions.to_time(stamp_ns)) == stamp_ns
 
@@ -126,16 +118,3 @@ def test_covariance_is_about_the_fixed_axes_of_the_parent():
     )
     # The test can tell: the unconverted covariance is far off.
     assert np.abs((cov_in_child - measured) / scale).max() > 0.3
-
-
-def test_rates_are_integrated_and_poses_can_be_read_in_part():
-    rates = MessageReader("sensor_msgs/msg/Imu", "rates")
-    for second in range(3):
-        imu = Imu()
-        imu.header.stamp.sec, imu.angular_velocity.z = second, 0.5
-        _, _, z, w = rates(serialize_message(imu)).quat_xyzw
-    assert 2 * np.arctan2(z, w) == pytest.approx(1.0)
-    odometry = Odometry()
-    odometry.pose.pose.position.x, odometry.pose.pose.orientation.w = 2.0, 0.0
-    position = MessageReader("nav_msgs/msg/Odometry", "positions")(serialize_message(odometry))
-    assert (position.position, position.quat_xyzw) == ([2, 0, 0], [0, 0, 0, 1])

