@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias, cast
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -149,20 +149,21 @@ if calibrate.__doc__:  # not with python -OO
 
 def _as_trajectories(*given: object) -> list[Trajectory]:
     """Trajectories from what :data:`TrajectoryLike` names."""
-    read = [each if isinstance(each, Trajectory) else _read(each) for each in given]
-    if not all(isinstance(each, str | PathLike) for each in given):
+    read_trajectory = upstairs("io.trajectory_files.reading", "read_trajectory")
+    are_paths = [isinstance(each, str | PathLike) for each in given]
+    read: list[Trajectory] = [
+        each
+        if isinstance(each, Trajectory)
+        else read_trajectory(each, *(["auto"] if is_path else []))
+        for each, is_path in zip(given, are_paths, strict=True)
+    ]
+    if not all(are_paths):
         return read
     names = names_of_files([Path(str(each)) for each in given])
     return [
         replace(each, sensor_frame=each.sensor_frame or name)
         for each, name in zip(read, names, strict=True)
     ]
-
-
-def _read(source: object) -> Trajectory:
-    is_path = isinstance(source, str | PathLike)
-    read = upstairs("io.trajectory_files.reading", "read_trajectory")
-    return cast(Trajectory, read(source, "auto") if is_path else read(source))
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:

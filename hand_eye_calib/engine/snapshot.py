@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import (
-    Correlation,
-    correlate_rates,
-)
+from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import cross_checked
@@ -127,9 +124,11 @@ class Snapshot:
     @cached_property
     def _pose_pairs(self) -> PosePairs:
         kept = self.kept
-        if len(kept) and conventions(self.config, "parent") | conventions(self.config, "child"):
-            parent = _corrected(Trajectory(kept.stamps_ns, kept.Ts_pw_p), "parent", self.config)
-            child = _corrected(Trajectory(kept.stamps_ns, kept.Ts_cw_c), "child", self.config)
+        if len(kept):
+            parent, child = (
+                _put_right(Trajectory(kept.stamps_ns, Ts), stream, self.config)
+                for stream, Ts in zip(STREAMS, (kept.Ts_pw_p, kept.Ts_cw_c), strict=True)
+            )
             kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
         made = pair_poses(self.config, self.parent, self.child, self.paired_at, kept)
         return downsample(PosePairs.concatenate(kept, made), self.config.max_pairs)
@@ -159,22 +158,18 @@ class Snapshot:
                 f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
                 "nothing to calibrate between; give parent_frame and child_frame"
             )
-        if cross_check is None:
-            cross_check = self.config.reference == "auto"
-        return self.resolved()._estimate(cross_check)
-
-    def _estimate(self, cross_check: bool) -> Calibration:
-        if len(self._pose_pairs) < self.config.min_pairs:
-            raise NotEnoughDataError(self._what_is_missing(len(self._pose_pairs)))
-        if self.config.measured != "poses":
-            result = self._estimate_part()
+        resolved, pairs = self.resolved(), self.pose_pairs()
+        config = resolved.config
+        if len(pairs) < config.min_pairs:
+            raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
+        if config.measured != "poses":
+            result = resolved._estimate_part()
         else:
-            solved = solve_poses(self._pose_pairs, self.config, self.time_offset)
-            result = (
-                cross_checked(solved, self.config, self._pose_pairs)
-                if cross_check
-                else solved.calibration()
-            )
+            solved = solve_poses(pairs, config, resolved.time_offset)
+            if cross_check or (cross_check is None and config.reference == "auto"):
+                result = cross_checked(solved, config, pairs)
+            else:
+                result = solved.calibration()
         return replace(
             result,
             parent_frame=self.parent_frame,
@@ -184,8 +179,8 @@ class Snapshot:
 
     def _estimate_part(self) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
-        for name in ("method", "reference", "backend"):
-            if getattr(self.config, name) not in _OF_PARTS_ALONE[name]:
+        for name, allowed in _OF_PARTS_ALONE.items():
+            if getattr(self.config, name) not in allowed:
                 self.config.require_poses(f"{name} {getattr(self.config, name)}")
         of_positions = self.config.measured == "positions"
         estimate = estimate_lever_arm if of_positions else estimate_rotation
@@ -219,15 +214,15 @@ class Snapshot:
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
-        for name, stream in (("parent", self.parent), ("child", self.child)):
-            if len(stream) == 0 and len(self.kept) == 0:
-                return f"{needed}: no poses on the {name} stream"
         if len(self.kept):
             return needed
-        child = self.child.shifted(fixed_time_offset(self.config))
-        start_ns = max(self.parent.stamps_ns[0], child.stamps_ns[0])
-        end_ns = min(self.parent.stamps_ns[-1], child.stamps_ns[-1])
-        counts = f"{len(self.parent)} parent and {len(child)} child poses"
+        parent, child = self.parent, self.child.shifted(fixed_time_offset(self.config))
+        for name, stream in zip(STREAMS, (parent, child), strict=True):
+            if len(stream) == 0:
+                return f"{needed}: no poses on the {name} stream"
+        start_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
+        end_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1])
+        counts = f"{len(parent)} parent and {len(child)} child poses"
         if end_ns < start_ns:
             return (
                 f"{needed}: the streams do not overlap in time ({counts}, "
@@ -251,12 +246,10 @@ def conventions(config: CalibratorConfig, stream: str) -> dict[str, float | str]
 
 
 def _put_right(poses: "RawPoses | Trajectory", stream: str, config: CalibratorConfig) -> Trajectory:
-    trajectory = poses if isinstance(poses, Trajectory) else poses.trajectory
-    return _corrected(trajectory, stream, config) if conventions(config, stream) else trajectory
-
-
-def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
     """The trajectory of a stream in the usual convention, from that of the options."""
+    trajectory = poses if isinstance(poses, Trajectory) else poses.trajectory
+    if not conventions(config, stream):
+        return trajectory
     invert, order = getattr(config, f"{stream}_invert"), getattr(config, f"{stream}_quaternion")
     needs = {"poses"} if invert == "poses" else {"poses", "rotations"}
     if (invert, order) != ("none", "xyzw") and trajectory.measures not in needs:
@@ -278,18 +271,14 @@ def name_frames(
     known : mapping
         "parent" and "child" to the name that the stream gives; empty if it gives none.
     """
-    names, warnings = [], []
-    for stream in STREAMS:
-        name = getattr(config, f"{stream}_frame") or known[stream]
-        if not name:
-            name = f"{stream}_sensor"
-            warnings.append(
-                f"the {stream} stream does not name its sensor's frame; it is called {name!r} "
-                f"here (name it with {stream}_frame)"
-            )
-        names.append(name)
-    parent, child = names
-    return parent, child, tuple(warnings)
+    parent, child = (getattr(config, f"{stream}_frame") or known[stream] for stream in STREAMS)
+    warnings = tuple(
+        f"the {stream} stream does not name its sensor's frame; it is called '{stream}_sensor' "
+        f"here (name it with {stream}_frame)"
+        for stream, name in zip(STREAMS, (parent, child), strict=True)
+        if not name
+    )
+    return parent or "parent_sensor", child or "child_sensor", warnings
 
 
 def estimated_time_offset(

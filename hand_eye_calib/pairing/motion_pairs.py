@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median
@@ -102,20 +102,7 @@ class MotionPairs:
         )
 
     def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals of AX = XB at a transform, per pair.
-
-        Parameters
-        ----------
-        T_parent_child : (4, 4) array
-            X.
-
-        Returns
-        -------
-        translation : (K, 3) array
-            See :meth:`translation_residuals`.
-        rotation : (K, 3) array
-            See :meth:`rotation_residuals`.
-        """
+        """:meth:`translation_residuals` and :meth:`rotation_residuals` (K, 3) at X (4, 4)."""
         return self.translation_residuals(T_parent_child), self.rotation_residuals(T_parent_child)
 
     def translation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
@@ -147,20 +134,9 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of parent and child sensor in their own worlds at the same N instants.
     reference : str
-        A, B<n> or C<n>; see :func:`~hand_eye_calib.pairing.motion_pairs.reference_indices`.
-
-    Raises
-    ------
-    InputError
-        If the two stacks differ in length.
-    ConfigError
-        If the reference is none of these.
+        A, B<n> or C<n>; see :func:`~hand_eye_calib.pairing.motion_pairs.reference_indices`, also
+        for its errors.
     """
-    if len(Ts_pw_p) != len(Ts_cw_c):
-        raise InputError(
-            "parent and child need the same number of poses; "
-            f"found {len(Ts_pw_p)} and {len(Ts_cw_c)}"
-        )
     return pairs_between(Ts_pw_p, Ts_cw_c, *reference_indices(reference, len(Ts_pw_p)))
 
 
@@ -183,31 +159,14 @@ def _relative(Ts_world_sensor: FloatArray, i: IntArray, j: IntArray) -> FloatArr
 
 
 def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = _MAX_PAIRS) -> MotionPairs:
-    """Motion pairs between poses about ``lag_s`` seconds apart, evenly over the recording.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-    lag_s : float
-        The interval of the poses if that is longer.
-    max_pairs : int
-
-    Returns
-    -------
-    MotionPairs
-        Empty if no two poses lie that far apart.
+    """Motion pairs between poses about ``lag_s`` seconds apart (their interval if that is longer),
+    evenly over the recording; none if no two poses lie that far apart.
     """
     stamps_ns = pose_pairs.stamps_ns
     if len(stamps_ns) > 1:
         lag_s = max(lag_s, median(np.diff(stamps_ns)) * 1e-9)
-    i, j = _indices_over(stamps_ns, lag_s, max_pairs)
-    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i, j)
-
-
-def _indices_over(stamps_ns: IntArray, lag_s: float, max_pairs: int) -> tuple[IntArray, IntArray]:
     i = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), max_pairs)).astype(int)
     j = np.searchsorted(stamps_ns, stamps_ns[i] + round(lag_s * 1e9) - 1000)
-    inside = j < len(stamps_ns)
-    i, j = i[inside], j[inside]
+    i, j = i[j < len(stamps_ns)], j[j < len(stamps_ns)]
     near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9
-    return i[near], j[near]
+    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i[near], j[near])

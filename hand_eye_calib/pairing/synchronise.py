@@ -52,12 +52,8 @@ class PosePairs:
     @classmethod
     def concatenate(cls, *parts: Self) -> Self:
         """All parts in the given order."""
-        return cls(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("stamps_ns", "Ts_pw_p", "Ts_cw_c")
-            )
-        )
+        columns = zip(*((one.stamps_ns, one.Ts_pw_p, one.Ts_cw_c) for one in parts), strict=True)
+        return cls(*map(np.concatenate, columns))
 
 
 def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
@@ -96,12 +92,10 @@ def synchronise(
     slow, fast = (parent, child) if at == "parent" else (child, parent)
     keep = _interpolable(fast.stamps_ns, slow.stamps_ns, max_gap_s)
     stamps_ns = slow.stamps_ns[keep]
-    fast_poses = (
-        np.repeat(fast.poses, len(stamps_ns), axis=0) if len(fast) == 1 else fast.at(stamps_ns)
-    )
-    if at == "parent":
-        return PosePairs(stamps_ns, slow.poses[keep], fast_poses)
-    return PosePairs(stamps_ns, fast_poses, slow.poses[keep])
+    is_one = len(fast) == 1
+    fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0) if is_one else fast.at(stamps_ns)
+    both = (slow.poses[keep], fast_poses) if at == "parent" else (fast_poses, slow.poses[keep])
+    return PosePairs(stamps_ns, *both)
 
 
 def _interpolable(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float) -> BoolArray:

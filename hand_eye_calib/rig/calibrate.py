@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
@@ -13,7 +13,6 @@ from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import synchronise
-from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.rig.result import RigCalibration
 
 # Options that are of one pair of sensors, by their beginnings.
@@ -67,16 +66,9 @@ def calibrate_rig(
     >>> len(rig.calibrations)
     2
     """
-    options = {
-        "method": method,
-        "max_gap": max_gap,
-        "time_offset": time_offset,
-        "scale": scale,
-        "target_translation": target_translation,
-        "target_rotation": target_rotation,
-    }
-    given = {name: value for name, value in options.items() if value is not None}
-    return solve_rig(trajectories, given, progress)
+    options = {name: value for name, value in locals().items() if value is not None}
+    del options["trajectories"]
+    return solve_rig(trajectories, options, options.pop("progress", None))
 
 
 def solve_rig(
@@ -86,21 +78,24 @@ def solve_rig(
 ) -> RigCalibration:
     """The same as :func:`calibrate_rig`, with options by their public names."""
     _refuse(trajectories, options)
-    tell: Callable[[float, str], None] = progress or (lambda share, step: None)
+    tell = progress or (lambda share, step: None)
     sensors = tuple(trajectories)
-    first = trajectories[sensors[0]]
-    star = []
-    for index, name in enumerate(sensors[1:]):
-        tell(0.6 * index / (len(sensors) - 1), f"{name} in {sensors[0]}")
-        star.append(_pairwise(first, trajectories[name], sensors[0], name, options))
-    moved = [
-        trajectories[each.child_frame].scaled(each.scale).shifted(each.time_offset_s)
-        for each in star
-    ]
+    named = [replace(each, sensor_frame=name) for name, each in trajectories.items()]
+    star, moved = [], []
+    for index, other in enumerate(named[1:]):
+        tell(0.6 * index / (len(sensors) - 1), f"{other.sensor_frame} in {sensors[0]}")
+        config = offline_config(named[0], other, options)
+        answer = run(whole_snapshot(config, named[0], other)).calibration
+        star.append(answer)
+        moved.append(other.scaled(answer.scale).shifted(answer.time_offset_s))
     chain = []
-    for index, (answer, before, after) in enumerate(zip(star, moved[:-1], moved[1:], strict=False)):
+    for index, (answer, before, after) in enumerate(zip(star, moved, moved[1:], strict=False)):
         tell(0.6 + 0.4 * index / (len(star) - 1), "closure of pairs")
-        chain.append(_neighbours(before, after, sensors[index + 1 : index + 3], answer, options))
+        pairs = synchronise(before, after, config.max_gap)
+        of_pair = {"method": answer.method, "max_pairs": max(len(pairs), 10)}
+        found = estimate_extrinsic(pairs, CalibratorConfig.from_options(of_pair))
+        ends = before.sensor_frame, after.sensor_frame
+        chain.append(replace(found, parent_frame=ends[0], child_frame=ends[1]))
     tell(1.0, "done")
     return RigCalibration.of(sensors, star, chain)
 
@@ -125,32 +120,3 @@ def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) 
                 f"{name} {value} would be of which sensor of the rig? Give {name} estimate, or "
                 "correct the trajectories before"
             )
-
-
-def _pairwise(
-    first: Trajectory, other: Trajectory, name: str, of_other: str, options: Mapping[str, Any]
-) -> Calibration:
-    """A sensor against the first one by itself."""
-    first = dataclasses.replace(first, sensor_frame=name)
-    other = dataclasses.replace(other, sensor_frame=of_other)
-    config = offline_config(first, other, options)
-    return run(whole_snapshot(config, first, other)).calibration
-
-
-def _neighbours(
-    parent: Trajectory,
-    child: Trajectory,
-    names: tuple[str, ...],
-    answer: Calibration,
-    options: Mapping[str, Any],
-) -> Calibration:
-    """One sensor in the frame of another, from trajectories that are aligned; with the method that
-    gave an answer.
-    """
-    max_gap_s = CalibratorConfig.from_options(dict(options)).max_gap
-    pairs = synchronise(parent, child, max_gap_s)
-    config = CalibratorConfig.from_options(
-        {"method": answer.method, "max_pairs": max(len(pairs), 10)}
-    )
-    found = estimate_extrinsic(pairs, config)
-    return dataclasses.replace(found, parent_frame=names[0], child_frame=names[1])

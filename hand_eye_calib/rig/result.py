@@ -106,21 +106,9 @@ class RigCalibration:
         """From answers for two sensors at a time. What they miss closing by is shared among them,
         as far as each is uncertain.
         """
-        found = cls(
-            sensors,
-            tuple(star),
-            tuple(neighbours),
-            tuple(
-                closure((sensors[0], *names), *answers)
-                for names, *answers in zip(
-                    zip(sensors[1:], sensors[2:], strict=False),
-                    star,
-                    neighbours,
-                    star[1:],
-                    strict=False,
-                )
-            ),
-        )
+        triangles = zip(star, neighbours, star[1:], strict=False)
+        closures = tuple(closure(*answers) for answers in triangles)
+        found = cls(sensors, tuple(star), tuple(neighbours), closures)
         calibrations = tuple(
             replace(each, T_parent_child=se3.exp(step) @ each.T_parent_child)
             for each, step in zip(star, found._steps(), strict=True)
@@ -209,13 +197,11 @@ class RigCalibration:
     def tree(self) -> list[str]:
         """The sensors and where they are, one a line."""
         lines = [self.sensors[0]]
-        last = len(self.calibrations) - 1
-        for index, each in enumerate(self.calibrations):
+        for each in self.calibrations:
             x, y, z = each.T_parent_child[:3, 3]
             roll, pitch, yaw = np.degrees(se3.rotation_to_rpy(each.T_parent_child[:3, :3]))
-            branch = "`-" if index == last else "|-"
             lines.append(
-                f"{branch} {each.child_frame}: x {x:.3f} y {y:.3f} z {z:.3f} m, "
+                f"`- {each.child_frame}: x {x:.3f} y {y:.3f} z {z:.3f} m, "
                 f"roll {roll:.2f} pitch {pitch:.2f} yaw {yaw:.2f} deg, {each.verdict.value}"
             )
         return lines
@@ -242,9 +228,7 @@ def _moved(calibration: Calibration, X: FloatArray) -> FloatArray:
     return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
-def closure(
-    sensors: tuple[str, str, str], to_second: Calibration, on: Calibration, to_third: Calibration
-) -> Closure:
+def closure(to_second: Calibration, on: Calibration, to_third: Calibration) -> Closure:
     """How the answers for a -> b, b -> c and a -> c close."""
     ahead = to_second.T_parent_child @ on.T_parent_child
     error = ahead @ to_third.T_child_parent
@@ -255,7 +239,7 @@ def closure(
     along = known.T @ se3.log(error)
     miss = known @ along
     return Closure(
-        sensors=sensors,
+        sensors=(to_second.parent_frame, to_second.child_frame, to_third.child_frame),
         translation_m=float(np.linalg.norm(miss[:3])),
         rotation_rad=float(np.linalg.norm(miss[3:])),
         chi2=float((along**2 / variances[variances < _UNKNOWN]).sum()),

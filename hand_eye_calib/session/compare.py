@@ -43,28 +43,18 @@ class Difference(Moved):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
-        columns = zip(AXES, self.values, self.sigmas, self.visible, self.verdicts, strict=True)
-        return {
-            "first": self.first,
-            "second": self.second,
-            "verdict": self.verdict.value,
-            "sentence": self.sentence,
-            "chi2": self.chi2,
-            "axes": {
-                axis: plain(
-                    {
-                        "difference": value,
-                        "sigma": sigma,
-                        "visible": visible,
-                        "verdict": verdict.value,
-                    }
-                )
-                for axis, value, sigma, visible, verdict in columns
-            },
+        names = ("difference", "sigma", "visible", "verdict")
+        verdicts = [each.value for each in self.verdicts]
+        rows = zip(self.values, self.sigmas, self.visible, verdicts, strict=True)
+        axes = {
+            axis: plain(dict(zip(names, row, strict=True)))
+            for axis, row in zip(AXES, rows, strict=True)
         }
+        taken = {name: getattr(self, name) for name in ("first", "second", "sentence", "chi2")}
+        return taken | {"verdict": self.verdict.value, "axes": axes}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Comparison:
     """The differences of results from what is installed, or of each from each.
 
@@ -84,12 +74,9 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values."""
-        return {
-            "verdict": self.verdict.value,
-            "sentence": self.sentence,
-            "moved": list(self.moved),
-            "differences": [each.to_dict() for each in self.differences],
-        }
+        differences = [each.to_dict() for each in self.differences]
+        told = {"verdict": self.verdict.value, "sentence": self.sentence}
+        return told | {"moved": list(self.moved), "differences": differences}
 
 
 def compare(
@@ -145,18 +132,15 @@ def compare(
     verdict = Change.of_all([each.verdict for each in differences])
     apart = [each for each in differences if each.verdict is Change.MOVED]
     moved_names = tuple(each.second for each in apart)
+    sentence = f"moved: {listing(moved_names)} of {len(stated)}"
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
     elif not apart:
         beside = "another" if installed is None else "what is installed"
         sentence = f"{verdict.value}: none of {len(stated)} differs from {beside}"
-    elif installed is not None:
-        sentence = f"moved: {listing(moved_names)} of {len(stated)}"
-    else:
+    elif installed is None:
         moved_names, sentence = _who_moved(called, calibrations, apart)
-    return Comparison(
-        differences=differences, moved=moved_names, verdict=verdict, sentence=sentence
-    )
+    return Comparison(differences, moved_names, verdict, sentence)
 
 
 def _who_moved(

@@ -8,11 +8,11 @@ docs/session.md.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
@@ -42,8 +42,7 @@ _TOO_LONG_S = 1200.0
 _STALL_S, _STALL_GROWTH = 60.0, 0.25
 
 
-@dataclass(frozen=True)
-class _Point:
+class _Point(NamedTuple):
     """One result: seconds of motion, and the information on the worst axis (1 suffices)."""
 
     motion_s: float
@@ -61,6 +60,12 @@ class Goal:
     ----------
     targets : (6,) array-like
         Of x, y, z (m), roll, pitch and yaw (rad): standard deviation wanted, times 1 / 0.7.
+
+    Attributes
+    ----------
+    best : Calibration or None
+        The best result that reaches the goal; None before that.
+    progress : Progress
     """
 
     def __init__(self, targets: Sequence[float] | FloatArray) -> None:
@@ -70,15 +75,10 @@ class Goal:
     def restart(self) -> None:
         """Begin a new session."""
         self._points: deque[_Point] = deque(maxlen=10_000)
-        self._best: Calibration | None = None
+        self.best: Calibration | None = None
         self._best_information = 0.0
         self._steps = np.full(6, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet("No result yet: move the sensors, with rotations.")
-
-    @property
-    def best(self) -> Calibration | None:
-        """The best result that reaches the goal; None before that."""
-        return self._best
 
     def wait(self, sentence: str) -> None:
         """Take note that there is no result yet, and why."""
@@ -103,13 +103,17 @@ class Goal:
         Progress
         """
         wanted = _SHARE * self._targets
-        exempt = _settled_by_prior(calibration) | _out_of_reach(calibration)
+        # What somebody measured by hand, no motion would tell better; some streams never show all.
+        exempt = np.isin(AXES, calibration.out_of_reach)
+        exempt |= [dof.verdict is DofVerdict.PRIOR for dof in calibration.observability]
         # What the common-mode floor leaves of the target; a floor above it cannot be driven away.
         room = np.maximum(wanted**2 - calibration.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
         ratios = np.where(exempt, 0.0, calibration.sigmas**2 / room)
         worst = int(np.argmax(ratios))
         motion_s = seen.motion_s
-        faults = faults or _errors(calibration)
+        if not faults:  # errors that the result has of its own, as one of positions or rates
+            found = [each for each in calibration.reasons if each.is_finding]
+            faults = [one.sentence for one in found if one.verdict is Verdict.DO_NOT_USE]
         may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
         is_known = bool(is_within) and motion_s >= _least_motion_s(calibration)
@@ -119,10 +123,11 @@ class Goal:
             self._points.append(point)
         if is_within:
             self._keep_best(calibration, point)
+        least_s = _least_motion_s(calibration)
         # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
-        left_s = np.maximum(left_s, max(_least_motion_s(calibration) - motion_s, 0.0))
-        is_done = self._best is not None
+        left_s = np.maximum(left_s, max(least_s - motion_s, 0.0))
+        is_done = self.best is not None
         stuck = not is_done and self._is_stuck(float(left_s[worst]))
         left_s = self._told(left_s)
         sentence = self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck)
@@ -138,12 +143,12 @@ class Goal:
 
     def _keep_best(self, calibration: Calibration, point: _Point) -> None:
         recent = list(self._points)[-_RESULTS:]
-        is_first = self._best is None
+        is_first = self.best is None
         are_known = len(recent) == _RESULTS and all(each.is_known for each in (*recent, point))
         if is_first and not are_known:
             return
         if point.information * _AS_GOOD**2 >= self._best_information:
-            self._best = calibration
+            self.best = calibration
             self._best_information = max(point.information, self._best_information)
 
     def _is_stuck(self, left_s: float) -> bool:
@@ -193,9 +198,9 @@ class Goal:
             return f"Stop: the streams are faulty: {faults[0]}."
         if calibration.status.failure:
             return f"No usable result: {calibration.status.failure}."
-        if self._best is not None:
-            floor = _beyond_target(self._best, self._targets)
-            return f"Done: {_precision(self._best)}. Stop and save.{floor}"
+        if self.best is not None:
+            floor = _beyond_target(self.best, self._targets)
+            return f"Done: {_precision(self.best)}. Stop and save.{floor}"
         motion, called = helpful_motion([axis], seen), axes_in_words([axis])
         if stuck:
             return f"This motion will not determine {called} well enough: {motion}."
@@ -203,22 +208,6 @@ class Goal:
             return f"{called} is not determined yet: {motion}."
         left = duration(max(left_s, _STEPS_S[1]))
         return f"Go on for about {left}: {called} takes longest, {motion}."
-
-
-def _settled_by_prior(calibration: Calibration) -> BoolArray:
-    """Axes that no motion would tell better: what somebody measured by hand counts."""
-    return np.array([dof.verdict is DofVerdict.PRIOR for dof in calibration.observability])
-
-
-def _out_of_reach(calibration: Calibration) -> BoolArray:
-    """Axes that streams of this kind never show."""
-    return np.isin(AXES, calibration.out_of_reach)
-
-
-def _errors(calibration: Calibration) -> tuple[str, ...]:
-    """Errors that the result has of its own, as one of positions or rates."""
-    reasons = calibration.reasons
-    return tuple(r.sentence for r in reasons if r.is_finding and r.verdict is Verdict.DO_NOT_USE)
 
 
 def _least_motion_s(calibration: Calibration) -> float:

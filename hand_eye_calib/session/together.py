@@ -5,6 +5,7 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any
@@ -17,13 +18,7 @@ from hand_eye_calib.assessment.moved import scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-    Verdict,
-)
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.records import Recorded, Together
 from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions
@@ -188,13 +183,23 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         raise InputError(f"no recording can be used: {told or 'there is none'}")
     found = agreement_of_results([*fit.values()])
     names = [*fit]
-    apart = {names[index] for index in found.apart}
-    unfit |= dict.fromkeys(apart, "it does not belong to the others")
-    used = [each for name, each in fit.items() if name not in apart]
+    unfit |= {names[index]: "it does not belong to the others" for index in found.apart}
+    used = [each for name, each in fit.items() if name not in unfit]
+    unknown = np.full(6, np.nan)
     of_axes = dict(zip(names, zip(found.deviations, found.sigmas, strict=True), strict=True))
-    nothing = np.full((2, 6), np.nan)
     records = tuple(
-        _recorded(name, each, unfit.get(name, ""), *of_axes.get(name, nothing))
+        Recorded(
+            name=name,
+            verdict=each.verdict.value,
+            headline=each.headline,
+            left_out=unfit.get(name, ""),
+            deviations=_by_axis(of_axes.get(name, (unknown, unknown))[0]),
+            sigmas=_by_axis(of_axes.get(name, (unknown, unknown))[1]),
+            time_offset_s=each.time_offset_s,
+            scale=each.scale,
+            n_poses=each.n_poses,
+            stamp_ns=each.stamp_ns,
+        )
         for name, each in results.items()
     )
     return _joint(
@@ -206,7 +211,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
             chi2=found.chi2,
             dof=found.dof,
             p_value=found.p_value,
-            scatter=dict(zip(AXES, found.scatter.tolist(), strict=True)),
+            scatter=_by_axis(found.scatter),
             recordings=records,
         ),
     )
@@ -239,21 +244,8 @@ def _unfit(result: Calibration) -> str:
     return result.headline if any(each.rule != "nothing_known" for each in grave) else ""
 
 
-def _recorded(
-    name: str, result: Calibration, left_out: str, deviations: FloatArray, sigmas: FloatArray
-) -> Recorded:
-    return Recorded(
-        name=name,
-        verdict=result.verdict.value,
-        headline=result.headline,
-        left_out=left_out,
-        deviations=dict(zip(AXES, deviations.tolist(), strict=True)),
-        sigmas=dict(zip(AXES, sigmas.tolist(), strict=True)),
-        time_offset_s=result.time_offset_s,
-        scale=result.scale,
-        n_poses=result.n_poses,
-        stamp_ns=result.stamp_ns,
-    )
+def _by_axis(values: FloatArray) -> dict[str, float]:
+    return dict(zip(AXES, values.tolist(), strict=True))
 
 
 def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> Calibration:
@@ -266,10 +258,15 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
         if known and all(dof.verdict is DofVerdict.PRIOR for dof in known):
             # All have it from one measurement by hand.
             by_prior.add(name)
-            variance = min(dof.sigma for dof in known) ** 2
-            covariance[axis, axis] = max(covariance[axis, axis], variance)
+            least = min(dof.sigma for dof in known)
+            covariance[axis, axis] = max(covariance[axis, axis], least**2)
     covariance = to_child @ covariance @ to_child.T
     assessed = combined(T, covariance, None, unknown_directions(covariance))
+    observability = tuple(
+        replace(dof, verdict=DofVerdict.PRIOR) if dof.name in by_prior else dof
+        for dof in assessed.observability
+    )
+    is_open = any(math.isinf(dof.sigma) for dof in observability)
     newest = used[-1]
     own_clock = {(one.time_offset_s, one.scale) for one in used}
     offset_s, scale = own_clock.pop() if len(own_clock) == 1 else (0.0, 1.0)
@@ -277,19 +274,13 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
     return Calibration(
         T_parent_child=T,
         covariance=assessed.cov_parent_child_in_child,
-        observability=tuple(
-            DofObservability(dof.name, DofVerdict.PRIOR, dof.sigma) if dof.name in by_prior else dof
-            for dof in assessed.observability
-        ),
+        observability=observability,
         floor=np.mean(floors, axis=0),
-        status=SolveStatus.UNOBSERVABLE
-        if any(math.isinf(dof.sigma) for dof in assessed.observability)
-        else SolveStatus.OK,
+        status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=found.chi2,
         method=Counter(one.method for one in used).most_common(1)[0][0],
         reference=newest.reference,
         backend=newest.backend,
-        method_reason="",
         time_offset_s=offset_s,
         scale=scale,
         measured=newest.measured,
@@ -298,12 +289,12 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
         n_pairs=sum(one.n_pairs for one in used),
         n_inliers=sum(one.n_inliers for one in used),
         stamp_ns=newest.stamp_ns,
-        **{name: getattr(newest, name) for name in _OF_RIG},
+        parent_frame=newest.parent_frame,
+        child_frame=newest.child_frame,
+        base_frame=newest.base_frame,
+        T_base_parent=newest.T_base_parent,
+        target_translation=newest.target_translation,
+        target_rotation=newest.target_rotation,
+        target_axes=newest.target_axes,
         together=record,
     )
-
-
-_OF_RIG = (
-    *("parent_frame", "child_frame", "base_frame", "T_base_parent"),
-    *("target_translation", "target_rotation", "target_axes"),
-)
