@@ -170,7 +170,6 @@ def delay_table(found: Sequence[Delay]) -> str:
                 "motion": kind,
                 "shift": size,
                 "said to be seen": f"{len(said)} of {len(some)}",
-                "of these seen": int(np.isfinite(said).sum()) if len(said) else "-",
                 "median (s)": told[0],
                 "90 % (s)": told[1],
                 "others seen": f"{int(np.isfinite(others).sum())} of {len(others)}",
