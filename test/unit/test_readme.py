@@ -237,7 +237,7 @@ def test_make_targets_exist(page):
 
 def test_every_package_has_its_line():
     packages = PAGES["docs/architecture.md"].partition("## Packages")[2].partition("\n## ")[0]
-    first = " ".join(re.findall(r"^\| ([^|]*) \|", packages, re.MULTILINE))
+    first = " ".join(re.findall(r"^\| (`[^|]*) \|", packages, re.MULTILINE))
     table = re.findall(r"`([a-z_]+(?:/|\.py))`", first)
     source = ROOT / "hand_eye_calib"
     found = [f"{path.parent.name}/" for path in source.glob("*/__init__.py")]
