@@ -5,37 +5,49 @@ in csv files, with their units; vx, vy, vz, wx, wy, wz are integrated.
 
 import json
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.bags.poses import TwistIntegrator
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.trajectory_files.columns import TWIST
+from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
+from hand_eye_calib.io.trajectory_files.table import AUTO, table_of
 
-_POSITION, _ORIENTATION = "x={0}.x,y={0}.y,z={0}.z", "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
-
-
-def _pose(at: str, stamp: str = "header.stamp") -> str:
-    position = _POSITION.format(f"{at}.position")
-    return f"t={stamp},{position},{_ORIENTATION.format(f'{at}.orientation')}"
+_ORIENTATION = "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
 
 
-_PX4 = "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,qw=q.0,qx=q.1,qy=q.2,qz=q.3"
+def _pose(at: str, stamp: str = "header.stamp", parts: str = "position orientation") -> str:
+    position, orientation = (f"{at}{part}" for part in parts.split())
+    place = f"x={position}.x,y={position}.y,z={position}.z"
+    return f"t={stamp},{place},{_ORIENTATION.format(orientation)}"
+
+
+def _twist(at: str) -> str:
+    parts = [*(f"linear.{axis}" for axis in "xyz"), *(f"angular.{axis}" for axis in "xyz")]
+    fields = (f"{name}={at}.{part}" for name, part in zip(TWIST, parts, strict=True))
+    return ",".join(["t=header.stamp", *fields])
+
+
+_PLACE = "lat_deg={0}latitude,lon_deg={0}longitude,height={0}altitude"
 #: Types of messages that are read this way, and how. Of arrays, the first element.
 FIELDS = {
-    "px4_msgs/msg/VehicleOdometry": _PX4,
-    "geometry_msgs/msg/PoseArray": _pose("poses.0"),
-    "mocap4r2_msgs/msg/RigidBodies": _pose("rigidbodies.0.pose"),
-    "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose("poses.0.pose"),
-    "foxglove.PoseInFrame": _pose("pose", "timestamp"),
-    "foxglove.FrameTransform": "t=timestamp,"
-    + _POSITION.format("translation")
-    + ","
-    + _ORIENTATION.format("rotation"),
-    "foxglove.LocationFix": "t=timestamp,lat=latitude,lon=longitude,height=altitude",
+    "geographic_msgs/msg/GeoPoseStamped": f"t=header.stamp,{_PLACE.format('pose.position.')},"
+    + _ORIENTATION.format("pose.orientation"),
+    "geometry_msgs/msg/TwistStamped": _twist("twist"),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist("twist.twist"),
+    "px4_msgs/msg/VehicleOdometry": "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,"
+    "qw=q.0,qx=q.1,qy=q.2,qz=q.3",
+    "geometry_msgs/msg/PoseArray": _pose("poses.0."),
+    "mocap4r2_msgs/msg/RigidBodies": _pose("rigidbodies.0.pose."),
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose("poses.0.pose."),
+    "foxglove.PoseInFrame": _pose("pose.", "timestamp"),
+    "foxglove.FrameTransform": _pose("", "timestamp", "translation rotation"),
+    "foxglove.LocationFix": f"t=timestamp,{_PLACE.format('')}",
 }
-_VELOCITIES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 def split_fields(source: str) -> tuple[str, str]:
@@ -44,15 +56,84 @@ def split_fields(source: str) -> tuple[str, str]:
     return topic, fields
 
 
-def decoder(name: str, encoding: str, definition: Any = None) -> Callable[[bytes], Any]:
-    """What makes a message of its bytes.
+class FieldReader:
+    """Reads the fields of a topic's messages.
 
-    Parameters
-    ----------
-    name, encoding : str
-        Of the message type.
-    definition : rosbags.interfaces.MessageDefinition, optional
-        That of the bag.
+    Raises
+    ------
+    ConfigError
+        If the fields are not written as they should be.
+    """
+
+    def __init__(self, topic: str, fields: str) -> None:
+        pairs = [each.partition("=")[::2] for each in fields.split(",")]
+        if not all(name and path for name, path in pairs):
+            raise ConfigError(
+                "fields are written NAME=PATH,..., such as t=header.stamp,x=pose.position.x; got "
+                f"{fields!r}"
+            )
+        self._topic = topic
+        self._names = [name for name, _ in pairs]
+        self._paths = [path.split(".") for _, path in pairs]
+
+    def cells(self, message: Any) -> list[str]:
+        """The values of a message, stamps in seconds with all their digits; an InputError if it
+        lacks one.
+        """
+        return [self._text(message, path) for path in self._paths]
+
+    def _text(self, message: Any, path: list[str]) -> str:
+        value = message
+        for part in path:
+            try:
+                if isinstance(value, dict):
+                    value = value[part]
+                else:
+                    value = value[int(part)] if part.isdecimal() else getattr(value, part)
+            except (AttributeError, KeyError, IndexError, TypeError):
+                raise InputError(
+                    f"{self._topic}: a message has no {'.'.join(path)}; name other fields"
+                ) from None
+        parts = value if isinstance(value, dict) else getattr(value, "__dict__", {})
+        if "sec" in parts:
+            names = ("nanosec", "nsec", "nanosecs")
+            return f"{parts['sec']}.{next((parts[each] for each in names if each in parts), 0):09d}"
+        return str(value)
+
+    def poses(self, rows: Iterable[list[str]]) -> tuple[IntArray, FloatArray, list[str]]:
+        """Stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of the cells of messages, and
+        notes for a person.
+
+        Raises
+        ------
+        InputError
+            If they are no poses.
+        """
+        measures = "twists" if {*TWIST} <= {*self._names} else AUTO
+        table = table_of(self._topic, self._names, enumerate(rows, 1), list, measures)
+        if not table.stamps:
+            raise InputError(f"no messages on {self._topic}")
+        stamps_ns = stamps_in_ns(table, None)
+        if measures == "twists":
+            return stamps_ns, _integrated(stamps_ns, table.values), []
+        positions, quats_xyzw = poses_of(table)
+        return stamps_ns, np.c_[positions, quats_xyzw], table.guesses
+
+
+def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
+    """Poses (N, 7) of velocities (N, 6), m/s and rad/s, in the sensor's own frame."""
+    steps = (twists[1:] + twists[:-1]) / 2 * (np.diff(stamps_ns) * 1e-9)[:, None]
+    poses = np.tile(np.eye(4), (len(twists), 1, 1))
+    for row, step in enumerate(se3.exp(steps), start=1):
+        poses[row] = poses[row - 1] @ step
+        poses[row, :3, :3] = se3.nearest_rotation(poses[row, :3, :3])
+    return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
+
+
+@lru_cache
+def decoder(name: str, encoding: str, definition: Any = None) -> Callable[[bytes], Any]:
+    """What makes a message of its bytes, by the name and the encoding of its type and the
+    rosbags.interfaces.MessageDefinition of the bag.
 
     Raises
     ------
@@ -84,70 +165,3 @@ def decoder(name: str, encoding: str, definition: Any = None) -> Callable[[bytes
         ) from error
     read = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
     return lambda data: read(data, name)
-
-
-def rows_of_messages(
-    topic: str, fields: str, messages: Iterable[Any]
-) -> tuple[IntArray, FloatArray, list[str]]:
-    """Stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of decoded messages, and notes for a
-    person.
-
-    Raises
-    ------
-    ConfigError
-        If the fields are not written as they should be.
-    InputError
-        If a message does not have them.
-    """
-    from hand_eye_calib.io.trajectory_files.columns import choose_columns
-    from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
-    from hand_eye_calib.io.trajectory_files.table import Table, table_of
-
-    pairs = [each.partition("=")[::2] for each in fields.split(",")]
-    if not all(name and path for name, path in pairs):
-        raise ConfigError(
-            "fields are written NAME=PATH,..., such as t=header.stamp,x=pose.position.x; got "
-            f"{fields!r}"
-        )
-    names, paths = [name for name, _ in pairs], [path.split(".") for _, path in pairs]
-    is_twist = {*_VELOCITIES} <= {*names}
-    rows = enumerate(messages, 1)
-
-    def cells_of(message: Any) -> list[str]:
-        return [_text(topic, message, path) for path in paths]
-
-    if is_twist:
-        chosen = choose_columns(topic, names, measures="rates")
-        table = Table(topic, fields, _VELOCITIES, chosen.stamp_unit)
-        at = [names.index(name) for name in _VELOCITIES]
-        table.fill(rows, cells_of, len(names), at, chosen.stamp)
-    else:
-        table = table_of(topic, names, rows, cells_of)
-    if not table.stamps:
-        raise InputError(f"no messages on {topic}")
-    stamps_ns = stamps_in_ns(table, None)
-    if is_twist:
-        twists = np.asarray(table.numbers).reshape(-1, len(_VELOCITIES))
-        return stamps_ns, TwistIntegrator().poses(stamps_ns, twists), []
-    positions, quats_xyzw = poses_of(table)
-    return stamps_ns, np.c_[positions, quats_xyzw], table.guesses
-
-
-def _text(topic: str, message: Any, path: list[str]) -> str:
-    """A value of a message; a stamp in seconds with all its digits."""
-    value = message
-    for part in path:
-        try:
-            if isinstance(value, dict):
-                value = value[part]
-            else:
-                value = value[int(part)] if part.isdecimal() else getattr(value, part)
-        except (AttributeError, KeyError, IndexError, TypeError):
-            raise InputError(
-                f"{topic}: a message has no {'.'.join(path)}; name other fields"
-            ) from None
-    get = value.get if isinstance(value, dict) else lambda name: getattr(value, name, None)
-    if get("sec") is not None:
-        fraction = next((get(name) for name in ("nanosec", "nsec", "nanosecs") if get(name)), 0)
-        return f"{get('sec')}.{fraction:09d}"
-    return str(value)

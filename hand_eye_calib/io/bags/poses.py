@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 
 ObjectArray = NDArray[np.object_]
@@ -96,25 +95,3 @@ class PoseBlock:
         positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
         frames = poses.sensor_frames[0] or "", poses.world_frames[0]
         return Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)
-
-
-class TwistIntegrator:
-    """Integrates velocities of one sensor in its own frame, in parts of any length."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, FloatArray] | None = None
-        self._pose = np.eye(4)
-
-    def poses(self, stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
-        """Poses (N, 7) of x y z qx qy qz qw at the stamps (N,) of the next twists (N, 6): m/s and
-        rad/s.
-        """
-        last_ns, last = self._last or (int(stamps_ns[0]), twists[0])
-        before = np.concatenate([[last], twists[:-1]])
-        seconds = np.diff(np.concatenate([[last_ns], stamps_ns])) * 1e-9
-        poses = np.empty((len(twists), 4, 4))
-        for row, step in enumerate(se3.exp((twists + before) / 2 * seconds[:, None])):
-            poses[row] = self._pose = self._pose @ step
-        self._pose[:3, :3] = se3.nearest_rotation(self._pose[:3, :3])
-        self._last = int(stamps_ns[-1]), twists[-1]
-        return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]

@@ -18,14 +18,13 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import scans
-from hand_eye_calib.io.bags.fields import FIELDS, decoder, rows_of_messages, split_fields
+from hand_eye_calib.io.bags.fields import FIELDS, FieldReader, decoder, split_fields
 from hand_eye_calib.io.bags.mcap_files import Message, MessageKind
 from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
     PATH_TYPE,
     POINTS_TYPE,
-    SENSOR_TYPES,
     TF_TYPES,
     MalformedMessage,
     MessageReader,
@@ -151,7 +150,7 @@ class PoseBag:
         InputError
             If a message cannot be read.
         """
-        if self.topics.type_of(topic) not in {*SENSOR_TYPES, *TF_TYPES}:
+        if self.topics.type_of(topic) not in {*MESSAGE_TYPES, PATH_TYPE, POINTS_TYPE, *TF_TYPES}:
             return []
         block = next(self._blocks([topic]), [])
         found = _decoded(block, lambda kind, data: frames_in(data, kind.type, _is_ros1(kind)))
@@ -278,23 +277,18 @@ class PoseBag:
             return self._scan_poses(stream, source)
         if topic not in self.topics:
             return self._joined_poses(stream, source, *joined_parts(topic))
-        decode: dict[str, Callable[[bytes], Any]] = {}
-        bag_ns: list[int] = []
+        read = FieldReader(topic, fields or FIELDS[type_])
+        definitions = (each.definition(topic) for each in self._storages)
+        definition = next(filter(None, definitions), None)
 
-        def decoded(kind: MessageKind, data: bytes) -> Any:
-            if kind.type not in decode:
-                found = (each.definition(topic) for each in self._storages)
-                decode[kind.type] = decoder(*kind[1:3], next(filter(None, found), None))
-            return decode[kind.type](data)
+        def cells(kind: MessageKind, data: bytes) -> list[str]:
+            return read.cells(decoder(kind.type, kind.encoding, definition)(data))
 
-        def messages() -> Iterator[Any]:
-            # The library's errors are of many kinds.
-            for _, message_ns, message in _decoded(self._messages([topic]), decoded, Exception):
-                bag_ns.append(message_ns)
-                yield message
-
-        stamps_ns, poses, notes = rows_of_messages(topic, fields or FIELDS[type_], messages())
+        # The library's errors are of many kinds.
+        found = list(_decoded(self._messages([topic]), cells, Exception))
+        stamps_ns, poses, notes = read.poses(row for _, _, row in found)
         self._notes += notes
+        bag_ns = [message_ns for _, message_ns, _ in found]
         return self._whole(stream, PoseColumns.of_frames(stamps_ns, poses), bag_ns)
 
     def _joined_poses(self, stream: str, source: str, fix: str, imu: str) -> PoseBlock:

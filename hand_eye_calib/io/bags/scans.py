@@ -66,16 +66,16 @@ def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
     """
     cursor = Cursor(data, is_ros1)
     header_ns, frame = cursor.header()
-    height, width = cursor.length(), cursor.length()
+    height, width = cursor.number(), cursor.number()
     fields = {}
-    for _ in range(cursor.length()):
-        name, offset, kind = cursor.name(), cursor.length(), cursor.byte()
-        cursor.length()
+    for _ in range(cursor.number()):
+        name, offset, kind = cursor.name(), cursor.number(), cursor.number("B")
+        cursor.number()
         if not 0 < kind < len(_DATATYPES):
             raise ValueError(f"field {name} of the points has datatype {kind}")
         fields[name] = (_DATATYPES[kind], offset)
-    order = ">" if cursor.byte() else "<"
-    step, _, size = cursor.length(), cursor.length(), cursor.length()
+    order = ">" if cursor.number("B") else "<"
+    step, _, size = cursor.number(), cursor.number(), cursor.number()
     if not {"x", "y", "z"} <= fields.keys():
         raise ValueError(f"points have no x, y, z, but {', '.join(fields)}")
     if size < height * width * step or cursor.position + size > len(data):

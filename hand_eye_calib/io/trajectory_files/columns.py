@@ -17,6 +17,7 @@ UNNAMED = ("q1", "q2", "q3", "q4")
 # The first three rows of a pose's matrix.
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 RATES = ("wx", "wy", "wz")
+TWIST = ("vx", "vy", "vz", *RATES)
 # Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
 # plane, fewer.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
@@ -54,6 +55,7 @@ _ALIASES = {
     **_ends(
         "w", "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_ w_rs_s_"
     ),
+    **_ends("v", "v"),
     **_ends("q", "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_"),
 }
 # Names that stand for a part of an orientation, even if it is not known which.
@@ -129,9 +131,11 @@ def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -
 
 
 def _quantities(found: dict[str, list[int]], measures: str) -> tuple[str, ...]:
-    """The quantities to read: of poses, or of the part of them that is measured."""
-    if measures == "rates":
-        return RATES
+    """The quantities to read: of poses, or of the part of them that is measured; of "twists",
+    velocities.
+    """
+    if measures in ("rates", "twists"):
+        return RATES if measures == "rates" else TWIST
     if measures == "positions":
         return _first_complete(_ALL_POSITIONS, found)
     orientation = _first_complete(_ALL_ORIENTATIONS, found)
