@@ -65,7 +65,7 @@ def deliver(
     inputs : dict
         Where the data came from, in plain values; it is saved, too.
     snapshot : Snapshot, optional
-        The poses and options that gave it. With them, ``--out`` also writes the report.
+        The poses and options that gave it; None for stops.
     bag : path-like, optional
         The bag that it is from, whose transforms may have the base frame.
     """
@@ -81,7 +81,7 @@ def deliver(
         return save_result(calibration, arguments.out, inputs)
 
     def finish() -> None:
-        if arguments.out and snapshot:
+        if arguments.out and calibration.motion_residuals:
             write_report(arguments.out, calibration, snapshot, inputs)
 
     code = exit_code(calibration)

@@ -49,7 +49,9 @@ def static_transform_command(calibration: Calibration) -> str:
 # ----------------------------------------------------------------------- pages
 
 
-def rendered(calibration: Calibration, snapshot: "Snapshot", inputs: Mapping[str, Any]) -> str:
+def rendered(
+    calibration: Calibration, snapshot: "Snapshot | None", inputs: Mapping[str, Any]
+) -> str:
     """The report as HTML, of a result, the poses and options that gave it, and where the data came
     from in plain values.
     """

@@ -1,6 +1,4 @@
-"""What a report shows beside the result: residuals, paths, excitation, and both streams before any
-solve.
-"""
+"""What a report shows beside the result: paths, excitation, and both streams before any solve."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,33 +7,18 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import angular_rates
 from hand_eye_calib.alignment.scale import child_scaled
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.stats import median
 
 # Most samples of the angular rates, and the shortest window of each (s).
 _MAX_RATES, _MIN_WINDOW_S = 1500, 0.2
-
-
-@dataclass(frozen=True)
-class ResidualView:
-    """Residual of each of K motion pairs at the time of its end from the first pose, s: lengths in
-    m and rad, whether the method rejected it (of the adaptive estimator: jumps), and the reference
-    of the pairs.
-    """
-
-    times_s: FloatArray
-    translation_m: FloatArray
-    rotation_rad: FloatArray
-    is_outlier: BoolArray
-    reference: str
 
 
 @dataclass(frozen=True)
@@ -79,11 +62,10 @@ class StreamView:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What the figures show beside the Calibration itself: residuals, both paths, how the sensors
-    moved, both streams; whether the parent has positions alone; and the streams as they were read.
+    """What the figures show beside the Calibration itself: both paths, how the sensors moved, both
+    streams; whether the parent has positions alone; and the streams as they were read.
     """
 
-    residuals: ResidualView
     tracks: Tracks
     excitation: Excitation
     streams: StreamView
@@ -98,7 +80,6 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = replace(snapshot, config=settled).pose_pairs()
     scaled = child_scaled(pose_pairs, calibration.scale)
-    residuals = calibration.residuals()
     rotating = scaled
     of_parent = config.parent_measures == "positions"
     if of_parent:
@@ -106,13 +87,6 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     parent, child = snapshot.streams
     shifted = child.shifted(calibration.time_offset_s).scaled(calibration.scale)
     return Evidence(
-        residuals=ResidualView(
-            _seconds(scaled, residuals.end_ns),
-            residuals.translation_m,
-            residuals.rotation_rad,
-            ~residuals.is_inlier,
-            calibration.reference if METHODS[calibration.method].uses_reference else "B1",
-        ),
         tracks=_tracks(calibration, scaled, of_parent),
         excitation=excitation(rotating),
         streams=view_streams(parent, shifted, config.max_gap),
@@ -144,16 +118,11 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
     )
 
 
-def _seconds(pose_pairs: PosePairs, stamps_ns: IntArray) -> FloatArray:
-    """Seconds from the first pose."""
-    return (stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
-
-
 def _tracks(calibration: Calibration, pose_pairs: PosePairs, of_parent: bool) -> Tracks:
     """Both paths, the child's world aligned with the parent's: by the mean over all poses, or by
     the paths if one sensor has positions alone.
     """
-    times_s = _seconds(pose_pairs, pose_pairs.stamps_ns)
+    times_s = (pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
     if calibration.measured == "positions":
         poses, measured = pose_pairs.Ts_pw_p @ calibration.T_parent_child, pose_pairs.Ts_cw_c
         if of_parent:

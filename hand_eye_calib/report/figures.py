@@ -3,7 +3,7 @@
 The verdict judges, by rules of its own; a caption says how large something is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.engine.evidence import Evidence, StreamView
+from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.plot import draw_views, said_of_views
 from hand_eye_calib.report.style import (
     BAD,
@@ -26,6 +27,7 @@ from hand_eye_calib.report.style import (
     plain_label,
 )
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import Residuals
 from hand_eye_calib.text import amount, angle, counted, length, listing, share
 
 # Points drawn of a line, and of dots that each stand alone.
@@ -55,13 +57,19 @@ class Drawn:
     svg: str
 
 
-def figures_of(calibration: Calibration, evidence: Evidence) -> list[Drawn]:
-    """The figures that a result of its kind has."""
-    names = (calibration.parent_frame, calibration.child_frame)
-    drawn = [_residuals(calibration, evidence), figure_of_streams(evidence.streams, names)]
-    if calibration.measured == "rotations":
-        return drawn
-    return [figure_of_views([calibration]), _trajectories(calibration, evidence), *drawn]
+def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Drawn]:
+    """The figures that a result of its kind has; stops have no evidence of streams."""
+    drawn = []
+    if calibration.measured != "rotations":
+        drawn.append(figure_of_views([calibration]))
+        if evidence:
+            drawn.append(_trajectories(calibration, evidence))
+    if calibration.motion_residuals:
+        drawn.append(_residuals(calibration, calibration.motion_residuals))
+    if evidence:
+        names = (calibration.parent_frame, calibration.child_frame)
+        drawn.append(figure_of_streams(evidence.streams, names))
+    return drawn
 
 
 @page_style()
@@ -172,12 +180,13 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
         side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
     _legend(figure, plane)
     apart = np.linalg.norm(tracks.parent - tracks.child, axis=1)
+    furthest_s = tracks.times_s[int(np.argmax(apart))]
     path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
     said = (
         f"The path of {names[1 - through]}, {length(path_m)} long, and the same path "
         f"computed from the poses of {names[through]} and the result. Half of the time "
         f"they are within {length(float(np.median(apart)))} of each other, and at most "
-        f"{length(apart.max())} apart, {_at(tracks.times_s[int(np.argmax(apart))], evidence)}. "
+        f"{length(apart.max())} apart, at {furthest_s * factor:.1f} {unit}. "
         "That includes drift and jumps of the odometry."
     )
     svg = as_svg(figure, "trajectories")
@@ -199,71 +208,65 @@ def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
 
 
 @page_style()
-def _residuals(calibration: Calibration, evidence: Evidence) -> Drawn:
-    residuals = evidence.residuals
+def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
     # Of translations under "x", of rotations under "yaw": those that streams of this kind have.
     sizes = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
     sizes.pop({"rotations": "x", "positions": "yaw"}.get(calibration.measured, ""), None)
-    factor, unit = _time_axis(evidence.tracks.times_s[-1])
+    is_out = ~residuals.is_inlier
+    if calibration.reference == "stops":
+        what, times, unit, label = "stops", np.arange(1.0, len(residuals) + 1), "", "stop"
+    else:
+        first_ns = residuals.start_ns.min(initial=residuals.end_ns[0])
+        times = (residuals.end_ns - first_ns) * 1e-9
+        factor, unit = _time_axis(float(times.max()))
+        times, label = times * factor, f"time ({unit})"
+        uses_reference = METHODS[calibration.method].uses_reference
+        what = f"motion pairs ({calibration.reference if uses_reference else 'B1'})"
+        if calibration.measured == "positions":
+            what = "distances from one position to the next"
     height = 1.0 + 1.6 * len(sizes)
     figure, panels = _figure(height, len(sizes), 1, left=0.7, bottom=0.8, top=0.1, sharex=True)
-    dots, crosses = (np.flatnonzero(residuals.is_outlier == is_out) for is_out in (False, True))
+    dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
     dots = dots[_downsample(len(dots), _MOST_DOTS)]
     axis, largest = next(iter(sizes.items()))
     crosses = crosses[np.argsort(-largest[crosses])[:_MOST_OUTLIERS]]
-    times = residuals.times_s * factor
     used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
     rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
     for panel, (name, sized) in zip(panels, sizes.items(), strict=True):
-        to_unit, label = _UNITS[name]
+        to_unit, of_axis = _UNITS[name]
         values = np.maximum(sized * to_unit, 1e-5)  # a logarithm has no zero
         panel.plot(times[dots], values[dots], "o", **used)
         panel.plot(times[crosses], values[crosses], "x", **rejected)
         panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
-        panel.set_ylabel(label)
+        panel.set_ylabel(of_axis)
         panel.yaxis.set_label_coords(-0.06, 0.5)
         if values.max() > 15 * np.median(values):  # the largest would hide the others
             panel.set_yscale("log")
             plain_decades(panel.yaxis)
         else:
             panel.set_ylim(0, 1.08 * values.max())
-    panels[-1].set_xlabel(f"time ({unit})")
+    panels[-1].set_xlabel(label)
     _legend(figure, panels[0])
-    said = _said_of_residuals(calibration, evidence, sizes)
-    return Drawn("residuals", "Residuals over time", said, as_svg(figure, "residuals"))
-
-
-def _said_of_residuals(
-    calibration: Calibration, evidence: Evidence, sizes: Mapping[str, FloatArray]
-) -> str:
-    residuals = evidence.residuals
-    n_out = int(residuals.is_outlier.sum())
-    what = f"motion pairs ({residuals.reference})"
-    if calibration.measured == "positions":
-        what = "distances from one position to the next"
-    halves, largest = (
-        listing([amount(axis, float(of(values))) for axis, values in sizes.items()])
+    halves, furthest = (
+        listing([amount(name, float(of(values))) for name, values in sizes.items()])
         for of in (np.median, np.max)
     )
-    text = f"Half of the {len(residuals.times_s):,} {what} agree with the result to {halves}"
-    if not n_out:
-        return f"{text}, all of them to {largest}. There are no outliers."
-    axis, values = next(iter(sizes.items()))
-    worst = int(np.argmax(np.where(residuals.is_outlier, values, -1)))
-    return (
-        f"{text}; {n_out:,} ({share(n_out / len(residuals.times_s))}) were rejected as outliers, "
-        f"the largest {amount(axis, values[worst])} {_at(residuals.times_s[worst], evidence)}."
-    )
+    said = f"Half of the {len(residuals):,} {what} agree with the result to {halves}"
+    if is_out.any():
+        worst = int(np.argmax(np.where(is_out, largest, -1)))
+        at = f"at {times[worst]:.1f} {unit}" if unit else f"stop {worst + 1}"
+        said += (
+            f"; {is_out.sum():,} ({share(float(is_out.mean()))}) were rejected as outliers, the "
+            f"largest {amount(axis, largest[worst])} {at}."
+        )
+    else:
+        said += f", all of them to {furthest}. There are no outliers."
+    return Drawn("residuals", "Residuals", said, as_svg(figure, "residuals"))
 
 
 def _time_axis(duration_s: float) -> tuple[float, str]:
     """Factor and name of the unit in which the time of a recording is shown."""
     return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
-
-
-def _at(seconds: float, evidence: Evidence) -> str:
-    factor, unit = _time_axis(evidence.tracks.times_s[-1])
-    return f"at {seconds * factor:.1f} {unit}"
 
 
 def _downsample(count: int, most: int) -> IntArray:

@@ -18,7 +18,6 @@ from hand_eye_calib.engine.evidence import Evidence, gather
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
@@ -97,8 +96,8 @@ def write_report(calibration: Calibration, path: Path) -> Path:
     InputError
         If the result has no poses, or the file cannot be written.
     """
-    snapshot = calibration.recording
-    if not isinstance(snapshot, Snapshot):
+    snapshot = calibration.recording if isinstance(calibration.recording, Snapshot) else None
+    if calibration.motion_residuals is None:
         raise InputError("a result that was read from a file has no poses; calibrate again")
     path = path / "report.html" if path.is_dir() else path
     try:
@@ -111,7 +110,7 @@ def write_report(calibration: Calibration, path: Path) -> Path:
 
 def render(
     calibration: Calibration,
-    snapshot: Snapshot,
+    snapshot: Snapshot | None,
     *,
     inputs: Plain | None = None,
     command: str = "",
@@ -121,8 +120,8 @@ def render(
     Parameters
     ----------
     calibration : Calibration
-    snapshot : Snapshot
-        The poses and options that gave it.
+    snapshot : Snapshot or None
+        The poses and options that gave it; None for stops.
     inputs : mapping, optional
         Where the data came from, in plain values.
     command : str
@@ -141,7 +140,8 @@ def render(
     parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
     verdict, _, said = calibration.headline.partition(": ")
     document, numbers = calibration.to_dict(), calibration.usable_numbers()
-    evidence = gather(calibration, snapshot)
+    evidence = gather(calibration, snapshot) if snapshot else None
+    options = snapshot.config.to_options() if snapshot else {}
     is_poor = calibration.verdict is Verdict.DO_NOT_USE
     unknown = {*calibration.out_of_reach}
     return page(
@@ -155,14 +155,16 @@ def render(
         document=document,
         parent=parent,
         child=child,
-        rotating=child if evidence.has_positions_of_parent else parent,
+        rotating=child if evidence and evidence.has_positions_of_parent else parent,
         kind="Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose",
         directions=[
             _direction(document[key], unknown) for key in ("T_parent_child", "T_child_parent")
         ],
         axes=list(_axes(calibration)),
         differences=list(_differences(calibration)),
-        advice="" if is_poor else what_is_missing(evidence.excitation, calibration),
+        advice=what_is_missing(evidence.excitation, calibration)
+        if evidence and not is_poor
+        else "",
         command=command,
         unknown=listing([value for value in numbers.values() if isinstance(value, str)]),
         target=_targets(calibration),
@@ -171,11 +173,13 @@ def render(
         shown_first=_SHOWN_FIRST,
         findings=calibration.findings,
         summary=_summary(calibration, evidence),
-        streams=[_stream(name, inputs, evidence.as_read) for name in ("parent", "child")],
+        streams=[
+            _stream(name, inputs, evidence)
+            for name in ("parent", "child")
+            if evidence or name in inputs
+        ],
         provenance=list(_provenance(inputs)),
-        options={
-            name: value for name, value in snapshot.config.to_options().items() if value != ""
-        },
+        options={name: each for name, each in options.items() if each != ""},
     )
 
 
@@ -279,16 +283,19 @@ def _differences(calibration: Calibration) -> Iterable[dict[str, str]]:
 # ---------------------------------------------------------------- data and provenance
 
 
-def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
+def _summary(calibration: Calibration, evidence: Evidence | None) -> dict[str, str]:
     """What was solved, as names and values."""
     offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
     scale = (calibration.scale, calibration.scale_sigma)
-    span = duration(evidence.tracks.times_s[-1])
+    poses = f"{calibration.n_poses:,} stops"
+    if evidence:
+        span = duration(evidence.tracks.times_s[-1])
+        poses = f"{calibration.n_poses:,} synchronised pose pairs over {span}"
     reason = calibration.method_reason
     rows = {
         "Method": f"{calibration.method} ({calibration.backend})" + (reason and f"; {reason}"),
         "Reference": calibration.reference_reason or calibration.reference,
-        "Poses": f"{calibration.n_poses:,} synchronised pose pairs over {span}",
+        "Poses": poses,
         "Motion pairs": f"{calibration.n_inliers:,} of {calibration.n_pairs:,} are inliers",
         "Objective": f"{calibration.objective:.6g}",
         "Time offset": given_or_estimated(*offset, "s")
@@ -300,7 +307,7 @@ def _summary(calibration: Calibration, evidence: Evidence) -> dict[str, str]:
     return rows
 
 
-def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict[str, str]:
+def _stream(name: str, inputs: Plain, evidence: Evidence | None) -> dict[str, str]:
     """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
     known = inputs.get(name, {})
     count = known.get("messages", known.get("poses"))
@@ -309,7 +316,7 @@ def _stream(name: str, inputs: Plain, streams: Mapping[str, Trajectory]) -> dict
         "source": known.get("topic") or Path(known.get("file", "-")).name,
         "poses": "-" if count is None else f"{count:,}",
     }
-    stream = streams.get(name)
+    stream = evidence.as_read[name] if evidence else None
     # In a very long recording only the newest poses are at hand: of the stream as a whole they say
     # nothing.
     if stream is not None and len(stream) >= max(2, count or 0):
