@@ -29,7 +29,7 @@ from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.results.status import AXES, ROTATIONS, DofObservability, DofVerdict
 from hand_eye_calib.solvers.solution import Solution
 from hand_eye_calib.stats import CHI2
 
@@ -41,8 +41,7 @@ _BLOCKS = 10
 _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
 # What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
-# exceed once in ten times.
-# The same of three.
+# exceed once in ten times; the same of three.
 _CHANCE = {6: np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28]), 3: np.array([0.64, 1.31, 2.44])}
 
 # An unseen direction with at least this length in its rotation is not one of translation alone.
@@ -67,9 +66,6 @@ _RANK_TOLERANCE = 1e-12
 WEAK_TRANSLATION, UNOBSERVABLE_TRANSLATION = 0.05, 0.3
 WEAK_ROTATION, UNOBSERVABLE_ROTATION = float(np.radians(1.0)), 0.3
 
-TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
-AXES = TRANSLATIONS + ROTATIONS
-
 
 @dataclass(frozen=True)
 class Assessment:
@@ -93,21 +89,9 @@ class Assessment:
 
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
-    """Covariance and observability of a solution.
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs in order of time.
-    solution : Solution
-        Their solution.
-    solve_without : callable
-        ``solve_without(left_out)`` gives the answers (B, 4, 4) without the pairs in each row of
-        ``left_out`` (B, K).
-
-    Returns
-    -------
-    Assessment
+    """Covariance and observability of the solution of K motion pairs in order of time;
+    ``solve_without(left_out)`` gives the answers (B, 4, 4) without the pairs in each row of
+    ``left_out`` (B, K).
     """
     model, unknown = model_covariance(pairs, solution)
     resampled = jackknife_covariance(len(pairs), solution.T_parent_child, solve_without)
@@ -115,18 +99,7 @@ def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) 
 
 
 def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
-    """Covariance and observability of an answer of the adaptive estimator.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-    solution : AdaptiveSolution
-        Its answer for these poses.
-
-    Returns
-    -------
-    Assessment
-    """
+    """Covariance and observability of an answer of the adaptive estimator for these poses."""
     covariance = _widened(solution.cov_parent_child_in_child, solution, slice(0, 6))
     hidden = noise_driven(
         pose_pairs.Ts_pw_p,
@@ -141,19 +114,11 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
 
 
 def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessment:
-    """Covariance and observability of an answer of the adaptive estimator from rotations alone.
+    """Covariance and observability of an answer of the adaptive estimator from rotations alone,
+    with the parent's poses (N, 4, 4).
 
-    Parameters
-    ----------
-    Ts_pw_p : (N, 4, 4) array
-        Poses of the parent.
-    solution : AdaptiveSolution
-
-    Returns
-    -------
-    Assessment
-        The translation is unknown. So is a rotation about the only axis that the sensors rotate
-        about: it is the axis along which they do not reveal a lever arm either.
+    The translation is unknown. So is a rotation about the only axis that the sensors rotate about:
+    it is the axis along which they do not reveal a lever arm either.
     """
     part, unseen = slice(3, 6), solution.unseen[3:]
     whole = np.zeros((6, 6))
@@ -168,18 +133,8 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
 
 
 def assess_lever_arm(Ts: FloatArray, solution: LeverArmSolution) -> Assessment:
-    """Covariance and observability of a lever arm.
-
-    Parameters
-    ----------
-    Ts : (N, 4, 4) array
-        Poses of the sensor in whose frame it is.
-    solution : LeverArmSolution
-
-    Returns
-    -------
-    Assessment
-        Of a transform with no rotation, which is unknown.
+    """Covariance and observability of a lever arm in the frame of a sensor with poses (N, 4, 4): of
+    a transform with no rotation, which is unknown.
     """
     whole = np.zeros((6, 6))
     whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3)) + solution.beyond
@@ -228,20 +183,18 @@ def noise_driven(
 
     Parameters
     ----------
-    Ts_pw_p : (N, 4, 4) array
-    T_parent_child : (4, 4) array
+    Ts_pw_p, T_parent_child : (N, 4, 4) array, (4, 4) array
     jumps : (N - 1,) bool array
         Increments that are no evidence.
     rotation_variance : callable
         Variance (rad^2) per axis of the rotation noise over so many increments.
     least_share : float
-        See :meth:`~hand_eye_calib.assessment.lever_arm.LeverArms.is_hidden`.
+        See :meth:`~hand_eye_calib.assessment.lever_arm.LeverArms.hidden_directions`.
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
-    baselines = sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True)
     rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])
     found = []
-    for baseline in baselines:
+    for baseline in sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True):
         motions = np.swapaxes(rotations[:-baseline], 1, 2) @ rotations[baseline:]
         # No baseline may run across a jump, unless all of them do.
         weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
@@ -293,14 +246,8 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     The cost is ``|r_t|^2 + 2 |r_R|^2`` with the residual translation r_t and the residual rotation
     vector r_R. With their Jacobians J_t, J_R and the variances s_t^2, s_R^2 of the residuals, an
     estimate that minimises the weighted sum has covariance ``H^-1 (s_t^2 J_t'J_t + 4 s_R^2 J_R'J_R)
-    H^-1``, ``H = J_t'J_t + 2 J_R'J_R``.
-
-    Returns
-    -------
-    covariance : (6, 6) array
-        Zero along directions without information.
-    unknown : (6, U) array
-        Orthonormal basis of the directions that the motion does not reveal.
+    H^-1``, ``H = J_t'J_t + 2 J_R'J_R``: (6, 6), zero along directions without information. Second
+    is an orthonormal basis (6, U) of the directions that the motion does not reveal.
     """
     weights = solution.weights
     n_effective = max(float(weights.sum()) - 3.0, 1.0)
@@ -384,15 +331,8 @@ def widened_by_halves(
     """The model's covariance (6, 6), or that of a part of xi, widened along the direction in which
     both halves of the recording disagree by more than chance.
 
-    Parameters
-    ----------
-    model : (6, 6) array
-    products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
-    misfit : float
-        Factor of the covariances of the halves.
-    part : slice
-        Of xi.
+    ``products`` (K, p + 1, p + 1) are what each part of the recording adds, see
+    :mod:`~hand_eye_calib.gls.parts`; ``misfit`` is a factor of the covariances of the halves.
     """
     half = len(products) // 2
     halves = NormalEquations(np.array([products[:half].sum(axis=0), products[half:].sum(axis=0)]))
@@ -426,10 +366,10 @@ def _verdicts(
     to_parent = np.kron(np.eye(2), rotation_parent_child)
     sigmas = np.sqrt(np.maximum(np.diag(to_parent @ covariance @ to_parent.T), 0.0))
     unknown_shares = ((to_parent @ unknown) ** 2).sum(axis=1)
-    verdicts = []
-    for name, sigma, share in zip(AXES, sigmas.tolist(), unknown_shares, strict=True):
-        verdicts.append(judged(name, float("inf") if share > HIDDEN_SHARE else sigma))
-    return tuple(verdicts)
+    return tuple(
+        judged(name, float("inf") if share > HIDDEN_SHARE else sigma)
+        for name, sigma, share in zip(AXES, sigmas.tolist(), unknown_shares, strict=True)
+    )
 
 
 def judged(axis: str, sigma: float) -> DofObservability:

@@ -8,16 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import (
-    ROTATIONS,
-    TRANSLATIONS,
-    WEAK_ROTATION,
-    WEAK_TRANSLATION,
-)
+from hand_eye_calib.assessment.covariance import WEAK_ROTATION, WEAK_TRANSLATION
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.stats import median, quantile
 from hand_eye_calib.text import amount, angle, axes_in_words, length, listing
 
@@ -75,23 +71,6 @@ class Excitation:
     motion_s: float = 0.0
     drives: bool = True
     forward: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    @property
-    def gain(self) -> FloatArray:
-        """(3,) array: root mean square displacement of lever arms of 1 m along x, y and z, in m:
-        how well an offset shows. 0 to 2.
-        """
-        return np.sqrt(np.maximum(np.diag(self.lever_arms.information), 0.0))
-
-    @property
-    def worst(self) -> FloatArray:
-        """(3,) array: unit vector of the lever arm that the rotations move least."""
-        return self.lever_arms.directions[:, 0]
-
-    @property
-    def worst_gain(self) -> float:
-        """Gain of that lever arm."""
-        return float(np.sqrt(max(self.lever_arms.powers[0], 0.0)))
 
     @property
     def has_vehicle_axes(self) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import FloatArray
 
 # A direction counts as revealed if the rotations move it with this many times the power of the
 # rotation errors. With less, noise alone would look like that motion.
@@ -52,24 +52,18 @@ class LeverArms:
 
     @classmethod
     def of(cls, chords: FloatArray, weights: FloatArray | None = None) -> "LeverArms":
-        """The lever arms of motions.
-
-        Parameters
-        ----------
-        chords : (K, 3, 3) array
-            R - I of each motion, or (R - I) Q for lever arms in a frame that Q rotates from.
-        weights : (K,) array, optional
-            1 for all motions by default.
+        """The lever arms of motions with these chords (K, 3, 3): R - I of each, or (R - I) Q for
+        lever arms in a frame that Q rotates from; and their weights (K,), 1 by default.
         """
         weights = np.ones(len(chords)) if weights is None else weights
         information = weighted_products(weights, chords) / max(float(weights.sum()), 1.0)
         powers, directions = np.linalg.eigh(information)
         return cls(powers, directions, information)
 
-    def is_hidden(
+    def hidden_directions(
         self, cov_rotation: FloatArray | None = None, least_share: float = MIN_SHARE
-    ) -> BoolArray:
-        """Whether the rotations do not reveal each of the directions, (3,).
+    ) -> FloatArray:
+        """The directions (3, U) that the rotations do not reveal.
 
         Parameters
         ----------
@@ -83,13 +77,7 @@ class LeverArms:
         noise = np.trace(cov_rotation) * np.eye(3) - cov_rotation + ROUNDING_ANGLE**2 * np.eye(3)
         noise_powers = np.array([d @ noise @ d for d in self.directions.T])
         least = np.maximum(_MIN_SIGNAL_TO_NOISE * noise_powers, least_share**2 * self.powers[-1])
-        return self.powers < least
-
-    def hidden_directions(
-        self, cov_rotation: FloatArray | None = None, least_share: float = MIN_SHARE
-    ) -> FloatArray:
-        """The directions (3, U) that the rotations do not reveal; see :meth:`is_hidden`."""
-        return self.directions[:, self.is_hidden(cov_rotation, least_share)]
+        return self.directions[:, self.powers < least]
 
     def hidden_axes(self, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:
         """Names of the axes x, y, z that lie too far in the hidden directions to be known."""

@@ -39,19 +39,7 @@ def errors(
 
 
 def relative_errors(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[float, float]:
-    """Mean relative errors e_rt and e_rR (eqs 6 and 7).
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K pairs, K >= 1.
-    T_parent_child : (4, 4) array
-
-    Returns
-    -------
-    e_rt, e_rR : float
-        In m and rad.
-    """
+    """Mean relative errors e_rt (m) and e_rR (rad), eqs 6 and 7, over at least one motion pair."""
     translation, rotation = pairs.residuals(T_parent_child)
     return (
         float(np.linalg.norm(translation, axis=1).mean()),

@@ -57,19 +57,10 @@ _MOVES, _LEAST_PARTS, _LEAST_PROBABILITY = 0.02, 4, 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class MountChange:
-    """A shift of the mount within a recording.
-
-    Attributes
-    ----------
-    at_ns : int
-        When, parent clock.
-    xi : (6,) array
-        Shift: afterwards the extrinsic is ``X exp(xi)``, with X from before, (rho, phi) in the
-        child sensor's frame, m and rad.
-    covariance : (6, 6) array
-        Of ``xi``, with the long-run variance.
-    log_ratio : float
-        Logarithm of the likelihood ratio of this shift against none.
+    """A shift of the mount within a recording, at a stamp of the parent's clock: afterwards the
+    extrinsic is ``X exp(xi)``, with X from before, and xi (6,) = (rho, phi) in the child sensor's
+    frame, m and rad; its covariance (6, 6) with the long-run variance; and the logarithm of the
+    likelihood ratio of this shift against none.
     """
 
     at_ns: int
@@ -194,8 +185,6 @@ class PossibleShift:
     ----------
     probability : float
         That the parts before and after some time have different answers, under their noise model.
-    moved : float
-        That this is more than recordings of one rig scatter: that something has moved.
     share : float
         Of the recording before it, where it is most likely.
     xi : (6,) array
@@ -203,25 +192,16 @@ class PossibleShift:
     spread : (6, 6) array
         Covariance of xi in ``X exp(xi)`` because of it: an answer between both mounts is half of
         the shift away from either.
+    warnings : tuple of str
+        One if something has moved, more likely than not: by more than recordings of one rig
+        scatter.
     """
 
     probability: float
-    moved: float
     share: float
     xi: FloatArray
     spread: FloatArray
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A warning if something has moved, more likely than not."""
-        if self.moved < 0.5:
-            return ()
-        return (
-            f"The first {self.share:.0%} and the last {1 - self.share:.0%} of the recording give "
-            f"different results ({length(float(np.linalg.norm(self.xi[:3])))}, "
-            f"{angle(float(np.linalg.norm(self.xi[3:])))}). Perhaps a sensor moved, or an odometry "
-            "got worse. The +/- values already include half of this.",
-        )
+    warnings: tuple[str, ...] = ()
 
 
 def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
@@ -257,10 +237,17 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     best = int(np.argmax(ratios))
+    share, xi = int(cuts[known][best]) / len(products), shifts[best]
+    sizes = length(float(np.linalg.norm(xi[:3]))), angle(float(np.linalg.norm(xi[3:])))
+    told = (
+        f"The first {share:.0%} and the last {1 - share:.0%} of the recording give different "
+        f"results ({', '.join(sizes)}). Perhaps a sensor moved, or an odometry got worse. The +/- "
+        "values already include half of this."
+    )
     return PossibleShift(
         probability=found,
-        moved=moved,
-        share=int(cuts[known][best]) / len(products),
-        xi=shifts[best],
+        share=share,
+        xi=xi,
         spread=found * squared / 4.0,
+        warnings=(told,) if moved >= 0.5 else (),
     )

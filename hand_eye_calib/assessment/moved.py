@@ -22,7 +22,7 @@ from enum import Enum
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import AXES
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import CHI2, LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN
 from hand_eye_calib.text import amount, listing
 
@@ -58,7 +58,7 @@ class Change(str, Enum):
         return next(graver, cls.SAME)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Moved:
     """Which axes differ between two estimates of an extrinsic, and by how much.
 
@@ -142,15 +142,8 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
         Change.MOVED if ratio > LARGEST_OF_SIX else Change.SAME if seen else Change.CANNOT_TELL
         for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
     )
-    together = [Change.MOVED] if chi2 > CHI2[0.001][6] else []
-    return Moved(
-        values=values,
-        sigmas=sigmas,
-        visible=visible,
-        verdicts=verdicts,
-        verdict=Change.of_all([*verdicts, *together]),
-        chi2=chi2,
-    )
+    verdict = Change.MOVED if chi2 > CHI2[0.001][6] else Change.of_all(verdicts)
+    return Moved(values, sigmas, visible, verdicts, verdict, chi2)
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:

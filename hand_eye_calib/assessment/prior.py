@@ -14,9 +14,6 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import (
-    AXES,
-    ROTATIONS,
-    TRANSLATIONS,
     UNKNOWN_ROTATION,
     UNKNOWN_SIGMAS,
     UNKNOWN_TRANSLATION,
@@ -25,6 +22,7 @@ from hand_eye_calib.assessment.covariance import (
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
 
 # Axis name to (value, standard deviation), in m and rad.
 Prior: TypeAlias = Mapping[str, tuple[float, float]]
@@ -53,8 +51,6 @@ _MAX_DISTANCE = 4.0
 # sensors farther apart than this (m): such a prior is in another unit.
 _MAX_LEVER_ARM = 50.0
 
-_ALL_AXES = slice(None)
-
 
 @dataclass(frozen=True)
 class Fused:
@@ -74,7 +70,7 @@ class Fused:
     assessment: Assessment
     contradictions: dict[str, float]
 
-    def status(self, converged: bool, within: slice = _ALL_AXES) -> SolveStatus:
+    def status(self, converged: bool, within: slice = slice(6)) -> SolveStatus:
         """How a solve ended, if it can determine the axes ``within``."""
         if not converged:
             return SolveStatus.NOT_CONVERGED
@@ -105,10 +101,6 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
     prior : mapping
         Axis name (x, y, z, roll, pitch, yaw; of the child sensor's pose in the parent sensor's
         frame, angles about fixed axes) to (value, sigma), in m and rad. May be empty.
-
-    Returns
-    -------
-    Fused
     """
     covariance = assessment.cov_parent_child_in_child
     unknown = _unknown_directions(covariance)
@@ -141,19 +133,8 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
 
 
 def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) -> Assessment:
-    """An assessment with the covariance of something added that the estimate depends on.
-
-    Parameters
-    ----------
-    assessment : Assessment
-    rotation : (3, 3) array
-        Of the estimate, T_parent_child.
-    spread : (6, 6) array
-        Covariance to add, of (rho, phi) in the child sensor's frame.
-
-    Returns
-    -------
-    Assessment
+    """An assessment of an estimate with this rotation (3, 3), and with the covariance (6, 6) of
+    (rho, phi), in the child sensor's frame, of something added that the estimate depends on.
     """
     if not spread.any():
         return assessment
@@ -177,16 +158,10 @@ def _unknown_directions(covariance: FloatArray) -> FloatArray:
 def _whitened(
     T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coordinates of unit variance: the variances of known and unknown directions differ by many
-    powers of ten.
-
-    Returns
-    -------
-    root, inverse_root : (6, 6) arrays
-        From these coordinates to deviations (rho, phi) from the estimate, and back.
-    targets : (6,) array
-        Where the estimate is set without a prior, in these coordinates: zero translation along
-        unknown directions.
+    """Matrices (6, 6) from coordinates of unit variance to deviations (rho, phi) from the estimate,
+    and back: the variances of known and unknown directions differ by many powers of ten; and where
+    (6,) the estimate is set without a prior, in these coordinates: zero translation along unknown
+    directions.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known = vectors[:, values < 0.5]
@@ -197,11 +172,8 @@ def _whitened(
     sigmas = np.concatenate([np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE)), unknown_sigmas])
     in_child = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
     targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
-    return (
-        directions * sigmas,
-        (directions / sigmas).T,
-        np.concatenate([np.zeros(len(variances)), targets]),
-    )
+    targets = np.concatenate([np.zeros(len(variances)), targets])
+    return directions * sigmas, (directions / sigmas).T, targets
 
 
 def _difference(T_from: FloatArray, T_to: FloatArray) -> FloatArray:

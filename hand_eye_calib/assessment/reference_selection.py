@@ -53,20 +53,13 @@ def select_reference(
     candidates: Sequence[str] = CANDIDATES,
     solution: AdaptiveSolution | None = None,
 ) -> ReferenceChoice:
-    """Choose the reference for a method.
+    """Choose the reference for a method; ``solution`` is the adaptive estimator's for these poses,
+    if it is known.
 
     The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The
     adaptive estimator can: its error is smaller and, as that of the best linear estimator,
     uncorrelated with the distance of other answers from it. So the answer nearest to it is
     probably the best one.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-    method : Method
-    candidates : sequence of str
-    solution : AdaptiveSolution, optional
-        The adaptive estimator's answer for these poses, if it is known.
 
     Raises
     ------

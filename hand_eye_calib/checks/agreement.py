@@ -3,7 +3,7 @@ little of the motion unexplained and yet spoil the extrinsic.
 """
 
 from collections.abc import Iterator
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -29,8 +29,10 @@ from hand_eye_calib.text import angle, length, listing
 #: X (4, 4) and its standard deviations (6,), (rho, phi).
 Known: TypeAlias = tuple[FloatArray, FloatArray]
 
-# A finding, and the share of the squared residuals that it explains.
-_Suspect: TypeAlias = tuple[float, Finding]
+# The share of the squared residuals that something explains, and its finding if it is significant.
+_Suspect: TypeAlias = tuple[float, Finding | None]
+
+_STREAMS = ("child", "parent")
 
 # Significance that a fault of the response needs, in standard deviations; smoothing, whose sigma
 # does not contain noise of the columns, needs more. How many times it must exceed what noise may
@@ -88,9 +90,9 @@ def check_agreement(
 ) -> list[Finding]:
     """Findings about two streams that agree.
 
-    One fault shows in several groups of columns: the one that explains most is it. Odometries drift
-    against each other, and a drift looks a little like a shift of the mount, turned worlds or a
-    scale by axis: what explains less than a world that moves is none of them.
+    One fault shows in several groups of columns: the one that explains most is it, or none if that
+    is not significant. Odometries drift against each other, and a drift looks a little like a shift
+    of the mount, worlds that are turned or a scale by axis.
 
     Parameters
     ----------
@@ -112,13 +114,12 @@ def check_agreement(
     if slow:
         response, axes = slow
         drift = response.fit("drift")
-        suspects += _rotation_gains(response, axes, gain)
-        suspects += _turned(response)
-        suspects += _axis_gains(response)
+        tried = [(drift.share, _world_drift(drift, pose_pairs, speeds))]
+        tried += [_rotation_gain(response, axes, gain)]
+        tried += [make(response, stream) for make in (_turned, _axis_gain) for stream in _STREAMS]
         if change:
-            suspects += _moved_mount(response, change, int(pose_pairs.stamps_ns[0]))
-        suspects = [each for each in suspects if each[0] > drift.share]
-        suspects += _world_drift(drift, pose_pairs, speeds)
+            tried += [_moved_mount(response, change, int(pose_pairs.stamps_ns[0]))]
+        suspects += [max(tried, key=lambda each: each[0])]
     if fast := short_response(pose_pairs, T_parent_child, gain):
         suspects += _delays(*fast[:2], speeds)
         suspects += _smoothing(*fast, speeds)
@@ -129,11 +130,13 @@ def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Findi
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     slow = long_response(pose_pairs, motions, X)
-    return _likeliest([each for each in _axis_gains(slow[0]) if each[0] > _MOST]) if slow else []
+    tried = [_axis_gain(slow[0], stream) for stream in _STREAMS] if slow else []
+    return _likeliest([each for each in tried if each[0] > _MOST])
 
 
 def _likeliest(suspects: list[_Suspect]) -> list[Finding]:
-    return [max(suspects, key=lambda each: each[0])[1]] if suspects else []
+    found = [(share, each) for share, each in suspects if each]
+    return [max(found, key=lambda each: each[0])[1]] if found else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -156,45 +159,35 @@ def _severity(is_error: bool | np.bool_) -> Severity:
     return Severity.ERROR if is_error else Severity.WARNING
 
 
-def _rotation_gains(slow: Regression, axes: FloatArray, gain: FloatArray) -> Iterator[_Suspect]:
+def _found(key: str, stream: str, is_error: bool | np.bool_, **values: Any) -> Finding:
+    return finding(key, stream, _severity(is_error), **values)
+
+
+def _rotation_gain(slow: Regression, axes: FloatArray, gain: FloatArray) -> _Suspect:
     """A gain of the child's rotations about an axis, which is put into the matrix ``gain``."""
     fitted, powers = slow.fit("gain"), slow.powers("gain")
     sizes = np.abs(fitted.values)
     limits = np.maximum(_SIGMAS * fitted.sigmas, _BIASES * slow.biases("gain"))
     limits = np.maximum(_GAINS[0], limits)
     counts = (sizes > limits) & (powers > LITTLE**2 * powers[0])
-    if counts.any():
-        gain += (axes * np.where(counts, fitted.values, 0.0)) @ axes.T
-        k = int(np.argmax(np.where(counts, sizes / limits, 0.0)))
-        yield (
-            fitted.share,
-            finding(
-                "rotation_gain",
-                severity=_severity(sizes[k] > _GAINS[1]),
-                stream="child",
-                axis=", ".join(f"{component:.2f}" for component in axes[:, k]),
-                gain=1.0 + fitted.values[k],
-                sigma=fitted.sigmas[k],
-            ),
-        )
+    if not counts.any():
+        return fitted.share, None
+    gain += (axes * np.where(counts, fitted.values, 0.0)) @ axes.T
+    k = int(np.argmax(np.where(counts, sizes / limits, 0.0)))
+    axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
+    values = {"axis": axis, "gain": 1.0 + fitted.values[k], "sigma": fitted.sigmas[k]}
+    return fitted.share, _found("rotation_gain", "child", sizes[k] > _GAINS[1], **values)
 
 
-def _turned(slow: Regression) -> Iterator[_Suspect]:
+def _turned(slow: Regression, stream: str) -> _Suspect:
     """Positions of a stream that are turned against its orientations."""
-    for stream in ("child", "parent"):
-        fitted = slow.fit(f"turned_{stream}")
-        if fitted.significance.max() > _SIGMAS and np.abs(fitted.values).max() > _TURNED[0]:
-            turned_rad = float(np.linalg.norm(fitted.values))
-            yield (
-                fitted.share,
-                finding(
-                    "worlds_turned",
-                    stream,
-                    _severity(turned_rad > _TURNED[1]),
-                    turned_deg=float(np.degrees(turned_rad)),
-                    axis="xyz"[int(np.argmax(np.abs(fitted.values)))],
-                ),
-            )
+    fitted = slow.fit(f"turned_{stream}")
+    if fitted.significance.max() < _SIGMAS or np.abs(fitted.values).max() < _TURNED[0]:
+        return fitted.share, None
+    turned_rad = float(np.linalg.norm(fitted.values))
+    axis = "xyz"[int(np.argmax(np.abs(fitted.values)))]
+    values = {"axis": axis, "turned_deg": float(np.degrees(turned_rad))}
+    return fitted.share, _found("worlds_turned", stream, turned_rad > _TURNED[1], **values)
 
 
 def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
@@ -213,61 +206,42 @@ def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
     return best
 
 
-def _axis_gains(slow: Regression) -> Iterator[_Suspect]:
+def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     """A coordinate of a stream that has another scale than the others."""
-    for stream in ("child", "parent"):
-        fitted = slow.fit(f"axes_{stream}", without="scale")
-        k, off, sigma = _odd_one(fitted)
-        bias = float(slow.biases(f"axes_{stream}")[k])
-        if abs(off) > max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * bias):
-            severity = _severity(abs(off) > _AXIS_GAINS[1])
-            yield (
-                fitted.share,
-                finding(
-                    "axis_scale", stream, severity, axis="xyz"[k], factor=1.0 + off, sigma=sigma
-                ),
-            )
+    fitted = slow.fit(f"axes_{stream}", without="scale")
+    k, off, sigma = _odd_one(fitted)
+    bias = float(slow.biases(f"axes_{stream}")[k])
+    if abs(off) < max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * bias):
+        return fitted.share, None
+    values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
+    return fitted.share, _found("axis_scale", stream, abs(off) > _AXIS_GAINS[1], **values)
 
 
-def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> Iterator[_Suspect]:
+def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspect:
     """A mount that has moved."""
-    sigmas = np.sqrt(np.diag(change.covariance))
+    share, sigmas = slow.fit("moved").share, np.sqrt(np.diag(change.covariance))
     known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
     if change.log_ratio < SIGNIFICANT or (moved_m < _MOVED_M[0] and moved_rad < _MOVED_RAD[0]):
-        return
+        return share, None
     is_large = moved_m > _MOVED_M[1] or moved_rad > _MOVED_RAD[1]
-    sizes = [length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0)
-    yield (
-        slow.fit("moved").share,
-        finding(
-            "mount_moved",
-            severity=_severity(is_large and change.log_ratio > 2.0 * SIGNIFICANT),
-            size=listing(sizes),
-            at_s=(change.at_ns - start_ns) * 1e-9,
-            translation_m=moved_m,
-            rotation_rad=moved_rad,
-        ),
-    )
+    size = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
+    values = {"size": size, "at_s": (change.at_ns - start_ns) * 1e-9}
+    is_error = is_large and change.log_ratio > 2.0 * SIGNIFICANT
+    return share, _found("mount_moved", "both", is_error, **values)
 
 
-def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Iterator[_Suspect]:
+def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Finding | None:
     """A world that moves against the other."""
     positions = pose_pairs.Ts_cw_c[:, :3, 3]
     turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
-    speed = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
-    share = float(speed) / max(_rms(speeds), 1e-9)
-    if drift.significance.max() >= _SIGMAS and share > _MOVING:
-        speed, rate = (float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
-        yield (
-            drift.share,
-            finding(
-                "world_drift",
-                deg_per_minute=float(np.degrees(60 * rate)),
-                m_per_minute=60 * speed,
-                percent=100 * share,
-            ),
-        )
+    moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
+    share = float(moving) / max(_rms(speeds), 1e-9)
+    if drift.significance.max() < _SIGMAS or share < _MOVING:
+        return None
+    speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
+    values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
+    return _found("world_drift", "both", False, percent=100 * share, **values)
 
 
 def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
@@ -283,35 +257,21 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
     if abs(delay_s) > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
         # Which stream it is cannot be told; hardly a filter makes positions early.
         stream = "child" if delay_s > 0 else "parent"
-        yield (
-            max(of_positions.share, of_rotations.share),
-            finding(
-                "position_clock",
-                stream,
-                _severity(shift_m > _SHIFTS_M[1]),
-                delay_s=abs(delay_s),
-                sigma_s=sigma_s,
-                shift_m=shift_m,
-            ),
-        )
+        share = max(of_positions.share, of_rotations.share)
+        values: dict[str, Any] = {"part": "positions", "others": "orientations"}
+        values |= {"delay_s": abs(delay_s), "sigma_s": sigma_s, "shift_m": shift_m}
+        is_error = shift_m > _SHIFTS_M[1]
+        yield share, _found("late", stream, is_error, code="position_clock", **values)
     for stream, columns in (("child", 0), ("parent", 3)):
         fitted = positions.fit(f"late_axes_{stream}", without="late")
         k, off_s, sigma_s = _odd_one(fitted)
         shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
         # The other stream's coordinate cannot be early.
         if off_s > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-            yield (
-                fitted.share,
-                finding(
-                    "axis_lag",
-                    stream,
-                    _severity(shift_m > _SHIFTS_M[1]),
-                    axis="xyz"[k],
-                    delay_s=off_s,
-                    sigma_s=sigma_s,
-                    shift_m=shift_m,
-                ),
-            )
+            values = {"part": f"{'xyz'[k]} coordinates", "others": "others"}
+            values |= {"delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
+            is_error = shift_m > _SHIFTS_M[1]
+            yield fitted.share, _found("late", stream, is_error, code="axis_lag", **values)
 
 
 def _smoothing(
@@ -326,17 +286,9 @@ def _smoothing(
             shift_m = smoothing_s * _rms(speeds)
             least = max(_SMOOTHING_S2[part] + least_s2, _SMOOTHING_SIGMAS * sigma)
             if value >= least and shift_m > _SHIFTS_M[0]:
-                yield (
-                    fitted.share,
-                    finding(
-                        "smoothed",
-                        stream,
-                        _severity(shift_m > _SHIFTS_M[1]),
-                        part=part,
-                        smoothing_s=smoothing_s,
-                        shift_m=shift_m,
-                    ),
-                )
+                values = {"part": part, "smoothing_s": smoothing_s, "shift_m": shift_m}
+                is_error = shift_m > _SHIFTS_M[1]
+                yield fitted.share, _found("smoothed", stream, is_error, **values)
 
 
 def _speeds(pose_pairs: PosePairs) -> FloatArray:
@@ -356,7 +308,7 @@ def _rms(speeds: FloatArray) -> float:
     return float(np.sqrt((speeds[:, 3:] ** 2).sum(axis=1).mean())) if len(speeds) else 0.0
 
 
-def check_independent(parent: Trajectory, child: Trajectory, offset_s: float) -> list[Finding]:
+def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory) -> list[Finding]:
     """Finding about streams of which one was computed from the other, or none.
 
     Two sensors differ by their noise, whatever the extrinsic is. Poses that were computed from
@@ -366,14 +318,15 @@ def check_independent(parent: Trajectory, child: Trajectory, offset_s: float) ->
     Parameters
     ----------
     parent, child : Trajectory
-    offset_s : float
-        Offset that was found; the stamps as they are count as well.
+        With their stamps as they are.
+    aligned : Trajectory
+        The child on the parent's clock.
     """
     (rough_p, white_p), (rough_c, white_c) = map(_roughness, (parent, child))
     limit_rad = min(_AGREE_RAD, min(rough_p, rough_c) / _BELOW_ROUGHNESS)
     if min(white_p, white_c) > _WHITE:
         limit_rad = max(limit_rad, min(_AGREE_NOISE_RAD, min(rough_p, rough_c) / _BELOW_NOISE))
-    for moved in (child, child.shifted(offset_s)) if offset_s else (child,):
+    for moved in (child, aligned):
         # Programs interpolate at the stamps of the new stream, most of them along a straight line.
         for slow, fast in ((moved, parent), (parent, moved)):
             for straight in (True, False):

@@ -9,9 +9,9 @@ wrong with them.
 4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,7 +56,8 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
-from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.text import axes_in_words
 
 # Time offsets (s) from which on an error, a warning, a note is given; each also needs this many
 # standard deviations. Differences of lengths from which on an error is given.
@@ -89,20 +90,11 @@ class CheckResult:
         Of the angular rates of both streams.
     fit : SimilarityFit or None
         The fit under the hypothesis that holds; None if none does.
-    rms_rotation : dict
-        Root mean square rotation over 3 s about each axis of the parent sensor, rad; empty if not
-        known.
     """
 
     findings: tuple[Finding, ...]
     correlation: Correlation = NO_CORRELATION
     fit: SimilarityFit | None = None
-    rms_rotation: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def is_good(self) -> bool:
-        """Whether nothing speaks against calibrating with these streams as they are."""
-        return all(each.severity is Severity.NOTE for each in self.findings)
 
 
 def check_streams(
@@ -141,9 +133,7 @@ def check_streams(
     streams, correlation = _on_one_clock(
         StreamPair(parent, child.scaled(scale), max_gap_s), time_offset_s, correlation
     )
-    aligned = streams
-    if correlation.is_clear:
-        aligned = replace(streams, child=streams.child.shifted(correlation.offset_s))
+    aligned = streams.shifted(correlation.offset_s if correlation.is_clear else 0.0)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
@@ -151,7 +141,7 @@ def check_streams(
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
         if correlation.is_clear and not explanation.holds:
-            pose_pairs = synchronise(aligned.parent, aligned.child, max_gap_s)
+            pose_pairs = aligned.synchronised()
             motions = _motions(pose_pairs, _MAX_MOTIONS)
             findings += check_coordinates(pose_pairs, motions) or explanation.findings
         elif explanation.holds:
@@ -169,9 +159,14 @@ def check_streams(
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
     findings = _with_lengths(findings, parent)
-    return _check_agreeing(
-        streams, explanation, correlation, findings, (time_offset_s, scale), known
-    )
+    is_sound = not any(each.makes_unusable for each in findings)
+    offset = _offset(streams, explanation, correlation)
+    findings += check_offset(offset, time_offset_s)
+    more, fit = _check_sizes(streams, explanation, correlation.offset_s, scale)
+    findings += more
+    if is_sound:
+        findings += _check_agreeing(streams.shifted(offset.seconds), streams, fit, known)
+    return CheckResult(gravest_first(findings), correlation, explanation.fit)
 
 
 def _on_one_clock(
@@ -181,68 +176,56 @@ def _on_one_clock(
     interpolate are compared where they have stamps in common, unless the coarse offset is off by
     more than its accuracy.
     """
-    moved = replace(streams, child=streams.child.shifted(known_s))
+    moved = streams.shifted(known_s)
     from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
     if not streams.are_slow:
         return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
-        in_common = synchronise(found.parent, found.child, found.max_gap_s)
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
-        if len(in_common) > MIN_PAIRS and (is_near or not correlation.is_clear):
+        if len(found.synchronised()) > MIN_PAIRS and (is_near or not correlation.is_clear):
             return found, replace(correlation, offset_s=0.0)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
 
-def _check_agreeing(
-    streams: StreamPair,
-    explanation: Explanation,
-    correlation: Correlation,
-    findings: list[Finding],
-    options: tuple[float, float],
-    known: Known | None,
-) -> CheckResult:
-    """What else there is to say of streams that agree under a hypothesis, with a time offset and a
-    scale from the options, and X if it is known.
-    """
-    is_sound = not any(each.makes_unusable for each in findings)
-    corrected, fit = explanation.hypothesis.undo(streams), explanation.fit
+def _offset(streams: StreamPair, explanation: Explanation, correlation: Correlation) -> TimeOffset:
+    """The time offset of streams that agree under a hypothesis."""
     if streams.are_slow:  # too slow to refine it
-        offset = TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
-    else:
-        offset = refine_time_offset(
-            corrected.parent,
-            corrected.child,
-            correlation,
-            streams.max_gap_s,
-            fit,
-            least_s=_OFFSET_NOTE_S,
-        )
-    pose_pairs = synchronise(
-        corrected.parent, corrected.child.shifted(correlation.offset_s), streams.max_gap_s
-    )
+        return TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
+    right = explanation.hypothesis.undo(streams)
+    parts = right.parent, right.child, correlation, streams.max_gap_s, explanation.fit
+    return refine_time_offset(*parts, least_s=_OFFSET_NOTE_S)
+
+
+def _check_sizes(
+    streams: StreamPair, explanation: Explanation, offset_s: float, scale: float
+) -> tuple[list[Finding], SimilarityFit]:
+    """Findings about the scale, beside the one that is known, and the axes of rotation of streams
+    that agree under a hypothesis, and the fit with the scale.
+    """
+    pose_pairs = explanation.hypothesis.undo(streams).shifted(offset_s).synchronised()
     rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
-    findings = [*findings, *check_offset(offset, options[0])]
+    findings, fit = _check_axes(rotations, explanation.fit.sigma_rotation), explanation.fit
     if explanation.same_unit:
-        findings.append(finding("unit_unseen"))
-    else:
-        with suppress(NotEnoughDataError):
-            scale = estimate_scale(pose_pairs, start=fit)
-            findings += _check_scale(scale, options[1])
-            fit = scale.fit
-    findings += _check_axes(rotations, explanation.fit.sigma_rotation)
-    if is_sound:
-        of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
-        best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-        if copied := check_independent(streams.parent, streams.child, offset.seconds):
-            findings += [*copied, *check_same(*best)]
-        else:
-            child = streams.child.shifted(offset.seconds).scaled(fit.scale)
-            pose_pairs = synchronise(streams.parent, child, streams.max_gap_s)
-            motions = _motions(pose_pairs, _MAX_MOTIONS)
-            findings += check_agreement(pose_pairs, motions, fit.T_parent_child, best)
-    rms = np.sqrt((se3.rotation_log(rotations) ** 2).mean(axis=0))
-    named = dict(zip("xyz", rms.tolist(), strict=True))
-    return CheckResult(gravest_first(findings), correlation, explanation.fit, named)
+        return [finding("unit_unseen"), *findings], fit
+    with suppress(NotEnoughDataError):
+        found = estimate_scale(pose_pairs, start=fit)
+        return [*_check_scale(found, scale), *findings], found.fit
+    return findings, fit
+
+
+def _check_agreeing(
+    aligned: StreamPair, streams: StreamPair, fit: SimilarityFit, known: Known | None
+) -> list[Finding]:
+    """What else there is to say of streams that agree as they are, on one clock, and of the same
+    streams as they were given.
+    """
+    of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
+    best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
+    if copied := check_independent(streams.parent, streams.child, aligned.child):
+        return [*copied, *check_same(*best)]
+    pose_pairs = replace(aligned, child=aligned.child.scaled(fit.scale)).synchronised()
+    motions = _motions(pose_pairs, _MAX_MOTIONS)
+    return check_agreement(pose_pairs, motions, fit.T_parent_child, best)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -376,19 +359,12 @@ def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
 
 def _check_axes(rotations: FloatArray, sigma_rotation: float) -> list[Finding]:
     """A note if nearly all rotation is about one axis."""
-    lever_arms = LeverArms.of(rotations - np.eye(3))
-    hidden = lever_arms.hidden_axes(sigma_rotation**2 * np.eye(3))
-    if not hidden:
-        return []
-    direction = lever_arms.directions[:, 0]
-    main = int(np.argmax(np.abs(direction)))
-    direction = direction * np.sign(direction[main])
-    return [
-        finding(
-            "one_axis",
-            options={f"prior.{'xyz'[main]}": "VALUE+/-SIGMA"},
-            axis=", ".join(f"{component:.2f}" for component in direction),
-            hidden=" and ".join(hidden),
-            main="xyz"[main],
-        )
-    ]
+    hidden = LeverArms.of(rotations - np.eye(3)).hidden_axes(sigma_rotation**2 * np.eye(3))
+    return [unseen(hidden)] if hidden else []
+
+
+def unseen(axes: Sequence[str]) -> Finding:
+    """The note that a motion does not show these axes."""
+    options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
+    it = "it" if len(axes) == 1 else "them"
+    return finding("one_axis", options=options, axes=axes_in_words(axes), it=it)

@@ -7,12 +7,11 @@ from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.results.finding import Confidence, Finding, Severity, gravest_first
+from hand_eye_calib.results.finding import Finding, Severity, gravest_first
 
-__all__ = ["Confidence", "Finding", "Severity", "answered", "finding", "gravest_first"]
+__all__ = ["Finding", "Severity", "answered", "finding", "gravest_first"]
 
 _NOTE, _WARNING = Severity.NOTE, Severity.WARNING
-_CERTAIN, _POSSIBLE = Confidence.CERTAIN, Confidence.POSSIBLE
 
 # Jumps up to this share hardly matter to the methods that reject outliers.
 _FEW_JUMPS = 0.02
@@ -28,7 +27,6 @@ class _Row:
     advice: str
     cause: str = ""
     severity: Severity = Severity.ERROR
-    confidence: Confidence = Confidence.LIKELY
     code: str = ""
 
 
@@ -36,33 +34,17 @@ _ONE_BODY = "check that both are on one rigid body, {units}, and the clocks (tim
 
 _ROWS = {
     # ------------------------------------------------------------------ of one stream
-    "duplicates": _Row(
-        "{repeated} of {poses} {stream} poses repeat a stamp",
-        "the first of each is used",
-        severity=_NOTE,
-        confidence=_CERTAIN,
-    ),
     "disorder": _Row(
-        "{backwards} {stream} stamps are earlier than the one before",
-        "poses are sorted by stamp",
+        "{backwards} {stream} stamps are earlier than the one before, {repeated} repeat another",
+        "poses are sorted by stamp; the first of each is used",
         severity=_NOTE,
-        confidence=_CERTAIN,
     ),
-    "repaired_file": _Row(
-        "{text}", "repair the file's source", code="disorder", severity=_NOTE, confidence=_CERTAIN
-    ),
-    "too_few_poses": _Row(
-        "the {stream} stream has {poses} poses",
-        "record longer, or check the topic",
-        code="too_short",
-        confidence=_CERTAIN,
-    ),
-    "leap": _Row("{whose} {text}", "{remedy}", confidence=_CERTAIN),
+    "repaired_file": _Row("{text}", "repair the file's source", code="disorder", severity=_NOTE),
+    "leap": _Row("{whose} {text}", "{remedy}"),
     "gaps": _Row(
         "the {stream} stream has {gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the time)",
         "nothing is paired across a gap; raise max_gap if the motion there is smooth",
         severity=_NOTE,
-        confidence=_CERTAIN,
     ),
     "jumps": _Row(
         "{share:.1%} of {whose} steps are jumps: far from the motion before and after",
@@ -74,19 +56,16 @@ _ROWS = {
         "the {stream} stream repeats the same pose for {share:.0%} of the time while the other "
         "sensor moves",
         "find out why its source stopped, and cut that part out",
-        confidence=_CERTAIN,
     ),
     "repeated": _Row(
         "the {stream} stream has each position {times} times in a row under new stamps: its source "
         "is slower than the stream",
         "keep the first of each, with the stamp of its measurement",
-        confidence=_CERTAIN,
     ),
     "stamp_unit": _Row(
         "{whose} stamps are {unit} instead of nanoseconds: they are {factor:g} times nearer to "
         "1970 than the {other}'s",
         "multiply {whose} stamps by {factor:g}",
-        confidence=_CERTAIN,
     ),
     "interleaved": _Row(
         "{whose} poses alternate between two levels {distance_m:.2g} m apart",
@@ -96,9 +75,8 @@ _ROWS = {
     "coarse_positions": _Row(
         "{whose} positions are multiples of {step_m:.3g} m",
         "write positions with 64 bits and all digits, or relative to a near origin",
-        "{why}",
+        "rounding, or numbers of 32 bits far from the origin, such as map coordinates",
         severity=_NOTE,
-        confidence=_CERTAIN,
     ),
     "flat": _Row(
         "the {stream} stream has only x, y and yaw, while the {other} tilts by {tilt_deg:.1f} deg "
@@ -106,7 +84,6 @@ _ROWS = {
         "give poses with all six degrees of freedom, or record on level ground and measure height, "
         "roll and pitch by hand",
         "odometry in 2D, such as that of wheels",
-        confidence=_CERTAIN,
     ),
     "lengths": _Row(
         "the parent moves at {speed_m_s:.0f} m/s and changes its velocity by "
@@ -128,17 +105,17 @@ _ROWS = {
         "be checked",
         "rotate about several axes (a vehicle: curves, and slopes if there are any)",
     ),
-    "too_short": _Row("{text}", "record longer", confidence=_CERTAIN),
+    "too_short": _Row("{text}", "record longer"),
     "not_one_body": _Row(
         "no extrinsic, scale or usual mistake explains both streams: {share:.0%} of the motion "
-        "stays unexplained (at most {limit:.0%} would be good)",
+        "stays unexplained",
         "check that both sensors are on one rigid body and that the poses are those of the sensors",
         code="unrelated",
     ),
     "unrelated_parts": _Row(
         "{share:.0%} of the {part} is not that of the {other}", _ONE_BODY, code="unrelated"
     ),
-    "unsolved": _Row("{text}", _ONE_BODY, code="unrelated", confidence=_POSSIBLE),
+    "unsolved": _Row("{text}", _ONE_BODY, code="unrelated"),
     "not_independent": _Row(
         "The two streams are not independent: one seems to be computed from the other. This result "
         "only repeats the transform that was used for it.",
@@ -195,7 +172,6 @@ _ROWS = {
     "time_offset": _Row(
         "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
         "add {total_s} s in all to the child's stamps, or have it estimated",
-        confidence=_CERTAIN,
     ),
     "large_time_offset": _Row(
         "the child's clock is {size_s:.2f} s {direction} the parent's, which nobody has said",
@@ -204,33 +180,22 @@ _ROWS = {
         "a clock of another time scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a "
         "vehicle that follows",
         severity=_WARNING,
-        confidence=_POSSIBLE,
         code="time_offset",
     ),
     "units": _Row(
         "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",
         "convert them to metres",
-        confidence=_CERTAIN,
     ),
     "scale": _Row(
         "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
         "parent's",
         "have the scale estimated, or find out which of the two measures wrongly",
-        confidence=_CERTAIN,
     ),
     "one_axis": _Row(
-        "nearly all rotation is about one axis, ({axis}) in the parent sensor's frame: the "
-        "translation along it, {hidden}, will be unobservable",
-        "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {main} and "
-        "give it",
-        severity=_NOTE,
-    ),
-    "unseen_axes": _Row(
         "{axes} cannot be determined from this motion, and will be unobservable",
         "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {it} and give "
         "a prior",
-        code="one_axis",
         severity=_NOTE,
     ),
     "same_frame": _Row(
@@ -252,12 +217,13 @@ _ROWS = {
         "calibrate that scale first",
         "a gyroscope or wheel base with a wrong scale, in either stream",
     ),
-    "position_clock": _Row(
-        "the {stream}'s positions are {delay_s:.3f} +/- {sigma_s:.3f} s late against its "
-        "orientations: at this speed a shift of {shift_m:.2g} m",
-        "use the poses before that filter, or correct the delay of the positions",
-        "positions and orientations of one stream come from different sources or filters, or the "
-        "other stream is of another body, such as a trailer",
+    "late": _Row(
+        "{whose} {part} are {delay_s:.3f} +/- {sigma_s:.3f} s late against its {others}: at this "
+        "speed a shift of {shift_m:.2g} m",
+        "use poses from one source, before any filter",
+        "positions, or heights of a barometer, from another source or filter than the rest, or "
+        "another stream of another body, such as a trailer",
+        code="{code}",
     ),
     "worlds_turned": _Row(
         "{whose} positions are turned against its orientations by {turned_deg:.2f} deg, mainly "
@@ -271,12 +237,6 @@ _ROWS = {
         "write all coordinates in metres, from one source",
         "heights in feet, of a barometer or constant (2D), or map coordinates whose scale depends "
         "on the latitude",
-    ),
-    "axis_lag": _Row(
-        "{whose} {axis} coordinates are {delay_s:.3f} +/- {sigma_s:.3f} s late against its others: "
-        "at this speed a shift of {shift_m:.2g} m",
-        "use positions whose coordinates come from one source",
-        "such as heights of a barometer",
     ),
     "smoothed": _Row(
         "{whose} {part} are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
@@ -313,7 +273,6 @@ def finding(
     key: str,
     stream: str = "both",
     severity: Severity | None = None,
-    confidence: Confidence | None = None,
     options: Mapping[str, float | str] | None = None,
     **values: Any,
 ) -> Finding:
@@ -325,8 +284,8 @@ def finding(
         Of the row.
     stream : str
         "parent", "child" or "both".
-    severity, confidence : optional
-        Instead of those of the row.
+    severity : Severity, optional
+        Instead of that of the row.
     options : mapping, optional
         Options that help, by name.
     **values
@@ -339,7 +298,6 @@ def finding(
         code=row.code.format(**values) or key,
         stream=stream,
         severity=severity or row.severity,
-        confidence=confidence or row.confidence,
         what=row.what.format(**values),
         advice=row.advice.format(**values),
         cause=row.cause.format(**values),
@@ -368,28 +326,16 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
     """The same findings; those that the options answer already are notes, and so are a few jumps if
     the method rejects outliers.
     """
-    given = config.to_options()
-    rejects_outliers = METHODS[config.method].rejects_outliers
-
-    def undone(found: Finding) -> Finding:
-        """A stream that was put right already, and needs it again, was right before."""
-        if found.code not in _CONVENTIONS:
-            return found
-        usual = {
-            name: getattr(CalibratorConfig, name) if given[name] == value else value
-            for name, value in found.options.items()
-        }
-        return replace(found, options=usual)
-
-    findings = [undone(found) for found in findings]
-
-    def is_answered(found: Finding) -> bool:
-        if found.code == "jumps" and rejects_outliers and found.evidence["share"] < _FEW_JUMPS:
-            return True
-        set_so = [given.get(name) == value for name, value in found.options.items()]
-        return bool(set_so) and all(set_so)
-
-    return [
-        replace(found, severity=Severity.NOTE) if is_answered(found) else found
-        for found in findings
-    ]
+    given, told = config.to_options(), []
+    for each in findings:
+        options = dict(each.options)
+        if each.code in _CONVENTIONS:
+            # A stream that was put right already, and needs it again, was right before.
+            set_so = [name for name, value in options.items() if given[name] == value]
+            options |= {name: getattr(CalibratorConfig, name) for name in set_so}
+        is_answered = options and all(given.get(name) == options[name] for name in options)
+        if each.code == "jumps" and METHODS[config.method].rejects_outliers:
+            is_answered = is_answered or each.evidence["share"] < _FEW_JUMPS
+        severity = Severity.NOTE if is_answered else each.severity
+        told.append(replace(each, options=options, severity=severity))
+    return told

@@ -21,14 +21,14 @@ import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity, conventions, finding
+from hand_eye_calib.checks.findings import Finding, Severity, conventions, finding
 from hand_eye_calib.checks.streams import coarse_poses
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
-from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
 from hand_eye_calib.solvers.park import align_rotation_vectors
 from hand_eye_calib.stats import median
 
@@ -78,6 +78,14 @@ class StreamPair:
         """Whether nothing is interpolated between most poses of both streams."""
         return self.interval_s > self.max_gap_s
 
+    def shifted(self, offset_s: float) -> "StreamPair":
+        """The same with another clock of the child."""
+        return replace(self, child=self.child.shifted(offset_s))
+
+    def synchronised(self) -> PosePairs:
+        """Poses of both at common stamps."""
+        return synchronise(self.parent, self.child, self.max_gap_s)
+
     def pairs(self, lag_s: float, max_pairs: int) -> MotionPairs:
         """Motion pairs over ``lag_s`` seconds.
 
@@ -86,7 +94,7 @@ class StreamPair:
         NotEnoughDataError
             If the streams have too few in common.
         """
-        pairs = pairs_over(synchronise(self.parent, self.child, self.max_gap_s), lag_s, max_pairs)
+        pairs = pairs_over(self.synchronised(), lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
             raise NotEnoughDataError(
                 f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
@@ -212,8 +220,8 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     ----------
     streams : StreamPair
     thorough : bool
-        The angular rates agree, so that it pays to try wrong axes, too. They are many and tried at
-        most twice.
+        The angular rates agree, so that it pays to try wrong axes, too. They are many and tried
+        once.
 
     Returns
     -------
@@ -234,23 +242,18 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
         if not chosen.holds and thorough and not failed:
             chosen = _or_other_axes(chosen, streams, lag_s)
         if chosen.holds:
-            return _attribute(chosen, streams, lag_s)
+            return _attributed(chosen, streams, lag_s)
         # Jumps spoil long motions more than short ones.
         failed.append((lag_s, chosen))
     if not failed:
         raise too_few
     lag_s, best = min(failed, key=lambda tried: tried[1].fit.unexplained)
-    if thorough and lag_s != failed[0][0]:
-        best = _or_other_axes(best, streams, lag_s)
-        if best.holds:
-            return _attribute(best, streams, lag_s)
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
-        attributed = _attribute(best, streams, lag_s)
+        attributed = _attributed(best, streams, lag_s)
         findings = (*attributed.findings, finding("noisy", share=unexplained))
         return replace(attributed, findings=findings, limit=_NOISY)
-    unrelated = finding("not_one_body", share=min(unexplained, 1.0), limit=HOLDS)
-    return replace(best, findings=(unrelated,))
+    return replace(best, findings=(finding("not_one_body", share=min(unexplained, 1.0)),))
 
 
 def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanation:
@@ -311,40 +314,32 @@ def _is_decisive(plain: Explanation, rival: Explanation, limit: float) -> bool:
     return unexplained < limit and _DECISIVE * unexplained < plain.fit.unexplained
 
 
-def _attribute(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
     """The explanation with its finding, after deciding by path lengths which stream is inverted, or
     both: the fits do not differ.
     """
-    hypothesis = explanation.hypothesis
-    if hypothesis.code not in ("", "inverse"):
-        code, stream = hypothesis.code, hypothesis.stream
-        options = conventions(code, stream)
-        found = finding(code, stream, options=options, detail=hypothesis.detail)
+    code, stream = explanation.hypothesis.code, explanation.hypothesis.stream
+    if code not in ("", "inverse"):
+        detail, options = explanation.hypothesis.detail, conventions(code, stream)
+        found = finding(code, stream, options=options, detail=detail)
         return replace(explanation, findings=(found,))
-    evidence, inverted_fit = _evidence_for_inverse(streams, explanation, lag_s)
-    if evidence < _INVERTED and not hypothesis.code:
-        return explanation
-    likely = abs(evidence) > (_INVERTED if hypothesis.code else _LIKELY_INVERTED)
-    if hypothesis.code:
-        stream, fit = hypothesis.stream, explanation.fit
+    evidence, inverted = _evidence_for_inverse(streams, explanation, lag_s)
+    if code:
+        fit = explanation.fit
         if evidence >= _INVERTED:
-            stream, fit = ("parent" if stream == "child" else "child"), inverted_fit
-        else:
-            likely = -evidence > _INVERTED
-        confidence = Confidence.LIKELY if likely else Confidence.POSSIBLE
-        options = conventions("inverse", stream)
-        found = finding("inverse", stream, confidence=confidence, options=options)
-        return replace(
-            explanation,
-            hypothesis=Hypothesis("inverse", stream, _inverted),
-            fit=fit,
-            findings=(found,),
-        )
-    if not likely or _may_be_an_arm(streams):
-        found = finding("inverse_both", "both", Severity.WARNING, Confidence.POSSIBLE)
+            stream, fit = ("parent" if stream == "child" else "child"), inverted
+        # An option mends only what is clear.
+        options = conventions(code, stream) if abs(evidence) > _INVERTED else {}
+        found = finding(code, stream, options=options)
+        hypothesis = Hypothesis(code, stream, _inverted)
+        return replace(explanation, hypothesis=hypothesis, fit=fit, findings=(found,))
+    if evidence < _INVERTED:
+        return explanation
+    if evidence <= _LIKELY_INVERTED or _may_be_an_arm(streams):
+        found = finding("inverse_both", "both", Severity.WARNING)
         return replace(explanation, findings=(found,))
     found = finding("inverse_both", options=conventions("inverse", "both"))
-    return Explanation(_BOTH_INVERTED, inverted_fit, (found,))
+    return Explanation(_BOTH_INVERTED, inverted, (found,))
 
 
 def _may_be_an_arm(streams: StreamPair) -> bool:
@@ -368,11 +363,7 @@ def _evidence_for_inverse(
     for stream in (streams.parent, streams.child):
         # Steps are so coarse that noise does not add to the path.
         coarse = coarse_poses(stream, _PATH_STEP_S)
-        path_m, inverse_m = (
-            float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
-            for poses in (coarse, se3.inverse(coarse))
-        )
-        by_paths += float(np.log(path_m / inverse_m))
+        by_paths += float(np.log(_path_m(coarse) / _path_m(se3.inverse(coarse))))
     most = by_paths + 0.5 * float(np.log(_lever_arm(fit) / _LEAST_LEVER_ARM_M))
     if not explanation.hypothesis.code and most < _INVERTED:
         return most, fit
@@ -381,6 +372,10 @@ def _evidence_for_inverse(
         # One world for both streams: the lever arm between the worlds says nothing.
         return by_paths, inverted
     return by_paths + 0.5 * float(np.log(_lever_arm(fit) / _lever_arm(inverted))), inverted
+
+
+def _path_m(poses: FloatArray) -> float:
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
 
 
 def _lever_arm(fit: SimilarityFit) -> float:

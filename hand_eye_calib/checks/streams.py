@@ -112,41 +112,19 @@ def coarse_poses(trajectory: Trajectory, step_s: float) -> FloatArray:
 
 
 def tidy(
-    stamps_ns: IntArray,
-    translations: FloatArray,
-    quats_xyzw: FloatArray,
-    stream: str,
-    **frames: str,
+    stamps_ns: IntArray, translations: FloatArray, quats_xyzw: FloatArray, stream: str
 ) -> tuple[Trajectory, list[Finding]]:
-    """A Trajectory from poses in the order of their arrival, and findings about that order.
+    """A Trajectory from N poses in the order of their arrival, and findings about that order.
 
-    Parameters
-    ----------
-    stamps_ns : (N,) int64 array
-    translations : (N, 3) array
-    quats_xyzw : (N, 4) array
-    stream : str
-        "parent" or "child".
-    **frames
-        Frame names of the Trajectory.
-
-    Returns
-    -------
-    trajectory : Trajectory
-        Sorted; of poses with the same stamp the first.
-    findings : list of Finding
+    It is sorted; of poses with the same stamp the first counts. Quaternions are (N, 4), x y z w;
+    ``stream`` is "parent" or "child".
     """
-    stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
     sorted_ns, first = np.unique(stamps_ns, return_index=True)
+    repeated, backwards = len(stamps_ns) - len(sorted_ns), int((np.diff(stamps_ns) < 0).sum())
     findings = []
-    if n_repeated := len(stamps_ns) - len(sorted_ns):
-        found = finding("duplicates", stream, repeated=n_repeated, poses=len(stamps_ns))
-        findings.append(found)
-    if n_backwards := int((np.diff(stamps_ns) < 0).sum()):
-        findings.append(finding("disorder", stream, backwards=n_backwards))
-    trajectory = Trajectory.from_quat_xyzw(
-        sorted_ns, np.asarray(translations)[first], np.asarray(quats_xyzw)[first], **frames
-    )
+    if repeated or backwards:
+        findings = [finding("disorder", stream, repeated=repeated, backwards=backwards)]
+    trajectory = Trajectory.from_quat_xyzw(sorted_ns, translations[first], quats_xyzw[first])
     return trajectory, findings
 
 
@@ -161,19 +139,7 @@ def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
 def check_stream(
     trajectory: Trajectory, stream: str, max_gap_s: float = CalibratorConfig.max_gap
 ) -> list[Finding]:
-    """Findings about one stream: too short, a leap in time, gaps, jumps.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-    stream : str
-        "parent" or "child".
-    max_gap_s : float
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Findings about one stream, "parent" or "child": too short, a leap in time, gaps, jumps."""
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(finding.code != "gaps" for finding in findings):
         return findings
@@ -211,7 +177,8 @@ def _repeated(trajectory: Trajectory) -> int:
 def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of one stream, whatever it measures: too few, a leap, gaps."""
     if len(trajectory) < 4:
-        return [finding("too_few_poses", stream, poses=len(trajectory))]
+        text = f"the {stream} stream has {len(trajectory)} poses"
+        return [finding("too_short", stream, text=text)]
     if leap := find_leap(trajectory.stamps_ns):
         return [finding("leap", stream, text=leap.what, remedy=leap.advice)]
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
@@ -298,18 +265,12 @@ def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArra
 
 def _check_grid(positions: FloatArray, stream: str) -> Finding | None:
     """Finding about positions that are multiples of a step, or None."""
-    steps = [_grid_step(column) for column in positions.T]
-    step_m, column = max(steps), positions[:, int(np.argmax(steps))]
+    step_m = max(_grid_step(column) for column in positions.T)
     if step_m < _COARSE_NOTE_M:
         return None
     severity = Severity.WARNING if step_m > _COARSE_WARNING_M else Severity.NOTE
     severity = Severity.ERROR if step_m > _COARSE_ERROR_M else severity
-    is_float32 = (column == column.astype(np.float32)).all() and step_m >= 0.5 * float(
-        np.spacing(np.float32(np.abs(column).max()))
-    )
-    far = "numbers of 32 bits far from the origin, such as map coordinates"
-    why = far if is_float32 else "they were rounded"
-    return finding("coarse_positions", stream, severity, step_m=step_m, why=why)
+    return finding("coarse_positions", stream, severity, step_m=step_m)
 
 
 def _grid_step(values: FloatArray) -> float:
@@ -344,8 +305,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
         if tilt_rad > _TILTS_RAD:
-            values: dict[str, Any] = {"tilt_rad": tilt_rad, "tilt_deg": np.degrees(tilt_rad)}
-            return [finding("flat", name, other=other, **values)]
+            return [finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))]
     return []
 
 
@@ -402,29 +362,13 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
 
 
 def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[Finding]:
-    """Finding about stamps in another unit than those of the other stream, or none.
-
-    Parameters
-    ----------
-    parent_stamps_ns, child_stamps_ns : (N,) int64 arrays
-        Stamps as read, as if in nanoseconds.
-
-    Returns
-    -------
-    list of Finding
-    """
-    stamps = {
-        "parent": median(parent_stamps_ns),
-        "child": median(child_stamps_ns),
-    }
+    """Finding about stamps (N,), as read, in another unit than the other stream's, or none."""
+    stamps = {"parent": median(parent_stamps_ns), "child": median(child_stamps_ns)}
     early, late = sorted(stamps, key=lambda name: stamps[name])
-    for factor, unit in _STAMP_UNITS.items():
-        if (
-            stamps[early] > 0
-            and stamps[late] > _DATE_NS
-            and abs(np.log10(stamps[late] / (stamps[early] * factor))) < _SAME_TIME
-        ):
-            return [finding("stamp_unit", early, other=late, unit=unit, factor=factor)]
+    if stamps[early] > 0 and stamps[late] > _DATE_NS:
+        for factor, unit in _STAMP_UNITS.items():
+            if abs(np.log10(stamps[late] / (stamps[early] * factor))) < _SAME_TIME:
+                return [finding("stamp_unit", early, other=late, unit=unit, factor=factor)]
     return []
 
 
@@ -443,13 +387,6 @@ def check_lengths(parent: Trajectory) -> list[Finding]:
     change = quantile(np.linalg.norm(changes, axis=1), _USUAL)
     if speed < _FASTEST and change < _HARDEST:
         return []
-    of_millimetres: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
-    return [
-        finding(
-            "lengths",
-            "parent",
-            options=of_millimetres,
-            speed_m_s=speed,
-            acceleration_m_s2=change,
-        )
-    ]
+    options: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
+    values = {"speed_m_s": speed, "acceleration_m_s2": change}
+    return [finding("lengths", "parent", None, options, **values)]

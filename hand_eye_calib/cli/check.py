@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     return show(
         arguments,
         lambda: _document(sources, streams, findings, checked),
-        lambda: "\n".join([said, "", *_table(findings), "", *_lines(sources, streams, checked)]),
+        lambda: "\n".join([said, "", *_table(findings), "", *_lines(sources, streams)]),
         finish=lambda: write_page(arguments.out / "check.html", page) if arguments.out else None,
         errors=errors,
         code=len(errors),
@@ -150,15 +150,13 @@ def _document(
         "streams": {
             name: {"source": sources[name], **vars(summary)} for name, summary in streams.items()
         },
-        "turning": turning | {"rms_rad_in_3_s": checked.rms_rotation},
+        "turning": turning,
         "findings": findings,
     }
 
 
-def _lines(
-    sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]", checked: "CheckResult"
-) -> Iterator[str]:
-    """Both streams, and how much the parent rotates."""
+def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:
+    """Both streams."""
     yield from (f"{stream} is {printable(source)}" for stream, source in sources.items())
     yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
@@ -168,9 +166,6 @@ def _lines(
             f"{summary.longest_interval_s:10.3f} s {'none' if path is None else length(path):>12} "
             f"{'none' if rotation is None else angle(rotation):>10}"
         )
-    if checked.rms_rotation:
-        rotated = ", ".join(f"{axis} {angle(rms)}" for axis, rms in checked.rms_rotation.items())
-        yield f"Rotation of the parent in 3 s about its axes, root mean square: {rotated}"
 
 
 def _verdict(findings: "Sequence[Finding]") -> str:
@@ -200,7 +195,7 @@ def _table(findings: "Sequence[Finding]") -> Iterator[str]:
     for finding in findings:
         mark = finding.severity.value
         mark = mark if mark == "note" else mark.upper()
-        yield f"{mark:<8} {finding.code:<17} {finding.stream:<7} {finding.confidence.value}"
+        yield f"{mark:<8} {finding.code:<17} {finding.stream}"
         options = typed_options(finding.options.items())
         for text in (finding.what, f"-> {finding.advice}{options and f': {options}'}"):
             yield from wrapped(text, "    ", "    ")

@@ -10,13 +10,18 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import MIN_VARIATION, Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.checks.check import CheckResult, check_offset, check_parts, check_streams
+from hand_eye_calib.checks.check import (
+    CheckResult,
+    check_offset,
+    check_parts,
+    check_streams,
+    unseen,
+)
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.text import axes_in_words
 
 # Smaller time offsets (s) of streams that are no poses are found by every solve.
 _FOUND_BY_SOLVE_S = 0.25
@@ -137,7 +142,5 @@ def _of_result(result: Calibration, correlation: Correlation, known_s: float) ->
     if abs(offset_s) < _FOUND_BY_SOLVE_S:
         found = [replace(each, severity=Severity.NOTE) for each in found]
     if hidden:
-        options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in hidden}
-        it = "it" if len(hidden) == 1 else "them"
-        found.append(finding("unseen_axes", options=options, axes=axes_in_words(hidden), it=it))
+        found.append(unseen(hidden))
     return found

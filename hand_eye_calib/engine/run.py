@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 from hand_eye_calib.alignment.time_offset import refine_time_offset
 from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity, finding, gravest_first
+from hand_eye_calib.checks.findings import Finding, Severity, finding, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.estimation import fixed_time_offset
@@ -24,9 +24,9 @@ from hand_eye_calib.results.calibration import Calibration
 Progress: TypeAlias = Callable[[float, str], None]
 Options: TypeAlias = Mapping[str, Any]
 
-# Options that a check can be certain of; and those in whose convention a stream may have been
-# written, of which being likely is enough: the second solve proves it.
-_MENDED = ("time_offset", "scale", "parent_scale")
+# Findings whose options are certain; and options in whose convention a stream may have been
+# written: the second solve proves it.
+_MENDED = ("time_offset", "scale", "units")
 _CONVENTIONS = tuple(f"{each}_{kind}" for each in STREAMS for kind in ("invert", "quaternion"))
 
 # A model's own time offset moves poses along their velocities. From this one (s) on, poses are
@@ -316,10 +316,9 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
 
 def _is_sure(finding: Finding, option: str) -> bool:
     if option in _CONVENTIONS:
-        return finding.makes_unusable and finding.confidence is not Confidence.POSSIBLE
+        return finding.makes_unusable
     is_warned = option == "time_offset" and finding.severity is Severity.WARNING
-    is_certain = finding.confidence is Confidence.CERTAIN
-    return option in _MENDED and is_certain and (finding.makes_unusable or is_warned)
+    return finding.code in _MENDED and (finding.makes_unusable or is_warned)
 
 
 def _offset_of_model(

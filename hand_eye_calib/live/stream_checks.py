@@ -3,7 +3,7 @@
 import numpy as np
 
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
-from hand_eye_calib.checks.findings import Confidence, Finding, Severity
+from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.live.state import ChecksState, Level
 
 # The streams are checked at most this often (s), which costs a second or two each time.
@@ -59,7 +59,9 @@ class StreamChecks:
             return [], []
         before, self._result, self._checked_at_s = self._faults, result, steady_s
         found = {(f.code, f.stream): f for f in result.findings if f.severity is not Severity.NOTE}
-        self._faults = {key: f for key, f in found.items() if _is_sure(f) or key in self._suspected}
+        self._faults = {
+            key: f for key, f in found.items() if f.makes_unusable or key in self._suspected
+        }
         self._suspected = set(found)
         new = [in_parameters(finding) for key, finding in self._faults.items() if key not in before]
         ended = [finding for key, finding in before.items() if key not in self._faults]
@@ -92,10 +94,6 @@ class StreamChecks:
                 f"{each.severity.value}: {in_parameters(each)}" for each in result.findings
             ),
         )
-
-
-def _is_sure(finding: Finding) -> bool:
-    return finding.severity is Severity.ERROR and finding.confidence is not Confidence.POSSIBLE
 
 
 def in_parameters(finding: Finding) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.assessment.covariance import AXES, TRANSLATIONS
 from hand_eye_calib.report.figures import figure_of_views
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.status import AXES, TRANSLATIONS
 from hand_eye_calib.rig.result import RigCalibration
 from hand_eye_calib.text import counted, with_sigma
 

@@ -17,14 +17,6 @@ class Severity(str, Enum):
     ERROR = "error"
 
 
-class Confidence(str, Enum):
-    """How sure a finding is."""
-
-    CERTAIN = "certain"
-    LIKELY = "likely"
-    POSSIBLE = "possible"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Finding:
     """Something about the streams that a person should know.
@@ -36,7 +28,6 @@ class Finding:
     stream : str
         "parent", "child" or "both".
     severity : Severity
-    confidence : Confidence
     what : str
         What was found, with its values.
     advice : str
@@ -54,7 +45,6 @@ class Finding:
     what: str
     advice: str
     stream: str = "both"
-    confidence: Confidence = Confidence.LIKELY
     cause: str = ""
     evidence: Mapping[str, float] = field(default_factory=dict)
     options: Mapping[str, float | str] = field(default_factory=dict)

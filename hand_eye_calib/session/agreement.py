@@ -25,8 +25,8 @@ from enum import Enum
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import amount, axes_in_words, listing
 
 # A direction with a larger standard deviation (m, rad) is unknown; its variance then.

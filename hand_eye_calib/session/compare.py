@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.assessment.moved import UNKNOWN, Change, Moved, moved, scatter_of_recordings
 from hand_eye_calib.config import CalibratorConfig
@@ -19,6 +18,7 @@ from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.records import Comparison as Installed
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.session.agreement import Kind
 from hand_eye_calib.session.together import agreement_of_results, require_same_frames

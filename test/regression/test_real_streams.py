@@ -157,7 +157,6 @@ class TestArms:
         parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand())
         (finding,) = calibrate(parent, child).findings
         assert (finding.code, finding.severity) == ("inverse_both", "warning")
-        assert finding.confidence == "possible"
 
     def test_the_axis_of_one_axis_motion_is_named(self):
         recording = real_data.robot_arm("sim")
@@ -168,8 +167,7 @@ class TestArms:
             for f in check_streams(recording.parent, recording.child).findings
             if f.code == "one_axis"
         )
-        assert "(1.00, -0.01, 0.01)" in note.what
-        assert "translation along it, x, will be unobservable" in note.what
+        assert note.what.startswith("x cannot be determined")
 
     @pytest.mark.parametrize(
         ("name", "low", "high"),

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from result_making import calibration
 
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import Excitation
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks.check import CheckResult
@@ -25,6 +24,7 @@ from hand_eye_calib.live.solving import Answer, Checked
 from hand_eye_calib.live.state import Level, NodeState
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.results.status import AXES
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 

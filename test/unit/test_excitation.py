@@ -31,9 +31,7 @@ def test_turning_is_measured_about_the_axis_it_happens_about(axis):
     seen = seen_in(turning(amplitudes))
     assert np.degrees(seen.rotation[axis]) == pytest.approx(40.0, abs=3.0)
     assert np.degrees(np.delete(seen.rotation, axis)).max() < 1e-6
-    np.testing.assert_allclose(np.abs(seen.worst), np.eye(3)[axis], atol=1e-6)
-    assert seen.worst_gain < 1e-6
-    assert seen.gain[axis] < 1e-6 < np.delete(seen.gain, axis).min()
+    assert seen.hidden_axes() == ("xyz"[axis],)
 
 
 def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
@@ -41,7 +39,6 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
     seen = seen_in(poses)
     moved = seen_in(se3.exp(np.array([5.0, 3.0, -2.0, 0.4, 1.0, -2.0])) @ poses)
     np.testing.assert_allclose(moved.rotation, seen.rotation, atol=1e-9)
-    np.testing.assert_allclose(moved.gain, seen.gain, atol=1e-9)
     many = seen_in(
         as_trajectory(poses).at(
             np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(np.int64)

@@ -7,7 +7,6 @@ import pytest
 from result_making import calibration as made
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.covariance import AXES
 from hand_eye_calib.assessment.excitation import Excitation, excitation, helpful_motion
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.cli.present import as_text
@@ -17,6 +16,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.records import CorrelatedError, Noise
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.session.goal import Goal
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses, write_pair
 
-from hand_eye_calib.assessment.covariance import AXES, UNKNOWN_TRANSLATION, Assessment
+from hand_eye_calib.assessment.covariance import UNKNOWN_TRANSLATION, Assessment
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
@@ -13,6 +13,7 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import parse_prior
 
 pytestmark = pytest.mark.usefixtures("no_figures")

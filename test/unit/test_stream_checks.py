@@ -13,7 +13,7 @@ from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_
 
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.findings import Confidence, Severity
+from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.checks.streams import (
     check_stamps,
     check_stream,
@@ -54,7 +54,6 @@ def grave(agreement):
 def test_no_false_alarm(seed, wander):
     agreement = check_streams(*drive(seed, wander=wander))
     assert grave(agreement) == []
-    assert agreement.is_good
 
 
 @pytest.mark.parametrize("centred", ["parent", "child"])
@@ -117,7 +116,6 @@ def test_every_fault_is_named(fault):
     parent, child = drive()
     agreement = check_streams(*damage(parent, child, drive(9)[1]))
     assert [found for found, _ in grave(agreement)] == [code]
-    assert not agreement.is_good
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -174,7 +172,7 @@ class TestWhichStreamAndWhatToDo:
         parent, child = drive(wander=planar_poses)
         note = check_streams(as_trajectory(parent.poses @ lying), child).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
-        assert "translation along it, y, will be unobservable" in note.what
+        assert note.what == "y cannot be determined from this motion, and will be unobservable"
         assert note.options == {"prior.y": "VALUE+/-SIGMA"}
 
     def test_motion_without_turns(self):
@@ -212,7 +210,7 @@ class TestOneStream:
         )
         assert np.array_equal(trajectory.stamps_ns, np.array([0, 10, 20, 30, 40, 50]) * 10**7)
         assert trajectory.poses[2, 0, 3] == 6.0
-        assert [f.code for f in findings] == ["duplicates", "disorder"]
+        assert [f.code for f in findings] == ["disorder"]
 
     def test_frozen_only_while_the_other_moves(self):
         parent, child = drive()
@@ -323,7 +321,7 @@ class TestCommand:
         assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
         page = (out / "check.html").read_text(encoding="utf-8")
         assert "calibrate with --child-quaternion wxyz" in page
-        assert "<code>quaternion_order</code> (child, likely)" in page
+        assert "<code>quaternion_order</code> (child)" in page
         assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
         assert page.count("<svg") == 1
 
@@ -387,7 +385,6 @@ def test_an_arm_about_its_base_may_have_inverse_poses_and_that_is_no_error(seed)
     child = as_trajectory(disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0)
     found = check_streams(parent, child).findings
     assert [(each.code, each.severity) for each in found] == [("inverse_both", Severity.WARNING)]
-    assert found[0].confidence is Confidence.POSSIBLE
 
 
 def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
