@@ -85,11 +85,9 @@ def _matrices(path: Path) -> FloatArray:
 
 def ethz(folder: Path) -> Iterator[Row]:
     """Thirty-two stops of an arm, judged on sixteen others; five splits."""
-    names = [
-        f"robot_arm_complete_bag_color_and_ir_{name}.csv"
-        for name in ("base_link_sr300_hinge", "target_ir")
-    ]
-    files = [folder / "asl_robot_arm" / name for name in names]
+    names = "base_link_sr300_hinge.csv", "target_ir.csv"
+    start = "robot_arm_complete_bag_color_and_ir"
+    files = [folder / "asl_robot_arm" / f"{start}_{name}" for name in names]
     hand_s, eye_s = (np.loadtxt(file, delimiter=",")[:, 0] for file in files)
     hand, eye = (_matrices(file) for file in files)
     best: dict[int, tuple[float, int]] = {}
@@ -100,12 +98,12 @@ def ethz(folder: Path) -> Iterator[Row]:
             best[nearest] = (apart_s, row)
     pairs = sorted((f"ethz-absolute-{i:05d}-{row:05d}", i, row) for i, (_, row) in best.items())
     motions, poses, seconds, same = [], [], [], 0
-    for seed, start in enumerate(_DIGESTS):
+    for seed, beginning in enumerate(_DIGESTS):
         order = list(range(len(pairs)))
         random.Random(seed).shuffle(order)
         held, fitted = ([pairs[k] for k in sorted(part)] for part in (order[:16], order[16:48]))
         name = hashlib.sha256("\n".join(pair[0] for pair in fitted).encode()).hexdigest()
-        same += name.startswith(start)
+        same += name.startswith(beginning)
         A, B = hand[[i for _, i, _ in fitted]], eye[[row for _, _, row in fitted]]
         started = time.process_time()
         fit = solve(Stops.of_one(A, B))
@@ -114,7 +112,7 @@ def ethz(folder: Path) -> Iterator[Row]:
         X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
         motions.append(closure_of_motions(X, A, B))
         poses.append(closure(A, X, Z, B))
-    source = f"{files[0].name} {digest(files[0])}, {same} of 5 splits by digest"
+    source = f"{names[0]} {digest(files[0])}, {same} of 5 splits"
     for figure, values, published in (
         ("closure of A X = X B, 16 poses held out, mean of 5", motions, "0.8672 deg, 13.821 mm"),
         ("closure of A X = Z B", poses, "0.6247 deg, 10.779 mm"),
