@@ -47,6 +47,11 @@ def _tf_source(stream: str) -> Any:
     )
 
 
+def _type(stream: str) -> Any:
+    text = f"Message type of {stream}_odom; auto takes it from the publisher."
+    return option("auto", text, choices=POSE_TYPES, read_only=True)
+
+
 def _measures(stream: str) -> Any:
     return option(
         "auto",
@@ -348,18 +353,8 @@ class NodeConfig(OptionSet):
     """Options that only the node has."""
 
     solve_period: float = option(2.0, "Time between solves.", unit="s", within=(0.05, 3600.0))
-    parent_type: str = option(
-        "auto",
-        "Message type of parent_odom; auto takes it from the publisher.",
-        choices=POSE_TYPES,
-        read_only=True,
-    )
-    child_type: str = option(
-        "auto",
-        "Message type of child_odom; auto takes it from the publisher.",
-        choices=POSE_TYPES,
-        read_only=True,
-    )
+    parent_type: str = _type("parent")
+    child_type: str = _type("child")
     other_children: int = option(
         0,
         "Number of further child sensors, with poses on child2_odom, child3_odom and so on. "

@@ -21,13 +21,10 @@ _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 def length(metres: float) -> str:
     """A length with two digits in mm, cm or m; paths of more than 10 m have more."""
     size = abs(metres)
-    if size < _MM_BELOW:
-        return f"{two_digits(1000 * metres)} mm"
-    if size < _M_FROM:
-        return f"{two_digits(100 * metres)} cm"
-    if size < 10:
-        return f"{two_digits(metres)} m"
-    return f"{metres:,.{1 if size < 100 else 0}f} m"
+    if size >= 10:
+        return f"{metres:,.{1 if size < 100 else 0}f} m"
+    unit, factor = ("mm", 1000) if size < _MM_BELOW else ("cm", 100) if size < _M_FROM else ("m", 1)
+    return f"{two_digits(factor * metres)} {unit}"
 
 
 def angle(radians: float) -> str:
@@ -59,14 +56,8 @@ def two_digits(value: float) -> str:
 
 
 def with_sigma(value: float | None, sigma: float | None, least_decimals: int = 2) -> str:
-    """A number and its standard deviation, with two digits of the latter.
-
-    Parameters
-    ----------
-    value, sigma : float or None
-        None where the value is not known.
-    least_decimals : int
-        Decimals that are shown in any case.
+    """A number and its standard deviation, with two digits of the latter and so many decimals at
+    least; None where one is not known.
     """
     if value is None or sigma is None or not math.isfinite(sigma):
         return "unknown"
@@ -78,9 +69,9 @@ def printed_angle(degrees: float | None, sigma: float | None) -> str:
     """An angle and its standard deviation; near gimbal lock roll and yaw are known and have none of
     their own.
     """
-    if degrees is not None and sigma is None:
-        return fixed(degrees, 2)
-    return with_sigma(degrees, sigma, 2)
+    return (
+        fixed(degrees, 2) if degrees is not None and sigma is None else with_sigma(degrees, sigma)
+    )
 
 
 def decimals_of(sigma: float) -> int:
@@ -191,22 +182,18 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
     """
     if not text:
         return {}
-    axis = name.removeprefix("prior.")
-    axes = tuple(AXIS_UNITS) if axis == "transform" else (axis,)
-    before, plus_minus, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
-    values, sigmas, expected = before.split(), after.split(), "VALUE+/-SIGMA"
-    if axis == "transform":
-        expected = "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
+    before, _, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
+    values, sigmas = before.split(), after.split()
+    axes, expected = [name.removeprefix("prior.")], "VALUE+/-SIGMA"
+    if axes == ["transform"]:
+        axes, expected = [*AXIS_UNITS], "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
         sigmas = sigmas[:1] * 3 + sigmas[1:] * 3 if len(sigmas) == 2 else sigmas
-    if not plus_minus or len(values) != len(axes) or len(sigmas) != len(axes):
+    if len(values) != len(axes) or len(sigmas) != len(axes):
         raise ConfigError(f"{name} must be {expected}, with its standard deviation; got {text!r}")
     prior = {}
     for axis, value, sigma in zip(axes, values, sigmas, strict=True):
-        unit = AXIS_UNITS[axis]
-        prior[axis] = (_quantity(name, value, unit), _quantity(name, sigma, unit))
-        if not prior[axis][1] > 0:
-            raise ConfigError(f"{name} needs a standard deviation above 0; got {text!r}")
-        if unit == "rad" and abs(prior[axis][0]) > 2 * math.pi:
+        prior[axis] = _quantity(name, value, AXIS_UNITS[axis]), _above_0(name, sigma, axis)
+        if AXIS_UNITS[axis] == "rad" and abs(prior[axis][0]) > 2 * math.pi:
             raise ConfigError(
                 f"{name} is in radians unless it says deg; got {value[:20]}: write {value[:20]}deg"
             )
@@ -246,9 +233,7 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
                 f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
                 f"yaw=0.5deg; got {shown_value(word)}"
             )
-        targets[axis] = _quantity(f"{name}: {axis}", value, AXIS_UNITS[axis])
-        if not targets[axis] > 0:
-            raise ConfigError(f"{name} needs targets above 0; got {shown_value(word)}")
+        targets[axis] = _above_0(f"{name}: {axis}", value, axis)
         if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
             raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
     return targets
@@ -262,6 +247,13 @@ def _quantity(name: str, text: str, unit: str) -> float:
     value = float(match[1]) * _IN_SI[unit][match[2] or unit]
     if abs(value) > _LARGEST_QUANTITY:
         raise ConfigError(f"{name} must be at most {_LARGEST_QUANTITY:g} {unit}; got {text[:20]!r}")
+    return value
+
+
+def _above_0(name: str, text: str, axis: str) -> float:
+    value = _quantity(name, text, AXIS_UNITS[axis])
+    if not value > 0:
+        raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(text)}")
     return value
 
 

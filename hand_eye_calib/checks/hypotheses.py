@@ -25,7 +25,6 @@ from hand_eye_calib.checks.findings import Finding, Severity, conventions, findi
 from hand_eye_calib.checks.streams import coarse_poses
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
@@ -152,7 +151,7 @@ class Explanation:
 
 def _misread(trajectory: Trajectory, **convention: str) -> Trajectory:
     """The trajectory with its poses put right, but for its names."""
-    return Trajectory(trajectory.stamps_ns, put_right(trajectory.poses, **convention))
+    return Trajectory(trajectory.stamps_ns, se3.put_right(trajectory.poses, **convention))
 
 
 _reordered = functools.partial(_misread, quaternion="wxyz")

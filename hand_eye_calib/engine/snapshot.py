@@ -14,7 +14,7 @@ from hand_eye_calib.engine.answers import cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
 from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
-from hand_eye_calib.geometry.misread import put_right
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, synchronise
 from hand_eye_calib.results.calibration import Calibration
@@ -255,7 +255,7 @@ def _put_right(poses: "RawPoses | Trajectory", stream: str, config: CalibratorCo
     if (invert, order) != ("none", "xyzw") and trajectory.measures not in needs:
         name = f"{stream}_invert {invert}" if invert != "none" else f"{stream}_quaternion {order}"
         raise ConfigError(f"{name} cannot be: the {stream} measures {trajectory.measures}")
-    right = replace(trajectory, poses=put_right(trajectory.poses, invert, order))
+    right = replace(trajectory, poses=se3.put_right(trajectory.poses, invert, order))
     return right.scaled(config.parent_scale) if stream == "parent" else right
 
 

@@ -327,3 +327,25 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
     """
     step = log(inverse(start) @ end)
     return start @ exp(np.asarray(fraction, dtype=float)[..., None] * step)
+
+
+def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
+    """Poses (N, 4, 4) that were written in another convention than they were read in.
+
+    Parameters
+    ----------
+    Ts : (N, 4, 4) array
+    invert : {"none", "poses", "orientations"}
+        What was written the other way round: of the world in the sensor.
+    quaternion : {"xyzw", "wxyz"}
+        Order in which quaternions were written that were read as x y z w.
+    """
+    if quaternion == "wxyz":
+        quats = np.roll(to_quat_xyzw(Ts), -1, axis=-1)
+        Ts = from_quat_xyzw(Ts[..., :3, 3], quats)
+    if invert == "poses":
+        return inverse(Ts)
+    if invert == "orientations":
+        Ts = Ts.copy()
+        Ts[..., :3, :3] = np.swapaxes(Ts[..., :3, :3], -1, -2)
+    return Ts
