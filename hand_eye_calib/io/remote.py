@@ -43,14 +43,6 @@ def expanded(pattern: str) -> list[str]:
         return sorted(system.unstrip_protocol(found) for found in system.glob(path.rstrip("/")))
 
 
-def states(url: str) -> list[str]:
-    """What the store says of each file of a bag, such as size, date and digest, from which one sees
-    whether it has changed. Raises as :func:`local_copies`.
-    """
-    with _reached(url) as (system, path):
-        return [str(sorted(about.items())) for about in _files(system, path)]
-
-
 @contextmanager
 def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
     """Paths of the same bags on this machine; what is remote is copied for as long as the block

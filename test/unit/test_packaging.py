@@ -135,14 +135,6 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
     assert keys - {DECLARED_AS[name][1] for name in imported} == {"tf2_ros"}
 
 
-def test_keys_that_only_pip_has_are_asked_for_where_pip_may_install():
-    """bloom refuses them, and pip of Ubuntu 24.04 refuses to install without the variable."""
-    conditions = {e.text: e.get("condition") for e in MANIFEST.iter("exec_depend")}
-    with_condition = {key for key, condition in conditions.items() if condition}
-    assert with_condition == {key for key in conditions if key.endswith("-pip")}
-    assert {conditions[key] for key in with_condition} == {"$PIP_BREAK_SYSTEM_PACKAGES == 1"}
-
-
 @pytest.mark.parametrize(
     ("library", "command"),
     [
@@ -165,23 +157,6 @@ def test_without_a_library_of_pip_one_line_says_what_is_missing(library, command
     assert codes == "[0, 0, 1]"
     assert library in line.lower()
     assert "not installed" in line
-
-
-def test_placeholders_are_in_the_manifest_alone(declared):
-    """One domain, reserved for examples, until there is a public repository; docs/release.md."""
-    domain = "hand-eye-calib.example"
-    text = (ROOT / "package.xml").read_text(encoding="utf-8")
-    assert set(re.findall(r"[\w-]+\.example", text)) == {domain}
-    assert all(domain in element.text for element in MANIFEST.iter("url"))
-    assert declared["url"].startswith(f"https://{domain}")
-    elsewhere = [
-        path
-        for pattern in ("*.*", "docs/*.md", ".github/**/*.*", "hand_eye_calib/**/*.py")
-        for path in ROOT.glob(pattern)
-        if path.is_file() and path.name not in ("package.xml", "release.md")
-        if domain.encode() in path.read_bytes()
-    ]
-    assert elsewhere == []
 
 
 def test_links_of_the_readme_are_absolute_on_other_pages(declared):

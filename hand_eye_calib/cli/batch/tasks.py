@@ -70,9 +70,7 @@ class Task:
 
 
 def _state(bag: str) -> list[Any]:
-    if remote.is_url(bag):
-        return remote.states(bag)
-    path = Path(bag)
+    path = Path(bag)  # none of a URL
     files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
     return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
