@@ -16,7 +16,7 @@ from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
-    from hand_eye_calib.live.processes import SessionResult
+    from hand_eye_calib.live.saving import SessionResult
     from hand_eye_calib.rig.result import RigCalibration
 
 REPORT = "report.html"
@@ -112,7 +112,7 @@ def save_text(path: Path, text: str) -> None:
 def write_session() -> None:
     """Write the pages of a session into the directory that is the only argument of this process.
 
-    It reads the result from standard input, as ``live/processes.py`` writes it. The results of
+    It reads the result from standard input, as ``live/saving.py`` writes it. The results of
     further child sensors go to standard output.
     """
     os.nice(15)  # every other program goes first

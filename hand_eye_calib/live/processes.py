@@ -1,4 +1,4 @@
-"""The processes beside the node's: one solves, one writes the report of a session.
+"""The process beside the node's that solves, and how Python code is run in another process.
 
 A thread that solves would share the interpreter with the callbacks: on a slow machine their latency
 rises to a second. The thread here only waits for the pipes.
@@ -11,22 +11,15 @@ import queue
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO, Any
+from collections.abc import Callable
+from typing import Any
 
-from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.live.solving import Answer, Failure, FailureKind, Job
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.text import listing
 
 # Not `-m`: its classes would belong to the module __main__, which the node does not have.
 _SOLVE = "from hand_eye_calib.live.solving import main; main()"
-_REPORT = "from hand_eye_calib.cli.reporting import write_session; write_session()"
 
 # A job hangs that has taken this long (s), and so many times the longest before it: solves grow
 # with their data, but not by that from one to the next, and a slow computer needs seconds for each.
@@ -38,7 +31,7 @@ _LAST_BREATH_S = 1.0
 _NOT_AN_ANSWER = (EOFError, OSError, pickle.UnpicklingError)
 
 
-def _start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Popen[bytes]":
+def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Popen[bytes]":
     """Run Python code with the same modules as here, in a group of its own, which Ctrl-C in the
     terminal leaves alone.
     """
@@ -100,7 +93,7 @@ class SolvingProcess:
         _end(self._process)
 
     def _started(self) -> "subprocess.Popen[bytes]":
-        return _start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        return start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
@@ -155,66 +148,3 @@ def _end(process: "subprocess.Popen[bytes]") -> int:
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
-
-
-@dataclass(frozen=True)
-class SessionResult:
-    """A result of the node, the poses that gave it, and where these came from; whether a report is
-    wanted, and the poses of further child sensors, each with those of the parent.
-    """
-
-    calibration: Calibration
-    snapshot: Snapshot
-    inputs: Mapping[str, Any]
-    with_report: bool = True
-    others: Mapping[str, Snapshot] = field(default_factory=dict)
-
-
-class ReportProcess:
-    """Writes reports in a process that outlives the node, one at a time: the newest counts."""
-
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._answer: IO[bytes] | None = None
-
-    def write(self, directory: Path, result: SessionResult) -> str:
-        """Start to write the files into a directory, which takes milliseconds; returns a sentence
-        about that.
-
-        The result is handed over in a file that has no name: nobody else can change it, and no
-        pipe has to be waited for at the end of the node.
-        """
-        self.stop()
-        files = ["report.html"] * result.with_report + ["rig/"] * bool(result.others)
-        try:
-            answer = tempfile.TemporaryFile()  # noqa: SIM115
-            with tempfile.TemporaryFile() as file:
-                pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
-                file.seek(0)
-                where = str(directory.resolve())
-                self._process = _start(_REPORT, where, stdin=file, stdout=answer)
-        except OSError as error:  # a full temporary directory, or no process can be started
-            return f"{listing(files)} cannot be written: {error.strerror}"
-        self._answer = answer if result.others else None
-        return f"{listing(files)} follow{'s' * (len(files) == 1)}"
-
-    def stop(self) -> None:
-        """End the process: what it writes is out of date."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-        self._process = self._answer = None
-
-    def forget(self) -> None:
-        """A new session has begun: results of the one before are of no use."""
-        self._answer = None
-
-    def take_others(self) -> list[Calibration]:
-        """Results of further child sensors in their order, once, when they are there."""
-        if self._answer is None or self._process is None or self._process.poll() is None:
-            return []
-        with self._answer as answer:
-            self._answer = None
-            answer.seek(0)
-            found: list[Calibration] = pickle.load(answer) if self._process.returncode == 0 else []
-            return found

@@ -55,25 +55,11 @@ def extrinsic_state(
     steady_s, clock_ns
         Steady time, and the node's clock, 0 if it does not run yet.
     """
-    seen, result, failure = cycle.seen, cycle.result, cycle.failure
-    age_s, said = cycle.age_s(steady_s), failure.what if failure else ""
-    broadcast, why = tf_static
-    # The gravest that applies is first.
-    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
-        level, text = Level.ERROR, f"the solve failed unexpectedly, see the log: {said}"
-    elif not accepts_poses:
-        level, text = Level.WARN, "not accepting poses: call ~/set_enabled to go on"
-    elif result is None:
-        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
-        level, text = Level.WARN, "; ".join(filter(None, (*faults, said))) or "no result yet"
-    elif broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
-        level, text = Level.WARN, f"publish_tf is refused: {why}"
-    elif waited_for_s is not None and age_s > max(_STALE_S, _STALE_PERIODS * waited_for_s):
-        text = ": ".join(filter(None, (f"the result is {age_s:.0f} s old", said)))
-        level = Level.WARN
-    else:
-        level = Level.OK if result.verdict is Verdict.USE else Level.WARN
-        text = result.headline
+    seen, result, age_s = cycle.seen, cycle.result, cycle.age_s(steady_s)
+    is_stale = waited_for_s is not None and age_s > max(_STALE_S, _STALE_PERIODS * waited_for_s)
+    refused = tf_static[1] if tf_static[0] is Broadcast.REFUSED else ""
+    stale = f"the result is {age_s:.0f} s old" if is_stale else ""
+    level, text = _judged(cycle, accepts_poses, refused, stale)
     return ExtrinsicState(
         level=level,
         text=text,
@@ -87,10 +73,28 @@ def extrinsic_state(
         rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True))
         if seen
         else {},
-        tf_static=broadcast,
-        tf_static_reason=why,
+        tf_static=tf_static[0],
+        tf_static_reason=tf_static[1],
         result=_result_state(result, age_s, clock_ns) if result else None,
     )
+
+
+def _judged(cycle: SolveCycle, accepts_poses: bool, refused: str, stale: str) -> tuple[Level, str]:
+    """Level and message: the gravest that applies."""
+    result, failure = cycle.result, cycle.failure
+    said = failure.what if failure else ""
+    if failure is not None and failure.kind is FailureKind.UNEXPECTED:
+        return Level.ERROR, f"the solve failed unexpectedly, see the log: {said}"
+    if not accepts_poses:
+        return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
+    if result is None:
+        faults = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in cycle.checks.faults()[:1]]
+        return Level.WARN, "; ".join(filter(None, (*faults, said))) or "no result yet"
+    if refused and result.verdict is not Verdict.DO_NOT_USE:
+        return Level.WARN, f"publish_tf is refused: {refused}"
+    if stale:
+        return Level.WARN, ": ".join(filter(None, (stale, said)))
+    return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
 
 
 def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultState:

@@ -93,14 +93,8 @@ class CalibratorNode(Node):
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
-        self._cycle = SolveCycle(
-            self._session,
-            self._log,
-            self._answered.trigger,
-            self._robot.complete,
-            self._publish_result,
-            config.targets,
-        )
+        hooks = self._answered.trigger, self._robot.complete, self._publish_result
+        self._cycle = SolveCycle(self._session, self._log, *hooks, config.targets)
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
         self._start_timers()

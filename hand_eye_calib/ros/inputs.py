@@ -45,17 +45,8 @@ def _quick() -> QoSProfile:
 
 
 class TopicInput(PoseInput):
-    """Subscribes to the poses of one sensor.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    name : str
-        "parent", "child", or one of :func:`~hand_eye_calib.config.other_names`.
-    wanted_type : str
-        Message type, or "auto" for that of the publishers.
-    parts : (session, log, clock_ns, on_jump_back)
-        As of :class:`~hand_eye_calib.live.input.PoseInput`.
+    """Subscribes to the poses of one sensor: to messages of the wanted type, or "auto" for that of
+    the publishers. The parts are those of :class:`~hand_eye_calib.live.input.PoseInput`.
     """
 
     def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
@@ -160,15 +151,8 @@ class TopicInput(PoseInput):
 
 
 class TfInput(PoseInput):
-    """Takes the poses of one sensor from the transform tree, on ``/tf`` and ``/tf_static``.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    name : {"parent", "child"}
-    source : TfSource
-    parts : (session, log, clock_ns, on_jump_back)
-        As of :class:`~hand_eye_calib.live.input.PoseInput`.
+    """Takes the poses of one sensor, parent or child, from ``/tf`` and ``/tf_static``. The parts
+    are those of :class:`~hand_eye_calib.live.input.PoseInput`.
     """
 
     def __init__(self, node: Node, name: str, source: TfSource, parts: Parts) -> None:

@@ -74,17 +74,8 @@ def needs_tf(options: NodeConfig) -> str:
 
 
 class RobotTree(FrameTree):
-    """The edges that others broadcast; of two parents of a frame the first counts.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    log : NodeLog
-
-    Attributes
-    ----------
-    own : deque of TransformStamped
-        What this node has broadcast itself, which is not heard.
+    """The edges that others broadcast; of two parents of a frame the first counts. ``own`` is what
+    this node has broadcast itself, which is not heard.
     """
 
     def __init__(self, node: Node, log: NodeLog) -> None:
@@ -135,15 +126,8 @@ class RobotTree(FrameTree):
 
 
 class Robot:
-    """Completes results with what is installed, and with the pose in the base frame.
-
-    Parameters
-    ----------
-    log : NodeLog
-    options : NodeConfig
-        Its ``installed`` and ``base_frame`` do not change while the node runs.
-    frames : FrameTree
-        The robot's.
+    """Completes results with what is installed, and with the pose in the base frame, from the
+    robot's own frames. These two options do not change while the node runs.
 
     Attributes
     ----------
@@ -227,12 +211,6 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
 class TfBroadcaster:
     """Broadcasts the result of a session that has reached its goal on ``/tf_static`` while that is
     switched on.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    log : NodeLog
-    tree : RobotTree
     """
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:

@@ -34,12 +34,7 @@ _PATIENCE_S = 60.0
 
 
 class Watcher:
-    """Fills a board with what the nodes say; a context manager.
-
-    Parameters
-    ----------
-    board : Board
-    """
+    """Fills a board with what the nodes say; a context manager."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
