@@ -161,11 +161,10 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     with _single_keys(), Live(console=console, screen=True, auto_refresh=False) as live:
 
         def show(view: "View", shows_code: bool) -> None:
-            width, height = console.size
-            if shown != [(view, width, height, shows_code)]:
-                of_view = screen(view, width, height, footer)
+            if shown != [(view, console.size, shows_code)]:
+                of_view = screen(view, console.width, footer)
                 live.update(Text.from_ansi(code) if code and shows_code else of_view, refresh=True)
-                shown[:] = [(view, width, height, shows_code)]
+                shown[:] = [(view, console.size, shows_code)]
 
         yield show
 

@@ -17,40 +17,30 @@ _STYLES = {
 }
 _BAR_CELLS = 16
 
-# Narrower terminals do without the column of differences; lower ones without empty lines.
-_WIDE, _HIGH = 76, 30
+# Narrower terminals do without the last column.
+_WIDE = 76
 
 KEYS, WATCHING_KEYS = "s solve   w save   r reset   q quit", "q quit"
 
 
-def screen(view: View, width: int, height: int, footer: str = "") -> RenderableType:
-    """The whole view; what is most important comes first, if the terminal is too low for it.
-
-    Parameters
-    ----------
-    view : View
-    width, height : int
-        Columns and rows of the terminal.
-    footer : str
-        Such as the address of the page.
+def screen(view: View, width: int, footer: str = "") -> RenderableType:
+    """The whole view, on a terminal of so many columns; what is most important comes first, if it
+    is too low for all. The footer is such as the address of the page.
     """
     head = Text.assemble((f" {view.tone.value} {view.word} ", f"reverse {_STYLES[view.tone]}"))
-    space = [Text()] * (height >= _HIGH)
     parts: list[RenderableType] = [head, Text(view.sentence, style="bold")]
-    parts += [Text(view.facts, style="dim"), *space] if view.facts else space
-    if view.answer is not None:
-        parts += [_lines((view.answer,)), *space]
+    parts += [Text(view.facts, style="dim")] * bool(view.facts)
+    parts += [_lines((view.answer,))] if view.answer is not None else []
     parts += [Text(f"    {topic}") for topic in view.topics]
     if view.bars:
         values = Table.grid(padding=(0, 3))  # x, y, z above roll, pitch, yaw
         texts = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
         for row in (texts[:3], texts[3:]):
             values.add_row(*row)
-        parts += [_bars(view, width), *space, Text(view.title, style="dim")]
-        parts += [values, *space] if texts else space
+        parts += [_bars(view, width), Text(view.title, style="dim"), values]
     if view.watched:
         title = Text("the mount, after ten minutes of motion", style="dim")
-        parts += [title, _lines(view.watched), *space]
+        parts += [title, _lines(view.watched)]
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
     keys = KEYS if view.bars else WATCHING_KEYS
@@ -61,15 +51,12 @@ def screen(view: View, width: int, height: int, footer: str = "") -> RenderableT
 
 
 def _bars(view: View, width: int) -> Table:
-    is_wide = width >= _WIDE
-    table = Table.grid(padding=(0, 2 if is_wide else 1))
-    has_installed = any(bar.difference for bar in view.bars)
+    table = Table.grid(padding=(0, 1))
     for bar in view.bars:
         style = _STYLES[bar.tone]
         drawn = ProgressBar(1.0, bar.share, _BAR_CELLS, complete_style=style, finished_style=style)
         sign = Text(f"{bar.tone.value} {bar.word}", style=style)
-        more = [Text(bar.difference)] * (is_wide and has_installed)
-        more += [Text(bar.meaning)] * (is_wide and not has_installed)
+        more = [Text(bar.difference or bar.meaning)] * (width >= _WIDE)
         table.add_row(Text(bar.name, style="bold"), drawn, sign, Text(bar.against), *more)
     return table
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from faults import inverted, reordered
-from ros_harness import LATCHED, RELIABLE_INPUTS, START_NS, drive, message
+from ros_harness import LATCHED, RELIABLE_INPUTS, drive, message
 from std_msgs.msg import String
 
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.live.state import Level
@@ -101,22 +100,6 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
     assert all(result.pose_sigma[axis] < 1e-3 for axis in "xyz")
     assert 0 <= result.age_s < 60
     assert (good.journal.level, good.journal.directory) == (Level.OK, str(tmp_path / "journal"))
-
-
-def test_flat_ground_is_said_in_one_sentence_and_zeros_are_no_result(start_node, peer, state):
-    start_node("-p solve_period:=0.2", *RELIABLE_INPUTS)
-    stamps_ns, _, _ = drive()
-    s = (stamps_ns - START_NS) * 1e-9
-    flat = se3.from_rotation_translation(
-        se3.rotation_exp(np.outer(np.arctan(0.5 * np.cos(0.5 * s)), [0, 0, 1])),
-        np.stack([s, np.sin(0.5 * s), 0 * s], axis=1),
-    )
-    noise = se3.exp(np.random.default_rng(0).normal(size=(2, len(s), 6)) * 1e-3)
-    peer.feed(peer.publishers(), stamps_ns, flat @ noise[0], flat @ noise[1])
-    found = state(lambda each: "all but z" in each.extrinsic.text)
-    assert found.extrinsic.level is Level.WARN
-    assert found.extrinsic.text.startswith("USE WITH CARE: all but z; measure z by hand")
-    assert (found.extrinsic.result.pose["z"], found.extrinsic.result.pose_sigma["z"]) == (None,) * 2
 
 
 def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):

@@ -168,12 +168,6 @@ class TestRefusedInput:
         peer.wait_matched(peer.publisher(Imu, "child_odom"))
         assert "Traceback" not in node.log
 
-    def test_a_qos_that_does_not_exist(self, start_node, peer):
-        node = start_node(QUIET[0], f"-p {QOS_OF_PARENT}:=relyable")
-        peer.publisher(Odometry, "parent_odom")
-        node.wait_for_log("cannot subscribe to /parent_odom with the QoS overrides", "`relyable`")
-        peer.wait_matched(peer.publisher(Odometry, "child_odom"))
-
     def test_positions_where_the_mount_is_watched(self, start_node, peer):
         node = start_node("-p monitor:=true", "-p installed:=1 0 0 0 0 0")
         peer.publisher(NavSatFix, "child_odom")
