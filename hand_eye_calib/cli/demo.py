@@ -18,14 +18,13 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.cli.console import note, waiting_for
 from hand_eye_calib.cli.options import add_json_argument, at_least
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
     from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
@@ -54,12 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="directory for the bag, the node's log and report.html; those of an earlier demo are "
         "replaced. Default: demo_output",
     )
-    parser.add_argument(
-        "--seed",
-        type=at_least(0),
-        default=0,
-        help="another seed gives another recording. Default: 0",
-    )
+    seed = "another seed gives another recording. Default: 0"
+    parser.add_argument("--seed", type=at_least(0), default=0, help=seed)
     add_json_argument(parser)
 
 
@@ -68,69 +63,47 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.cli.present import exit_code, show
     from hand_eye_calib.cli.reading import read_bags
     from hand_eye_calib.cli.reporting import write_report
+    from hand_eye_calib.io.bags import PoseBag, write_bag
     from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import simulate_drive
 
     with waiting_for("simulating"):
         drive = simulate_drive(arguments.seed, DRIVE, REALISTIC)
-        bag_path = _write_bag(arguments.out, drive)
+        bag_path = arguments.out / "demo_bag"
+        if bag_path.is_dir():
+            shutil.rmtree(bag_path)
+        streams = zip(TOPICS.values(), (drive.parent, drive.child), strict=True)
+        write_bag(bag_path, {topic: (each, "nav_msgs/msg/Odometry") for topic, each in streams})
     note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
     recording = read_bags([bag_path], TOPICS, CalibratorConfig())
     offline = recording.snapshot.estimate()
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
-    with waiting_for("playing"):
-        live = _play(Player, bag_path, arguments.out / "node.log", offline.stamp_ns)
+    # Simulated odometry stays away from robots on the network.
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    # From 102 on the ports overlap with those that Linux gives to clients.
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    node = _node(arguments.out / "node.log")
+    with waiting_for("playing"), node as check, Player(TOPICS, check) as player:
+        with PoseBag(bag_path) as bag:
+            player.play(bag.blocks(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
+        online = player.wait_for_extrinsic(offline.stamp_ns)
     note("3/4 calibrated live; the report follows")
-    document = _document(drive, bag_path, offline, live)
+    document = _document(drive, offline, online) | {"bag": str(bag_path)}
 
     def finish() -> None:
         write_report(arguments.out, offline, recording.snapshot, recording.inputs)
         note(f"4/4 done; everything is in {arguments.out}")
 
-    errors = []
-    if max(document["agreement"].values()) > AGREEMENT:
-        errors = [
-            f"offline and online differ by more than {AGREEMENT}: {document['agreement']}; "
-            "the same messages must give the same"
-        ]
+    differs = max(document["agreement"].values()) > AGREEMENT
+    error = f"offline and online differ by {document['agreement']}: they must give the same"
     return show(
         arguments,
         lambda: document,
         lambda: "\n".join(_lines(document)),
         finish=finish,
-        errors=errors,
-        code=1 if errors else exit_code(offline),
+        errors=[error] * differs,
+        code=1 if differs else exit_code(offline),
     )
-
-
-def _write_bag(out: Path, drive: "SimulatedDrive") -> Path:
-    from hand_eye_calib.io.bags import write_bag
-
-    path = out / "demo_bag"
-    try:
-        if path.is_dir():
-            shutil.rmtree(path)
-    except OSError as error:
-        raise InputError(
-            f"cannot replace {path}: {error.strerror}; remove it or choose another directory with "
-            "--out"
-        ) from None
-    streams = zip(TOPICS.values(), (drive.parent, drive.child), strict=True)
-    write_bag(path, {topic: (stream, "nav_msgs/msg/Odometry") for topic, stream in streams})
-    return path
-
-
-def _play(player_type: "type[Player]", bag_path: Path, log_path: Path, stamp_ns: int) -> Any:
-    """Play the bag to the node; returns its result for the stamp."""
-    from hand_eye_calib.io.bags import PoseBag
-
-    # Simulated odometry stays away from robots on the network.
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # From 102 on the ports overlap with those that Linux gives to clients.
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    with _node(log_path) as check, player_type(TOPICS, check) as player, PoseBag(bag_path) as bag:
-        player.play(bag.blocks(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
-        return player.wait_for_extrinsic(stamp_ns)
 
 
 @contextmanager
@@ -143,8 +116,6 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
         # At this speed best effort might lose messages, and the results of the same messages are
         # compared.
         command += ["-p", f"qos_overrides.{topic}.subscription.reliability:=reliable"]
-    with log_path.open("wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
     def check() -> None:
         if process.poll() is not None:
@@ -152,54 +123,44 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
                 f"the node ended with exit code {process.returncode}; see {log_path}"
             )
 
-    try:
-        yield check
-        process.send_signal(signal.SIGINT)
-        if process.wait(_STOP_S) != 0:
-            check()  # says so
-    finally:
-        if process.poll() is None:
+    with (
+        log_path.open("wb") as log,
+        subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT) as process,
+    ):
+        try:
+            yield check
+            process.send_signal(signal.SIGINT)
+            if process.wait(_STOP_S) != 0:
+                check()  # says so
+        finally:
             process.kill()
-            process.wait()
 
 
-def _document(
-    drive: "SimulatedDrive", bag_path: Path, offline: "Calibration", live: Any
-) -> dict[str, Any]:
-    frames = {"parent_frame": offline.parent_frame, "child_frame": offline.child_frame}
-    if (live.parent_frame, live.child_frame) != (offline.parent_frame, offline.child_frame):
-        raise HandEyeCalibError(
-            f"the node's result is of {live.child_frame} in {live.parent_frame}, the replay's of "
-            f"{frames}"
-        )
+def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> dict[str, Any]:
+    """The truth, both results, and how far they are from it and from each other."""
     truth = drive.T_parent_child
-    found = {"offline": offline, "online": live}
-    estimates = {
-        name: _both_directions(each.T_parent_child)
-        | {"error": _difference(each.T_parent_child, truth), "stamp_ns": each.stamp_ns}
-        for name, each in found.items()
-    }
-    return {
-        **frames,
-        "bag": str(bag_path),
+    document: dict[str, Any] = {
+        "parent_frame": offline.parent_frame,
+        "child_frame": offline.child_frame,
         "poses": {"parent": len(drive.parent), "child": len(drive.child)},
         "verdict": offline.verdict.value,
         "headline": offline.headline,
         "status": offline.status.value,
         "reference": offline.reference,
         "truth": _both_directions(truth),
-        **estimates,
-        "agreement": _difference(live.T_parent_child, offline.T_parent_child),
+        "agreement": _difference(online.T_parent_child, offline.T_parent_child),
     }
+    for name, each in (("offline", offline), ("online", online)):
+        document[name] = _both_directions(each.T_parent_child) | {"stamp_ns": each.stamp_ns}
+        document[name]["error"] = _difference(each.T_parent_child, truth)
+    return document
 
 
 def _both_directions(T_parent_child: "FloatArray") -> dict[str, Any]:
     from hand_eye_calib.geometry import se3
 
-    return {
-        "T_parent_child": T_parent_child.tolist(),
-        "T_child_parent": se3.inverse(T_parent_child).tolist(),
-    }
+    inverse = se3.inverse(T_parent_child)
+    return {"T_parent_child": T_parent_child.tolist(), "T_child_parent": inverse.tolist()}
 
 
 def _difference(T_parent_child: "FloatArray", other: "FloatArray") -> dict[str, float]:
@@ -227,11 +188,7 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"  {title:<24}{position}{'':10}{degrees}"
     yield f"Error of the pose of {child} in {parent}"
     for row in ("offline", "online"):
-        error = document[row]["error"]
-        metres, radians = error["translation_m"], error["rotation_rad"]
+        metres, radians = document[row]["error"].values()
         yield f"  {_ROWS[row]:<24}{length(metres):>10} {angle(radians):>14}"
-    agreement = document["agreement"]
-    yield (
-        f"Offline and online differ by {agreement['translation_m']:.1e} m and "
-        f"{math.degrees(agreement['rotation_rad']):.1e} deg"
-    )
+    metres, radians = document["agreement"].values()
+    yield f"Offline and online differ by {metres:.1e} m and {math.degrees(radians):.1e} deg"

@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import with_progress
 from hand_eye_calib.cli.options import add_json_argument, at_least
@@ -19,12 +18,10 @@ from hand_eye_calib.simulation.options import (
 )
 from hand_eye_calib.text import counted
 
-if TYPE_CHECKING:
-    from hand_eye_calib.simulation.drive import SimulatedDrive
-
 # The layout of the published simulations: sensor 1 is the parent.
 PARENT_FILE, CHILD_FILE, TRUTH_FILE = "T_S1_W1.txt", "T_S2_W2.txt", "T_S2_S1.txt"
 PARENT_TOPIC, CHILD_TOPIC = "/parent/odometry", "/child/odometry"
+_TYPE = "nav_msgs/msg/Odometry"
 
 _DRIVES = {"published": PUBLISHED_DRIVE, "hilly": HILLY_DRIVE}
 _NOISE_OPTIONS = {"noise": "gaussian", "outliers": "outliers", "drift": "drift"}
@@ -88,52 +85,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write; returns the exit code."""
+    from hand_eye_calib.geometry.trajectory import Trajectory
+    from hand_eye_calib.io.trajectory_files import write_trajectory
     from hand_eye_calib.simulation.drive import simulate_drive
 
     config, noise = _configs(arguments)
     _make_empty(arguments.out)
     digits = max(2, len(str(arguments.runs)))
     folders = [arguments.out / f"run_{number:0{digits}}" for number in range(1, arguments.runs + 1)]
-    shown = with_progress(enumerate(folders), len(folders), "simulating")
-    for number, folder in shown:
-        write_drive(folder, simulate_drive((arguments.seed, number), config, noise), arguments.bag)
+    for number, folder in with_progress(enumerate(folders), len(folders), "simulating"):
+        drive = simulate_drive((arguments.seed, number), config, noise)
+        _make_empty(folder)
+        write_trajectory(folder / PARENT_FILE, drive.parent)
+        write_trajectory(folder / CHILD_FILE, drive.child)
+        truth = Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
+        write_trajectory(folder / TRUTH_FILE, truth)
+        streams = {PARENT_TOPIC: (drive.parent, _TYPE), CHILD_TOPIC: (drive.child, _TYPE)}
+        if arguments.bag:
+            from hand_eye_calib.io.bags import write_bag
+
+            name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
+            write_bag(folder / name, streams, arguments.bag)
     if arguments.json:
-        settings = {
-            "seed": arguments.seed,
-            "drive": config.to_options(),
-            "noise": noise.to_options(),
-        }
-        print(json.dumps({"runs": [str(folder) for folder in folders], **settings}, indent=2))
+        document = {"runs": [str(folder) for folder in folders], "seed": arguments.seed}
+        document |= {"drive": config.to_options(), "noise": noise.to_options()}
+        print(json.dumps(document, indent=2))
     else:
         print(f"{counted(len(folders), 'recording')} written to {arguments.out}")
     return 0
-
-
-def write_drive(folder: Path, drive: "SimulatedDrive", bag: str | None = None) -> None:
-    """Write a SimulatedDrive into a new folder; ``bag`` is the storage of a bag to write as well:
-    mcap, sqlite3 or rosbag1.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    from hand_eye_calib.geometry.trajectory import Trajectory
-    from hand_eye_calib.io.trajectory_files import write_trajectory
-
-    _make_empty(folder)
-    write_trajectory(folder / PARENT_FILE, drive.parent)
-    write_trajectory(folder / CHILD_FILE, drive.child)
-    truth = Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
-    write_trajectory(folder / TRUTH_FILE, truth)
-    if bag:
-        from hand_eye_calib.io.bags import write_bag
-
-        streams = {
-            topic: (stream, "nav_msgs/msg/Odometry")
-            for topic, stream in ((PARENT_TOPIC, drive.parent), (CHILD_TOPIC, drive.child))
-        }
-        write_bag(folder / ("bag.bag" if bag == "rosbag1" else "bag"), streams, bag)
 
 
 def _configs(arguments: argparse.Namespace) -> tuple[DriveConfig, NoiseConfig]:
@@ -147,14 +126,8 @@ def _configs(arguments: argparse.Namespace) -> tuple[DriveConfig, NoiseConfig]:
 
 
 def _make_empty(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        occupied = any(folder.iterdir())
-    except OSError as error:
-        raise InputError(
-            f"cannot make directory {folder}: {error.strerror}; choose another with --out"
-        ) from None
-    if occupied:
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.iterdir()):
         raise InputError(
             f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another "
             "with --out"

@@ -18,7 +18,6 @@ from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.watch.board import Board, View
-    from hand_eye_calib.watch.web import WebServer
 
 EXAMPLES = """\
 examples:
@@ -74,10 +73,11 @@ def run(arguments: argparse.Namespace) -> int:
         signal.signal(number, lambda signum, _: came.append(signum))
     with (
         Watcher(board) as watcher,
-        _web(arguments, board, requests) as server,
-        _display(server.addresses()[0] if server else "") as show,
+        _web(arguments, board, requests) as address,
+        _keyboard() as keys,
+        _display(address) as show,
     ):
-        session = Session(board, requests, _keys)
+        session = Session(board, requests, keys)
         while not came and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
@@ -99,10 +99,7 @@ class Session:
     """
 
     def __init__(
-        self,
-        board: "Board",
-        requests: "queue.SimpleQueue[str]",
-        keys: Callable[[], str],
+        self, board: "Board", requests: "queue.SimpleQueue[str]", keys: Callable[[], str]
     ) -> None:
         self.is_over = self.shows_code = False
         self._board, self._requests, self._keys = board, requests, keys
@@ -111,9 +108,9 @@ class Session:
     def view(self) -> "View":
         """Do what was typed, and make the view."""
         now_s = time.monotonic()
-        view = self._board.view(now_s)
+        buttons = self._board.view(now_s).buttons
         for key in self._keys():
-            self._press(key, now_s, view.buttons)
+            self._press(key, now_s, buttons)
         return self._board.view(now_s)
 
     def _press(self, key: str, now_s: float, buttons: tuple[str, ...]) -> None:
@@ -140,7 +137,6 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     """Function that shows a view, or the code of the page's address: on the screen of a terminal,
     or in lines for a file or a pipe.
     """
-    from rich.console import Console
     from rich.live import Live
     from rich.text import Text
 
@@ -156,15 +152,16 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
         yield write
         return
     code = qr_code(address)
-    footer = f"p QR code   phone: {address}" if code else f"phone: {address}" if address else ""
-    console, shown = Console(), list[tuple[object, ...]]()
-    with _single_keys(), Live(console=console, screen=True, auto_refresh=False) as live:
+    footer = f"{'p QR code   ' * bool(code)}phone: {address}" if address else ""
+    shown: list[tuple[object, ...]] = []
+    with Live(screen=True, auto_refresh=False) as live:
 
         def show(view: "View", shows_code: bool) -> None:
-            if shown != [(view, console.size, shows_code)]:
-                of_view = screen(view, console.width, footer)
+            size = live.console.size
+            if shown != [(view, size, shows_code)]:
+                of_view = screen(view, size.width, footer)
                 live.update(Text.from_ansi(code) if code and shows_code else of_view, refresh=True)
-                shown[:] = [(view, console.size, shows_code)]
+                shown[:] = [(view, size, shows_code)]
 
         yield show
 
@@ -181,47 +178,38 @@ def qr_code(address: str) -> str:
     return drawn.getvalue()
 
 
-def _is_terminal() -> bool:
-    return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def _keys() -> str:
-    """The keys pressed since the last call."""
-    pressed = ""
-    while _is_terminal() and select.select([sys.stdin], [], [], 0)[0]:
-        read = os.read(sys.stdin.fileno(), 64).decode(errors="replace")
-        if not read:
-            break
-        pressed += read
-    return pressed
-
-
 @contextlib.contextmanager
-def _single_keys() -> Iterator[None]:
-    """Give keys at once, without Enter and without showing them."""
-    if not sys.stdin.isatty():
-        yield
+def _keyboard() -> Iterator[Callable[[], str]]:
+    """Function that gives the keys pressed since its last call, at once, without Enter and without
+    showing them; none unless a person sits at a terminal.
+    """
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        yield str
         return
     import termios
     import tty
 
+    def pressed() -> str:
+        keys = b""
+        while select.select([sys.stdin], [], [], 0)[0] and (read := os.read(0, 64)):
+            keys += read
+        return keys.decode(errors="replace")
+
     before = termios.tcgetattr(sys.stdin)
     try:
         tty.setcbreak(sys.stdin)
-        yield
+        yield pressed
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
 @contextlib.contextmanager
 def _web(
-    arguments: argparse.Namespace,
-    board: "Board",
-    requests: "queue.SimpleQueue[str]",
-) -> "Iterator[WebServer | None]":
-    """The server of the page, if it is wanted."""
+    arguments: argparse.Namespace, board: "Board", requests: "queue.SimpleQueue[str]"
+) -> Iterator[str]:
+    """Serve the page, if it is wanted; yields its address."""
     if arguments.web is None:
-        yield None
+        yield ""
         return
     from hand_eye_calib.watch.web import WebServer
 
@@ -229,7 +217,7 @@ def _web(
     try:
         for address in server.addresses():
             note(f"open {address} in a browser")
-        yield server
+        yield server.addresses()[0]
     finally:
         server.stop()
 
