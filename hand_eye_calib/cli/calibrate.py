@@ -54,91 +54,61 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ".db3 or .bag file, or the URL of one, as s3://..., of which several are the parts of one "
         "recording; or the journal of a node's session, or the output directory that holds it",
     )
-    parser.add_argument(
-        "--topics",
-        metavar="TOPIC",
-        nargs="+",
-        help="poses of three sensors or more, or frames as odom:lidar: all are solved together, in "
-        "the frame of the first",
+    add = parser.add_argument
+    topics = (
+        "poses of three sensors or more, or frames as odom:lidar: all are solved together, in the "
+        "frame of the first"
     )
-    parser.add_argument(
-        "--list",
-        action="store_true",
-        help="show the bag's topics with types, counts, rates and frames, and exit",
+    add("--topics", metavar="TOPIC", nargs="+", help=topics)
+    listing = "show the bag's topics with types, counts, rates and frames, and exit"
+    add("--list", action="store_true", help=listing)
+    order = (
+        "none: the poses of two files are stops without an order, paired by their rows. So are the "
+        "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
     )
-    parser.add_argument(
-        "--order",
-        choices=("time", "none"),
-        default="time",
-        help="none: the poses of two files are stops without an order, paired by their rows. So "
-        "are the samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH",
-    )
-    _add_images_and_many(parser)
+    add("--order", choices=("time", "none"), default="time", help=order)
     add_config_arguments(parser)
     add_output_arguments(parser)
-    robot = parser.add_argument_group("what is installed")
-    robot.add_argument(
-        "--installed",
-        metavar="SOURCE",
-        help="compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
-        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad',
-    )
-    robot.add_argument(
-        "--base-frame",
-        metavar="FRAME",
-        help="state the child's pose in this frame too, as the URDF of --installed or the bag's "
-        "/tf_static has it",
-    )
-
-
-def _add_images_and_many(parser: argparse.ArgumentParser) -> None:
-    images = parser.add_argument_group("images of a target, one for each pose of a hand")
-    images.add_argument(
-        "--target",
-        metavar="TARGET",
-        help="what the images of the folder show, the second PATH: such as "
+    add = parser.add_argument_group("images of a target, one for each pose of a hand").add_argument
+    target = (
+        "what the images of the folder show, the second PATH: such as "
         "charuco:5x7:0.04:0.03:4X4_50 (squares, side of a square and of a marker in m, markers) or "
-        "aprilgrid:6x6:0.088:0.0264 (tags, side of a tag, gap)",
+        "aprilgrid:6x6:0.088:0.0264 (tags, side of a tag, gap)"
     )
-    images.add_argument(
-        "--camera",
-        metavar="FILE",
-        type=Path,
-        help="its intrinsics: YAML of camera_info, of Kalibr or of OpenCV",
+    add("--target", metavar="TARGET", help=target)
+    camera = "its intrinsics: YAML of camera_info, of Kalibr or of OpenCV"
+    add("--camera", metavar="FILE", type=Path, help=camera)
+    _add_many(parser)
+    add = parser.add_argument_group("what is installed").add_argument
+    installed = (
+        "compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
+        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
     )
-    batch = parser.add_argument_group("many recordings")
-    batch.add_argument(
-        "--batch",
-        metavar="FILE",
-        nargs="+",
-        help="YAML file with a list of bags, each with its own options; or bags, or patterns of "
-        "bags in quotes, such as 'fleet/**'",
+    add("--installed", metavar="SOURCE", help=installed)
+    base_frame = (
+        "state the child's pose in this frame too, as the URDF of --installed or the bag's "
+        "/tf_static has it"
     )
-    batch.add_argument(
-        "--vehicle",
-        metavar="PATTERN",
-        help="the vehicle's name, or its place in the paths of --batch, such as "
-        "'fleet/{vehicle}/*': recordings of one vehicle are put together",
+    add("--base-frame", metavar="FRAME", help=base_frame)
+
+
+def _add_many(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("many recordings").add_argument
+    batch = "bags, or patterns of bags in quotes, such as 'fleet/**'"
+    add("--batch", metavar="BAG", nargs="+", help=batch)
+    vehicle = (
+        "the vehicle's name, or its place in the paths of --batch, such as 'fleet/{vehicle}/*': "
+        "recordings of one vehicle are put together"
     )
-    batch.add_argument(
-        "--pairs",
-        action="store_true",
-        help="the PATHs are trajectory files, parent and child by turns, of several recordings",
-    )
-    batch.add_argument(
-        "--no-report", action="store_true", help="no page for each recording: they take most time"
-    )
-    batch.add_argument(
-        "--jobs",
-        metavar="N",
-        type=at_least(1),
-        help="number of worker processes. Default: one for each core",
-    )
-    batch.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        help="use a Dask cluster instead: address of its scheduler, tcp://...",
-    )
+    add("--vehicle", metavar="PATTERN", help=vehicle)
+    pairs = "the PATHs are trajectory files, parent and child by turns, of several recordings"
+    add("--pairs", action="store_true", help=pairs)
+    no_report = "no page for each recording: they take most time"
+    add("--no-report", action="store_true", help=no_report)
+    jobs = "number of worker processes. Default: one for each core"
+    add("--jobs", metavar="N", type=at_least(1), help=jobs)
+    dask = "use a Dask cluster instead: address of its scheduler, tcp://..."
+    add("--dask", metavar="ADDRESS", help=dask)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -157,9 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.cli.batch.tasks import matching
 
         arguments.paths = [
-            type(path)(found)
-            for path in arguments.paths
-            for found in matching(str(path)) or [str(path)]
+            type(path)(found) for path in arguments.paths for found in matching(str(path))
         ]
     with local_copies(arguments.paths) as (arguments.paths, as_given):
         return _run_here(arguments, as_given)

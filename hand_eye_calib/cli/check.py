@@ -3,10 +3,16 @@
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import STREAMS, note, typed_options, waiting_for, with_progress
+from hand_eye_calib.cli.console import (
+    STREAMS,
+    note,
+    print_result,
+    typed_options,
+    waiting_for,
+    with_progress,
+)
 from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
@@ -19,15 +25,14 @@ from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
-    from hand_eye_calib.checks.check import CheckResult
     from hand_eye_calib.checks.findings import Finding
     from hand_eye_calib.checks.streams import StreamSummary
     from hand_eye_calib.geometry.trajectory import Trajectory
 
-EXAMPLES = """\
+_EPILOG = """\
 examples:
   hand_eye_calib check my_bag
-  hand_eye_calib check my_bag --parent-topic /lidar/odometry --child-topic /vio --out checked
+  hand_eye_calib check my_bag --parent-topic /lidar/odometry --child-topic /vio
   hand_eye_calib check lidar.txt camera.txt
   hand_eye_calib check lidar.txt gnss.csv"""
 
@@ -37,15 +42,9 @@ _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rot
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] PATH ..."
-    parser.epilog = EXAMPLES
+    parser.epilog = _EPILOG
     add_input_arguments(parser, "a bag, or the trajectory files of parent and child")
     add_config_arguments(parser)
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        help="write check.html into this directory: the findings, and figures of both streams",
-    )
     add_json_argument(parser)
 
 
@@ -54,23 +53,21 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import answered, finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.cli.present import show
+    from hand_eye_calib.cli.console import fail
     from hand_eye_calib.cli.reading import are_bags, file_settings, read_files
-    from hand_eye_calib.cli.reporting import write_page
     from hand_eye_calib.engine.checking import check_partial
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+    from hand_eye_calib.plain import json_text
 
     options = options_from(arguments)
     names = [str(path) for path in arguments.paths]
-    is_bag = are_bags(arguments.paths)
-    if len(names) != 2 - is_bag:
-        raise ConfigError(f"expected one bag or two trajectory files; got {len(names)}")
-    if is_bag:
-        names, both, of_files = _read_bag(arguments)
-    else:
-        both, repairs = read_files(arguments.paths, file_settings(arguments), options)
+    if are_bags(arguments.paths) and len(names) == 1:
+        names, (first, second), of_files = _read_bag(arguments)
+    elif len(names) == 2 and not are_bags(arguments.paths):
+        (first, second), repairs = read_files(arguments.paths, file_settings(arguments), options)
         of_files = [finding("repaired_file", text=text) for text in repairs]
-    first, second = both
+    else:
+        raise ConfigError(f"expected one bag or two trajectory files; got {len(names)}")
     config = offline_config(first, second, options)
     snapshot = whole_snapshot(config, first, second)
     parent, child = snapshot.parent, snapshot.child
@@ -84,29 +81,22 @@ def run(arguments: argparse.Namespace) -> int:
             checked = check_partial(snapshot)
     findings = gravest_first(answered([*checked.findings, *of_files], config))
     sources = dict(zip(STREAMS, names, strict=True))
-    streams = {
-        name: summarise(one)
-        for name, one in zip(STREAMS, (parent, child), strict=True)
-        if len(one) > 1
-    }
-    said = _verdict(findings)
-
-    def page() -> str:
-        from hand_eye_calib.report.check_page import render_check
-
-        corrected = child.shifted(offset_s).scaled(scale)
-        shown = [f"{name}: {one if is_bag else Path(one).name}" for name, one in sources.items()]
-        return render_check(parent, corrected, checked, findings, shown, said, config.max_gap)
-
-    errors = [str(finding) for finding in findings[:1] if finding.makes_unusable]
-    return show(
-        arguments,
-        lambda: _document(sources, streams, findings, checked),
-        lambda: "\n".join([said, "", *_table(findings), "", *_lines(sources, streams)]),
-        finish=lambda: write_page(arguments.out / "check.html", page) if arguments.out else None,
-        errors=errors,
-        code=len(errors),
-    )
+    both = zip(STREAMS, (parent, child), strict=True)
+    streams = {name: summarise(one) for name, one in both if len(one) > 1}
+    if arguments.json:
+        found = checked.correlation
+        turning = {
+            "time_offset_s": found.offset_s,
+            "correlation": found.correlation,
+            "distinctness": found.distinctness,
+        }
+        summaries = {name: {"source": sources[name], **vars(streams[name])} for name in streams}
+        print(json_text({"streams": summaries, "turning": turning, "findings": findings}))
+    else:
+        lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
+        print_result("\n".join(lines))
+    unusable = [each for each in findings[:1] if each.makes_unusable]
+    return fail(unusable[0], 1) if unusable else 0
 
 
 def _read_bag(
@@ -135,24 +125,6 @@ def _read_bag(
         trajectories.append(replace(tidied, measures=measures[stream]))
         findings += told
     return [str(parent), str(child)], trajectories, findings
-
-
-def _document(
-    sources: Mapping[str, str],
-    streams: "Mapping[str, StreamSummary]",
-    findings: "Sequence[Finding]",
-    checked: "CheckResult",
-) -> dict[str, Any]:
-    found = checked.correlation
-    turning = {"time_offset_s": found.offset_s, "correlation": found.correlation}
-    turning |= {"distinctness": found.distinctness}
-    return {
-        "streams": {
-            name: {"source": sources[name], **vars(summary)} for name, summary in streams.items()
-        },
-        "turning": turning,
-        "findings": findings,
-    }
 
 
 def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:

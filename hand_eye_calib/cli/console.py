@@ -103,7 +103,7 @@ def print_result(text: str) -> None:
     verdict, colon, rest = text.partition(":")
     if sys.stdout.isatty() and verdict in _STYLES:
         text = f"{_STYLES[verdict]}{verdict}\x1b[0m{colon}{rest}"
-    print(text)
+    print(text, flush=True)
 
 
 def told_apart(paths: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import note, waiting_for
+from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
 from hand_eye_calib.cli.options import add_json_argument, at_least
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError
@@ -60,10 +60,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
-    from hand_eye_calib.cli.present import exit_code, show
+    from hand_eye_calib.cli.present import exit_code
     from hand_eye_calib.cli.reading import read_bags
     from hand_eye_calib.cli.reporting import write_report
     from hand_eye_calib.io.bags import PoseBag, write_bag
+    from hand_eye_calib.plain import json_text
     from hand_eye_calib.ros.player import Player
     from hand_eye_calib.simulation.drive import simulate_drive
 
@@ -90,20 +91,16 @@ def run(arguments: argparse.Namespace) -> int:
     note("3/4 calibrated live; the report follows")
     document = _document(drive, offline, online) | {"bag": str(bag_path)}
 
-    def finish() -> None:
-        write_report(arguments.out, offline, recording.snapshot, recording.inputs)
-        note(f"4/4 done; everything is in {arguments.out}")
-
-    differs = max(document["agreement"].values()) > AGREEMENT
-    error = f"offline and online differ by {document['agreement']}: they must give the same"
-    return show(
-        arguments,
-        lambda: document,
-        lambda: "\n".join(_lines(document)),
-        finish=finish,
-        errors=[error] * differs,
-        code=1 if differs else exit_code(offline),
-    )
+    if arguments.json:
+        print(json_text(document), flush=True)
+    else:
+        print_result("\n".join(_lines(document)))
+    write_report(arguments.out, offline, recording.snapshot, recording.inputs)
+    note(f"4/4 done; everything is in {arguments.out}")
+    if max(document["agreement"].values()) > AGREEMENT:
+        differ = f"offline and online differ by {document['agreement']}: they must give the same"
+        return fail(differ, 1)
+    return exit_code(offline)
 
 
 @contextmanager

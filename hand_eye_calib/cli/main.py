@@ -141,13 +141,6 @@ class CommandParser(argparse.ArgumentParser):
         text = as_typed(f"{message} (see {self.prog} --help)")
         self.exit(EXIT_USAGE, f"hand_eye_calib: error: {text}\n")
 
-    def refuse(self, words: Sequence[str]) -> NoReturn:
-        """End with wrong usage: options or arguments that are none."""
-        word = next((word.partition("=")[0] for word in words if word.startswith("-")), None)
-        if word is None:
-            self.error(f"unexpected argument {words[0]!r}")
-        self.error(f"unknown option {word}{did_you_mean(word, self._option_string_actions)}")
-
 
 def _run(argv: Sequence[str]) -> int:
     command = next((word for word in argv if not word.startswith("-")), None)
@@ -175,7 +168,8 @@ def _run(argv: Sequence[str]) -> int:
             argcomplete.autocomplete(parser)  # tells the shell, and ends the process
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
-        of_command.refuse(rest)
+        word = next((each for each in rest if each.startswith("-")), rest[0]).partition("=")[0]
+        of_command.error(f"unknown {word!r}{did_you_mean(word, of_command._option_string_actions)}")
     if arguments.version:
         from hand_eye_calib.version import package_version
 

@@ -2,9 +2,8 @@
 
 import argparse
 import shlex
-import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,30 +72,21 @@ def deliver(
         calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
-
-    def save() -> Path:
+    if arguments.out:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
 
         keep_earlier_results(arguments.out)
-        return save_result(calibration, arguments.out, inputs)
-
-    def finish() -> None:
-        if arguments.out and calibration.motion_residuals:
-            write_report(arguments.out, calibration, snapshot, inputs)
-
-    code = exit_code(calibration)
-    reasons = calibration.reasons[:1] if code == _EXIT_FAILED else ()
-    return show(
-        arguments,
-        lambda: calibration.to_dict() | {"inputs": inputs},
-        lambda: as_text(
-            calibration, next_steps(calibration, arguments, snapshot), arguments.verbose
-        ),
-        save=save,
-        finish=finish,
-        errors=[f"{one.sentence}; do not use this result, {one.what_to_do}" for one in reasons],
-        code=code,
-    )
+        note(f"wrote {save_result(calibration, arguments.out, inputs)}")
+    if arguments.json:
+        print(json_text(calibration.to_dict() | {"inputs": inputs}), flush=True)
+    else:
+        steps = next_steps(calibration, arguments, snapshot)
+        print_result(as_text(calibration, steps, arguments.verbose))
+    if arguments.out and calibration.motion_residuals:
+        write_report(arguments.out, calibration, snapshot, inputs)
+    for one in calibration.reasons[:1] if calibration.status.failure else ():
+        fail(f"{one.sentence}; do not use this result, {one.what_to_do}", _EXIT_FAILED)
+    return exit_code(calibration)
 
 
 def _with_robot(
@@ -129,36 +119,6 @@ def _with_robot(
     return replace(calibration, base_frame=base, T_base_parent=T_base_parent)
 
 
-def show(
-    arguments: argparse.Namespace,
-    document: Callable[[], Mapping[str, Any]],
-    text: Callable[[], str],
-    *,
-    save: Callable[[], Path] | None = None,
-    finish: Callable[[], None] | None = None,
-    errors: Iterable[str] = (),
-    code: int = 0,
-) -> int:
-    """Show what a command found, in the order of all commands; returns the exit code.
-
-    For ``--out``, ``save`` writes the files, and returns the most important one, before anything
-    is printed. After that ``finish`` writes what takes longer, or may fail. The errors are lines
-    for stderr, at the end.
-    """
-    if arguments.out and save is not None:
-        note(f"wrote {save()}")
-    if arguments.json:
-        print(json_text(document()))
-    else:
-        print_result(text())
-    sys.stdout.flush()
-    if finish is not None:
-        finish()
-    for error in errors:
-        fail(error, code)
-    return code
-
-
 def exit_code(calibration: Calibration) -> int:
     """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
     if calibration.status.failure:
@@ -181,7 +141,7 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
         Also quaternions, and how it was solved.
     """
     parent, child = calibration.parent_frame, calibration.child_frame
-    document, reach = calibration.to_dict(), calibration.out_of_reach
+    document = calibration.to_dict()
     lines = [calibration.headline]
     for number, reason in enumerate(shown(calibration.reasons)):
         # What to do about the first one may follow the headline, which says why, at once.
@@ -191,25 +151,23 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
         lines += wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")
     for warning in calibration.warnings:
         lines += wrapped(f"Note: {warning}", "", "  ")
-    transforms = [
-        (child, parent, document["T_parent_child"], reach),
-        (parent, child, document["T_child_parent"], reach),
-    ]
-    if calibration.T_world_world is not None:
-        worlds = calibration.child_world_frame, calibration.parent_world_frame
-        transforms.append((*worlds, document["T_world_world"], ()))
-    if calibration.T_base_child is not None:
-        transforms.append((child, calibration.base_frame, document["T_base_child"], reach))
-    for source, target, transform, out_of_reach in transforms:
-        lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
-        lines += transform_lines(transform, out_of_reach, with_details)
+    for source, target, name in (
+        (child, parent, "T_parent_child"),
+        (parent, child, "T_child_parent"),
+        (calibration.child_world_frame, calibration.parent_world_frame, "T_world_world"),
+        (child, calibration.base_frame, "T_base_child"),
+    ):
+        if document.get(name):
+            reach = () if name == "T_world_world" else calibration.out_of_reach
+            lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
+            lines += transform_lines(document[name], reach, with_details)
     lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
     if command := static_transform_command(calibration):
         by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = list(_details(calibration) if with_details else _comparisons(calibration))
-    lines += ["Details"] if details else []
+    lines += ["Details"] * bool(details)
     lines += [line for detail in details for line in wrapped(detail, "  ", "    ")]
     return "\n".join(printable(line) for line in lines)
 
@@ -232,17 +190,16 @@ def next_steps(
     """What to do next, in sentences and commands; empty if the result may be used."""
     if calibration.verdict is Verdict.USE:
         return []
-    is_poor = calibration.verdict is Verdict.DO_NOT_USE
-    is_of_poses = calibration.measured == "poses" and snapshot is not None
-    steps = []
-    if is_of_poses and not is_poor and snapshot:
-        from hand_eye_calib.assessment.excitation import excitation, what_is_missing
-
-        motion = what_is_missing(excitation(snapshot.pose_pairs()), calibration)
-        steps += [motion] if motion else []
     options = [each for one in shown(calibration.reasons) for each in one.options.items()]
     extra = [typed_options([each]) for each in options]
-    if not is_poor:
+    steps = []
+    if calibration.verdict is not Verdict.DO_NOT_USE:
+        is_of_poses = calibration.measured == "poses" and snapshot is not None
+        if is_of_poses and snapshot:
+            from hand_eye_calib.assessment.excitation import excitation, what_is_missing
+
+            motion = what_is_missing(excitation(snapshot.pose_pairs()), calibration)
+            steps += [motion] if motion else []
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]
         extra += [f"--prior {axis}=VALUE+-SIGMA" for axis in hidden[:3]]
@@ -258,14 +215,15 @@ def transform_lines(
     transform: Mapping[str, Any], out_of_reach: Sequence[str] = (), with_quaternion: bool = False
 ) -> Iterator[str]:
     """A row for each axis: the translation along it and an angle, with one standard deviation."""
-    sigmas_m, sigmas_deg = transform["sigma_total_translation"], transform["sigma_total_rpy_deg"]
     left = ["", "x, y and z are not estimated", ""]
     if not {*out_of_reach} & {*"xyz"}:
-        rows = zip("xyz", transform["translation"], sigmas_m, strict=True)
+        rows = zip(
+            "xyz", transform["translation"], transform["sigma_total_translation"], strict=True
+        )
         left = [f"{name} {with_sigma(value, sigma, 3):>22} m" for name, value, sigma in rows]
     right = ["", "roll, pitch and yaw are not estimated", ""]
     if not {*out_of_reach} & {*_ROTATIONS}:
-        rows = zip(_ROTATIONS, transform["rpy_deg"], sigmas_deg, strict=True)
+        rows = zip(_ROTATIONS, transform["rpy_deg"], transform["sigma_total_rpy_deg"], strict=True)
         right = [f"{name:<5} {printed_angle(value, sigma):>20} deg" for name, value, sigma in rows]
     for metres, degrees in zip(left, right, strict=True):
         yield f"  {metres:<30}  {degrees}".rstrip()

@@ -33,18 +33,8 @@ _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 
 @dataclass
 class Recording:
-    """Both streams of a recording, and where they came from.
-
-    Attributes
-    ----------
-    snapshot : Snapshot
-        The poses and the options.
-    inputs : dict
-        Where the poses came from, in plain values.
-    files : list of pathlib.Path
-        The files that were read.
-    warnings : tuple of str
-        What there is to say of the files.
+    """Both streams of a recording with their options, where they came from in plain values, the
+    files that were read, and what there is to say of them.
     """
 
     snapshot: Snapshot
@@ -55,11 +45,6 @@ class Recording:
     def solved(self) -> Calibration:
         """Solve, check the streams, and solve again if a check is certain of an option; the
         snapshot and the inputs have the options that gave the result.
-
-        Raises
-        ------
-        NotEnoughDataError
-            If there are too few poses.
         """
         with waiting_for("solving, and checking the streams"):
             found = run(self.snapshot)
@@ -109,12 +94,8 @@ def read_paths(
     options: Mapping[str, Any],
     are_files: bool = False,
 ) -> Recording:
-    """The recording of a journal, of a bag or the parts of one, or of two trajectory files.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If it cannot be read, or something does not go together.
+    """The recording of a journal, of a bag or the parts of one, or of two trajectory files; the
+    sources and options are those that somebody gave.
     """
     if are_files:
         return read_pair(paths, [{}] * 2, options)
@@ -137,13 +118,7 @@ def read_pair(
     settings: Sequence[Mapping[str, Any]],
     options: Mapping[str, Any],
 ) -> Recording:
-    """The recording of the trajectory files of parent and child, with how each is read.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If a file cannot be read.
-    """
+    """The recording of the trajectory files of parent and child, with how each is read."""
     (parent, child), repairs = read_files(paths, settings, options)
     for text in repairs:
         note(text)
@@ -158,13 +133,7 @@ def read_pair(
 
 
 def file_settings(arguments: Namespace) -> list[dict[str, Any]]:
-    """How each of the files is read: of two, its own options before those for both.
-
-    Raises
-    ------
-    ConfigError
-        If an option is of one of two files, and there are more.
-    """
+    """How each of the files is read: of two, its own options before those for both."""
     if len(arguments.paths) == 2:
         return [
             {
@@ -184,27 +153,9 @@ def read_files(
     settings: Sequence[Mapping[str, Any]],
     options: Mapping[str, Any],
 ) -> tuple[list[Trajectory], list[str]]:
-    """Read trajectory files; a note says what was guessed.
-
-    Parameters
-    ----------
-    paths : list of path-like
-    settings : list of mapping
-        How each file is read, see :func:`file_settings`.
-    options : mapping
-        What the sensors measure, if that is set.
-
-    Returns
-    -------
-    trajectories : list of Trajectory
-        With a sensor frame that is named like the file, if the file names none.
-    repairs : list of str
-        What was wrong with the stamps.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If a file cannot be read.
+    """The trajectories of files, named like the files that name no frame, and what was wrong with
+    their stamps; a note says what was guessed. See :func:`file_settings`; the options say what the
+    sensors measure.
     """
     from hand_eye_calib.io.trajectory_files import FileOptions, read_trajectory_files
 
@@ -243,20 +194,8 @@ def source_of(text: str) -> "Source":
 def read_bags(
     paths: Sequence[Path | str], wanted: Mapping[str, str], config: CalibratorConfig
 ) -> Recording:
-    """Read one bag, or the parts of one recording.
-
-    Parameters
-    ----------
-    paths : list of path-like
-        Parts of one recording; see :func:`refuse_recordings`.
-    wanted : mapping
-        "parent" and "child" to a topic or WORLD:SENSOR, unless the bag leaves no choice.
-    config : CalibratorConfig
-
-    Raises
-    ------
-    HandEyeCalibError
-        If bag or poses cannot be used.
+    """Read one bag, or the parts of one recording; with SeveralRecordings if they are not. Sources
+    must be wanted by name if the bag leaves a choice.
     """
     from hand_eye_calib.io.bags import PoseBag
 
@@ -311,24 +250,8 @@ def select(
 
 
 def feed(calibrator: Calibrator, blocks: "Iterable[PoseBlock]", topics: Mapping[str, Any]) -> int:
-    """Give every pose to the engine.
-
-    Parameters
-    ----------
-    calibrator : Calibrator
-    blocks : iterable of PoseBlock
-    topics : mapping
-        "parent" and "child" to the names of their topics, for messages.
-
-    Returns
-    -------
-    int
-        How many there were.
-
-    Raises
-    ------
-    InputError
-        At the first message that cannot be used, with topic, message number and stamp.
+    """Give every pose to the engine; returns how many there were. The first message that cannot be
+    used is an InputError with topic, message number and stamp.
     """
     # A message without a frame name changes nothing.
     frames: set[tuple[str, str | None]] = {(stream, None) for stream in topics}
@@ -365,19 +288,7 @@ def journal_in(paths: Sequence[Path | str]) -> Path | None:
 
 
 def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
-    """Read the journal of a session of the node.
-
-    Parameters
-    ----------
-    directory : pathlib.Path
-    options : mapping
-        Options by their public names; they go before those of the session.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If the journal cannot be used.
-    """
+    """Read the journal of a session of the node; the options go before those of the session."""
     from hand_eye_calib.io.journal import read_journal
     from hand_eye_calib.live.journal import give
 

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import note, waiting_for
+from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
 from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.parts import refuse_recordings
-from hand_eye_calib.cli.present import exit_code, show, transform_lines, wrapped
+from hand_eye_calib.cli.present import exit_code, transform_lines, wrapped
 from hand_eye_calib.cli.reading import file_settings, read_files, source_of
 from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.plain import json_text
 
 if TYPE_CHECKING:
     from hand_eye_calib.geometry.trajectory import Trajectory
@@ -74,21 +75,19 @@ def _calibrate(
     with waiting_for(f"solving for {len(sensors)} sensors"):
         rig = solve_rig(sensors, inputs["options"])
 
-    def finish() -> None:
-        if arguments.out:
-            names = inputs.get("topics") or inputs["files"]
-            write_rig_report(arguments.out, rig, names)
-
+    if arguments.out:
+        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
+    if arguments.json:
+        print(json_text(rig.to_dict() | {"inputs": inputs}), flush=True)
+    else:
+        print_result("\n".join(printable(line) for line in as_lines(rig)))
+    if arguments.out:
+        names = inputs.get("topics") or inputs["files"]
+        write_rig_report(arguments.out, rig, names)
     failed = [each for each in rig.calibrations if each.status.failure]
-    return show(
-        arguments,
-        lambda: rig.to_dict() | {"inputs": inputs},
-        lambda: "\n".join(printable(line) for line in as_lines(rig)),
-        save=lambda: save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs),
-        finish=finish,
-        errors=[f"{each.child_frame}: {each.headline}" for each in failed],
-        code=1 if failed else max(map(exit_code, rig.calibrations)),
-    )
+    for each in failed:
+        fail(f"{each.child_frame}: {each.headline}", 1)
+    return 1 if failed else max(map(exit_code, rig.calibrations))
 
 
 def as_lines(rig: "RigCalibration") -> list[str]:

@@ -14,8 +14,6 @@ from pathlib import Path
 from fuzz import text_inputs
 from fuzz.chaos import Chaos
 
-from hand_eye_calib.cli.batch.run import stored
-from hand_eye_calib.cli.batch.tasks import read_batch
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -126,25 +124,6 @@ def info(chaos, folder):
     return min(command("info", folder), command("info", folder, "--json"))
 
 
-def batches(chaos, folder):
-    """Read a batch file; what it names must stay below the directory of the results."""
-    path = folder / "fleet.yaml"
-    (folder / "bag.mcap").touch()
-    path.write_bytes(text_inputs.yaml_text(chaos, "batch"))
-    try:
-        tasks = read_batch([path], {}, {})
-    except HandEyeCalibError as error:
-        if "\n" in str(error):
-            raise Finding(f"an error of several lines: {error}") from None
-        return 2
-    for task in tasks:
-        target = Path(os.path.normpath(folder / "out" / task.name))
-        if target.parent != folder / "out" or task.name in ("summary.json", "index.html"):
-            raise Finding(f"results of {task.name!r} would go to {target}")
-        stored(task, folder / "out")
-    return 0
-
-
 def metadata(chaos, folder):
     """List a bag whose metadata.yaml is not as it should be."""
     streams = {"/a": (text_inputs.PARENT, ODOMETRY), "/b": (text_inputs.CHILD, ODOMETRY)}
@@ -186,7 +165,6 @@ FORMATS = {
     "trajectory": trajectory,
     "config": config,
     "info": info,
-    "batch": batches,
     "metadata": metadata,
     "journal": journal,
 }

@@ -113,11 +113,6 @@ def altered(chaos, document):
 DOCUMENTS = {
     "config": CalibratorConfig().to_options(),
     "info": calibration().to_dict(),
-    "batch": {
-        "parent_topic": "/a",
-        "options": {"method": "dnl"},
-        "bags": ["bag", {"bag": ["x", "y"], "name": "z", "child_tf": "odom:b"}, "*.mcap"],
-    },
     "metadata": {
         "rosbag2_bagfile_information": {
             "version": 9,

@@ -19,17 +19,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from fleet_making import always_dies, calibration_of, dies_once, outcome, recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.cli.batch import run as batch_run
 from hand_eye_calib.cli.batch import work as batch_work
 from hand_eye_calib.cli.batch.run import row_of, write_rows
-from hand_eye_calib.cli.batch.tasks import Task, read_batch
+from hand_eye_calib.cli.batch.tasks import Task, matching, tasks_of
 from hand_eye_calib.cli.batch.work import outcomes, work
 from hand_eye_calib.cli.reporting import REPORT
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.bags import write_bag
@@ -62,42 +61,29 @@ def write_drive(path, n_poses, seed):
 
 @pytest.fixture
 def fleet(tmp_path):
-    """Three drives, a bag that is missing, and the file that names them."""
+    """Three drives and a bag that is missing, as they are typed."""
     for number in range(3):
         write_drive(tmp_path / "bags" / f"drive{number}", 60, number)
-    document = {
-        "options": {"reference": "B5"},
-        "parent_topic": "/a",
-        "child_topic": "/b",
-        "bags": [
-            "bags/drive*",
-            {"bag": "absent", "name": "gone"},
-            {"bag": ["bags/drive0"], "name": "again", "options": {"reference": "B1"}},
-        ],
-    }
-    path = tmp_path / "fleet.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return path
+    return ["--batch", f"{tmp_path}/bags/drive*", tmp_path / "gone", *STREAMS, "--reference", "B5"]
 
 
 def assert_is_result_of_the_fleet(code, out, err):
-    summary = json.loads(out)
+    document = json.loads(out)
     assert code == 1
-    assert summary["failures"] == ["gone"]
+    assert document["failures"] == ["gone"]
     assert ": gone: no bag at " in err
-    rows = {row["name"]: row for row in summary["results"]}
-    assert list(rows) == ["drive0", "drive1", "drive2", "gone", "again"]
+    rows = {row["name"]: row for row in document["results"]}
+    assert list(rows) == ["drive0", "drive1", "drive2", "gone"]
     for name, row in rows.items():
         if name != "gone":
-            np.testing.assert_allclose(
-                row["calibration"]["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3
-            )
-            assert row["calibration"]["reference"] == ("B1" if name == "again" else "B5")
+            found = row["calibration"]["T_parent_child"]["matrix"]
+            np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-3)
+            assert row["calibration"]["reference"] == "B5"
 
 
 def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, monkeypatch):
     out_dir = tmp_path / "out"
-    assert_is_result_of_the_fleet(*run("--batch", fleet, "--out", out_dir, "--json", "--jobs", "2"))
+    assert_is_result_of_the_fleet(*run(*fleet, "--out", out_dir, "--json", "--jobs", "2"))
     np.testing.assert_allclose(
         load_result(out_dir / "drive1").T_parent_child, T_PARENT_CHILD, atol=1e-3
     )
@@ -110,18 +96,21 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, mon
     assert 'href="gone/' not in page
     done = []
     monkeypatch.setattr(batch_run, "outcomes", lambda tasks, jobs, dask: here(tasks, done))
-    code, out, err = run("--batch", fleet, "--out", out_dir, "--json")
+    code, out, err = run(*fleet, "--out", out_dir, "--json")
     assert_is_result_of_the_fleet(code, out, err)
     assert done == ["gone"]
-    assert "4 of 5 bags are done already" in err
-    # Another option or another bag is another task.
-    write_drive(tmp_path / "absent", 100, seed=7)
-    fleet.write_text(fleet.read_text().replace("B1", "B2"))
+    assert "3 of 4 bags are done already" in err
+    # A bag that was missing, or has changed, is done; with other options all are.
+    write_drive(tmp_path / "gone", 100, seed=7)
+    next((tmp_path / "bags" / "drive1").glob("*.mcap")).touch()
     done.clear()
-    code, out, err = run("--batch", fleet, "--out", out_dir)
-    assert (code, done) == (0, ["gone", "again"])
-    assert re.search(r"^again: USE", out, re.MULTILINE)
-    assert "5 of 5 bags calibrated, 0 failed" in out
+    code, out, err = run(*fleet, "--out", out_dir)
+    assert (code, done) == (0, ["drive1", "gone"])
+    assert re.search(r"^gone: USE", out, re.MULTILINE)
+    assert "4 of 4 bags calibrated, 0 failed" in out
+    done.clear()
+    assert run(*fleet[:-1], "B2", "--out", out_dir, "--no-report")[0] == 0
+    assert len(done) == 4
 
 
 def here(tasks, done):
@@ -141,9 +130,9 @@ def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
         tmp_path / "short",
         {"/a": (streams[0], ODOMETRY), "/b": (streams[1].scaled(1000.0), ODOMETRY)},
     )
-    fleet = tmp_path / "fleet.yaml"
-    fleet.write_text(yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": ["short"]}))
-    (row,) = json.loads(run("--batch", fleet, "--json", "--jobs", "1")[1])["results"]
+    (row,) = json.loads(run("--batch", tmp_path / "short", *STREAMS, "--json", "--jobs", "1")[1])[
+        "results"
+    ]
     alone = json.loads(run(tmp_path / "short", *STREAMS, "--json")[1])
     assert row["calibration"]["scale"] == alone["scale"] == 0.001
     assert row["inputs"]["options"] == alone["inputs"]["options"]
@@ -158,78 +147,43 @@ def test_a_batch_on_a_dask_cluster(run, fleet):
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
     ) as cluster:
-        assert_is_result_of_the_fleet(
-            *run("--batch", fleet, "--json", "--dask", cluster.scheduler_address)
-        )
+        assert_is_result_of_the_fleet(*run(*fleet, "--json", "--dask", cluster.scheduler_address))
 
 
 def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    code, out, err = run("--batch", fleet, "--dask", "tcp://127.0.0.1:1")
+    code, out, err = run(*fleet, "--dask", "tcp://127.0.0.1:1")
     assert (code, out) == (1, "")
     assert "pip install 'hand_eye_calib[cluster]'" in err
 
 
-def test_a_defect_in_one_bag_leaves_the_others_alone(fleet, monkeypatch):
-    tasks = read_batch([fleet], {}, {})
+def test_a_defect_in_one_bag_leaves_the_others_alone(monkeypatch):
     monkeypatch.setattr(batch_work, "read_paths", lambda *_, **__: 1 / 0)
-    outcome = work(tasks[0])
+    outcome = work(Task(name="a", bags=("absent",)))
     assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
     assert "ZeroDivisionError" in outcome["traceback"]
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("bags", "names"),
     [
-        ("bags: []", "expected a list of bags"),
         (
-            "[{bag: a, colour: red}]",
-            "entry 1: unknown key 'colour'; known are bag, name, vehicle, options, parent_topic",
+            ["monday/bag", "tuesday/bag", "other", "other"],
+            ["monday_bag", "tuesday_bag", "other", "other_2"],
         ),
-        ("[a, {name: b}]", "entry 2: expected a bag's path or a list of paths; got None"),
-        ("[{bag: a, options: {method: magic}}]", "entry 1: method must be one of"),
-        ("[{bag: a, options: 3}]", "entry 1: options must be a mapping"),
-        ("{bags: [a], parent_tf: odom}", "beside 'bags': expected two frames as WORLD:SENSOR"),
+        (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a_monday", "b_monday", "tuesday"]),
+        (["s3://fleet/t1/run.mcap?sig=a/b", "s3://fleet/t2/run.mcap"], ["t1", "t2"]),
+        (["a/vehicles", "a/."], ["vehicles_2", "a"]),
     ],
 )
-def test_batch_files_that_are_wrong(run, tmp_path, text, message):
-    path = tmp_path / "fleet.yaml"
-    path.write_text(text)
-    code, out, err = run("--batch", path)
-    assert (code, out) == (2, "")
-    assert message in err
-
-
-def test_what_is_said_of_a_bag_goes_before_the_rest(tmp_path):
-    path = tmp_path / "fleet.yaml"
-    path.write_text(
-        "{parent_tf: 'odom:lidar', options: {method: dnl}, bags: [a, {bag: b/a, "
-        "parent_topic: /p, options: {reference: A}}]}"
-    )
-    first, second = read_batch(
-        [path], {"method": "park", "max_gap": 0.3}, {"parent": "/cli", "child": "/c"}
-    )
-    assert first.options == {"method": "dnl", "max_gap": 0.3}
-    assert first.sources == {"parent": "odom:lidar", "child": "/c"}
-    assert second.options == {"method": "dnl", "max_gap": 0.3, "reference": "A"}
-    assert second.sources == {"parent": "/p", "child": "/c"}
-    assert (first.name, second.name) == ("a", "b")
-    assert first.bags == (str(tmp_path / "a"),)
-
-
-def test_bags_of_one_name_are_told_apart_by_their_folders(tmp_path):
-    for folder in ("monday", "tuesday"):
-        (tmp_path / folder / "bag").mkdir(parents=True)
-    path = tmp_path / "fleet.yaml"
-    path.write_text("bags: ['*/bag', other, other, {bag: monday/bag, name: first}]")
-    names = [task.name for task in read_batch([path], {}, {})]
-    assert names == ["monday_bag", "tuesday_bag", "other", "other_2", "first"]
+def test_recordings_are_named_by_what_tells_their_paths_apart(bags, names):
+    assert [task.name for task in tasks_of([[bag] for bag in bags])] == names
 
 
 # ---- workers
 
 
-def tasks_of(*names, **options):
+def some_tasks(*names, **options):
     return [Task(name=name, bags=(), options=options.get(name, {})) for name in names]
 
 
@@ -241,13 +195,13 @@ NAMES = ("a", "b", "c", "d", "bad")
 
 
 def test_what_a_worker_that_dies_had_to_do_is_done_again(tmp_path):
-    tasks = tasks_of(*NAMES, b={"marker": str(tmp_path / "marker")})
+    tasks = some_tasks(*NAMES, b={"marker": str(tmp_path / "marker")})
     assert done_by(tasks, dies_once) == dict.fromkeys(NAMES, "done")
     assert (tmp_path / "marker").exists()
 
 
 def test_a_recording_of_which_workers_die_takes_no_other_along():
-    found = done_by(tasks_of(*NAMES), always_dies)
+    found = done_by(some_tasks(*NAMES), always_dies)
     assert found.pop("bad") == "worker processes die of it, perhaps for lack of memory: --jobs 1"
     assert found == dict.fromkeys(NAMES[:-1], "done")
 
@@ -256,7 +210,7 @@ def test_a_dask_cluster_does_what_a_worker_that_dies_had_to_do(tmp_path):
     distributed = pytest.importorskip(
         "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
     )
-    tasks = tasks_of(*NAMES, b={"marker": str(tmp_path / "marker")})
+    tasks = some_tasks(*NAMES, b={"marker": str(tmp_path / "marker")})
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
@@ -305,21 +259,20 @@ def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
 
 def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatch):
     monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
-    fleet.write_text("vehicle: truck\n" + fleet.read_text())
     tables = {}
     for jobs in ("1", "2"):
         out_dir = tmp_path / jobs
-        assert run("--batch", fleet, "--out", out_dir, "--jobs", jobs)[0] == 1
+        assert run(*fleet, "--vehicle", "truck", "--out", out_dir, "--jobs", jobs)[0] == 1
         tables[jobs] = (out_dir / "rows.csv").read_text()
     assert tables["1"] == tables["2"]
     rows = list(csv.DictReader(tables["1"].splitlines()))
-    assert [row["name"] for row in rows] == ["drive0", "drive1", "drive2", "gone", "again"]
+    assert [row["name"] for row in rows] == ["drive0", "drive1", "drive2", "gone"]
     assert rows[0]["start"] == "2023-11-14T22:13:20+00:00"
     assert (rows[3]["x_m"], rows[3]["error"][:10]) == ("", "no bag at ")
     np.testing.assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-3)
     page = (tmp_path / "1" / "index.html").read_text(encoding="utf-8")
     assert "report.html" not in page
-    assert "The 4 recordings agree within their standard deviations" in page
+    assert "The 3 recordings agree within their standard deviations" in page
     assert (tmp_path / "1" / "vehicles" / "truck" / "extrinsic.yaml").exists()
     assert not list(tmp_path.rglob("*.parquet"))
 
@@ -341,11 +294,15 @@ def test_a_cell_cannot_become_a_formula(tmp_path, name):
 # ---- bags at URLs
 
 
-def outcomes_of(path, bags, **common):
-    path.write_text(
-        yaml.safe_dump({"parent_topic": "/a", "child_topic": "/b", "bags": bags, **common})
-    )
-    tasks = read_batch([path], {"reference": "B5"}, {}, with_fingerprints=True)
+def outcomes_of(*bags):
+    tasks = [
+        *tasks_of(
+            [[bag] for bag in bags],
+            options={"reference": "B5"},
+            sources={"parent": "/a", "child": "/b"},
+            with_fingerprints=True,
+        )
+    ]
     return tasks, [work(task) for task in tasks]
 
 
@@ -362,8 +319,8 @@ def memory(tmp_path):
 
 
 def test_bags_in_a_store_give_what_they_give_here(tmp_path, memory):
-    _, local = outcomes_of(tmp_path / "fleet.yaml", ["drive0", "drive1"])
-    tasks, remotely = outcomes_of(tmp_path / "fleet.yaml", ["memory://fleet/*/drive"])
+    _, local = outcomes_of(f"{tmp_path}/drive0", f"{tmp_path}/drive1")
+    tasks, remotely = outcomes_of(*matching("memory://fleet/*/drive"))
     assert [task.name for task in tasks] == ["run0", "run1"]
     for here, there, task in zip(local, remotely, tasks, strict=True):
         assert there["error"] is None
@@ -391,7 +348,7 @@ def test_a_bag_at_a_url_is_replayed_alone(run, tmp_path, memory, monkeypatch):
 
 def test_a_remote_bag_may_not_fill_the_disk(tmp_path, memory, monkeypatch):
     monkeypatch.setattr(remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000))
-    _, (found,) = outcomes_of(tmp_path / "fleet.yaml", ["memory://fleet/run0/drive"])
+    _, (found,) = outcomes_of("memory://fleet/run0/drive")
     assert found["error"] == (
         "cannot read memory://fleet/run0/drive: it is larger than 1e-05 GB, half of the free space "
         f"of {tempfile.gettempdir()}; set TMPDIR to a folder with more space"
@@ -414,7 +371,7 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
 
 def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
-    _, (found,) = outcomes_of(tmp_path / "fleet.yaml", ["s3://fleet/run.mcap"])
+    _, (found,) = outcomes_of("s3://fleet/run.mcap")
     assert found["error"].startswith("s3://fleet/run.mcap needs a package that is not installed")
     assert "pip install 'hand_eye_calib[fleet]'" in found["error"]
 
@@ -455,16 +412,14 @@ def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
 
 def test_recordings_without_a_vehicle_are_not_judged_together(run, fleet, tmp_path, monkeypatch):
     monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
-    document = yaml.safe_load(fleet.read_text())
-    fleet.write_text(yaml.safe_dump(document | {"bags": ["bags/drive0", "bags/drive1", "absent"]}))
-    _, out, err = run("--batch", fleet, "--jobs", "1")
-    assert "2 of 3 bags calibrated, 1 failed" in out
+    _, out, err = run(*fleet, "--jobs", "1")
+    assert "3 of 4 bags calibrated, 1 failed" in out
     assert "agree" not in out
     assert (
-        "note: 2 recordings are not compared with each other: give --vehicle with the place of the "
+        "note: 3 recordings are not compared with each other: give --vehicle with the place of the "
         "vehicle in their paths, such as 'fleet/{vehicle}/*'"
     ) in err
-    assert re.search(r"note: [12] of 3: drive[01]: USE", err)  # a line for each in a pipe
+    assert re.search(r"note: [1-4] of 4: drive[0-2]: USE", err)  # a line for each in a pipe
 
 
 def test_the_index_page_shows_each_vehicle(tmp_path):
@@ -496,11 +451,13 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
         if place != "notes":
             (tmp_path / "fleet" / place / "metadata.yaml").touch()
             (tmp_path / "fleet" / place / "a.mcap").touch()
-    pattern = f"{tmp_path}/fleet/**"
-    tasks = read_batch([pattern], {}, {}, "fleet/{vehicle}/*")
-    assert [(task.name, task.vehicle) for task in tasks] == [
+    groups = [[bag] for bag in matching(f"{tmp_path}/fleet/**")]
+    assert [(task.name, task.vehicle) for task in tasks_of(groups, "fleet/{vehicle}/*")] == [
         ("truck_1_monday", "truck_1"),
         ("tuesday", "truck_1"),
         ("truck_2_monday", "truck_2"),
     ]
-    assert {task.vehicle for task in read_batch([pattern], {}, {}, "other/{vehicle}/*")} == {""}
+    assert {task.vehicle for task in tasks_of(groups, "other/{vehicle}/*")} == {""}
+    assert {task.vehicle for task in tasks_of([["/x/../bag"]], "/x/{vehicle}/bag")} == {""}
+    with pytest.raises(ConfigError, match="no bag matches"):
+        matching(f"{tmp_path}/none/**")

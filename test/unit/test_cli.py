@@ -400,7 +400,7 @@ def parsed(options):
         (["calibrate", str(ROOT / "README.md")], "is one trajectory file: give those of two"),
         (["calibrate", "a.tum", "b.mcap"], "b.mcap is a bag, but not all of the others are"),
         (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
-        (["replay", "bag", "--methd", "dnl"], "unknown option --methd; did you mean --method?"),
+        (["replay", "bag", "--methd", "dnl"], "unknown '--methd'; did you mean --method?"),
         (["replay", "bag", "--method", "magic"], "argument --method: must be one of auto, dnlo"),
         (
             ["replay", "bag", "--threshold", "-1"],
@@ -417,7 +417,7 @@ def parsed(options):
         (["replay", "bag", "--reference", "D4"], "--reference: must be auto, A, B<n> such as B5"),
         (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
         (["replay", "bag", "--scale", "non"], "did you mean none?"),
-        (["info", "a", "b"], "unexpected argument 'b'"),
+        (["info", "a", "b"], "unknown 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
     ],

@@ -12,7 +12,7 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses, write_p
 from result_making import calibration
 
 from hand_eye_calib.cli.batch.run import stored
-from hand_eye_calib.cli.batch.tasks import Task, read_batch
+from hand_eye_calib.cli.batch.tasks import Task
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result, save_result
@@ -57,7 +57,7 @@ HOSTILE_YAML = {
 
 @pytest.mark.parametrize(
     ("command", "kind"),
-    [("config", each) for each in HOSTILE_YAML] + [("info", "aliases")] + [("batch", "aliases")],
+    [("config", each) for each in HOSTILE_YAML] + [("info", "aliases")],
 )
 def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, command, kind):
     text, message = HOSTILE_YAML[kind]
@@ -66,21 +66,12 @@ def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, command, kin
     arguments = {
         "info": ["info", path],
         "config": ["replay", tmp_path, "--config", path],
-        "batch": ["replay", "--batch", path],
     }[command]
     code, out, err = run(*arguments)
     assert (code in (1, 2), out) == (True, "")
     (line,) = err.splitlines()
     assert message in line
     assert len(line) < 1000
-
-
-@pytest.mark.parametrize(("name", "read"), [("2024-02-30", "2024-02-30"), ("../../x", ".._.._x")])
-def test_a_date_is_read_as_text_and_a_name_with_slashes_is_one_folder(tmp_path, name, read):
-    """Impossible dates included, which YAML takes for dates."""
-    path = tmp_path / "fleet.yaml"
-    path.write_text(f"[{{bag: absent, name: {name}}}]")
-    assert [task.name for task in read_batch([path], {}, {})] == [read]
 
 
 INF, NAN = float("inf"), float("nan")
@@ -166,47 +157,11 @@ def bag(tmp_path):
     return tmp_path / "bag"
 
 
-@pytest.mark.parametrize(
-    "entry",
-    [
-        "{bag: bag, name: '..'}",
-        "{bag: bag, name: '.'}",
-        "{bag: bag, name: ' '}",
-        "{bag: '..'}",
-        "{bag: bag/..}",
-        "{bag: bag, name: summary.json}",
-        "{bag: bag, name: Index.html}",
-        "{bag: bag, vehicle: {a: b}}",
-        '{bag: bag, vehicle: "a\\e[2Jb"}',
-        '{bag: bag, name: "a\\0b"}',
-        '{bag: bag, name: "a\\e[2Jb"}',
-        "{bag: bag, name: {a: b}}",
-        "{bag: bag, name: " + "n" * 300 + "}",
-        '{bag: "a\\0b"}',
-        "{bag: ['bag', \"a\\0b\"]}",
-        "'no*where'",
-    ],
-)
-def test_batches_write_nothing_outside_their_directory(run, tmp_path, bag, entry):
-    (tmp_path / "extrinsic.yaml").write_text("mine")
-    fleet = tmp_path / "fleet.yaml"
-    fleet.write_text(f"[{entry}]")
-    before = sorted(tmp_path.rglob("*"))
-    code, out, err = run("replay", "--batch", fleet, "--out", tmp_path / "out", "--jobs", "1")
-    assert (code, out) == (2, "")
-    assert "fleet.yaml, entry 1: " in err
-    assert len(err.splitlines()) == 1
-    assert sorted(tmp_path.rglob("*")) == before
-    assert (tmp_path / "extrinsic.yaml").read_text() == "mine"
-
-
 def test_a_folder_that_is_a_link_out_of_the_directory_is_refused(run, tmp_path, bag):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "bag").symlink_to(tmp_path / "elsewhere")
-    fleet = tmp_path / "fleet.yaml"
-    fleet.write_text("[bag]")
-    code, _, err = run("replay", "--batch", fleet, "--out", tmp_path / "out", "--jobs", "1")
+    code, _, err = run("replay", "--batch", bag, "--out", tmp_path / "out", "--jobs", "1")
     assert (code, "is a link out of" in err) == (1, True)
     assert list((tmp_path / "elsewhere").iterdir()) == []
 

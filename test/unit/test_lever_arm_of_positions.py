@@ -292,11 +292,6 @@ def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, caps
     assert code == 0
     assert "roll, pitch and yaw are not estimated" in printed.out
     assert "became metres east and north" in printed.err
-    files = [str(tmp_path / name) for name in ("lidar.tum", "gnss.csv")]
-    assert main(["check", *files, "--out", str(tmp_path)]) == 0
-    page = (tmp_path / "check.html").read_text()
-    assert "speed (m/s)" in page
-    assert "the two curves must have the same course" in page
 
 
 def test_targets_of_single_axes_are_those_of_the_verdict(streams):

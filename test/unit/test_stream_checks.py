@@ -310,21 +310,6 @@ class TestCommand:
         assert document["findings"][0]["options"] == {"scale": 0.001}
         assert document["streams"]["child"]["poses"] == 500
 
-    def test_out_is_a_page_with_a_picture(self, files, tmp_path, capsys):
-        pytest.importorskip("matplotlib")
-        parent, child = drive()
-        out = tmp_path / "out"
-        assert (
-            main(["check", *files(parent, reordered(child).shifted(-100.0)), "--out", str(out)])
-            == 1
-        )
-        assert f"wrote {out / 'check.html'}" in capsys.readouterr().err
-        page = (out / "check.html").read_text(encoding="utf-8")
-        assert "calibrate with --child-quaternion wxyz" in page
-        assert "<code>quaternion_order</code> (child)" in page
-        assert "100.0" in page.split("<figcaption>")[1].split("added to the child")[0]
-        assert page.count("<svg") == 1
-
     def test_calibrate_says_the_same(self, files, capsys):
         parent, child = drive()
         paths = files(parent, inverted(child))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hand_eye_calib.cli.batch import tasks as names
-from hand_eye_calib.cli.batch.tasks import Task, read_batch
+from hand_eye_calib.cli.batch.tasks import Task, matching, tasks_of
 from hand_eye_calib.cli.batch.work import Outcome, outcomes
 from hand_eye_calib.cli.console import STREAMS, note, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from, sources_from
@@ -63,26 +63,24 @@ class Done(NamedTuple):
 
 def run_batch(arguments: argparse.Namespace) -> int:
     """Calibrate from many recordings; returns the exit code. A bag that fails is a row."""
-    title = " ".join(map(str, arguments.batch))
-    with waiting_for(f"reading {title}"):
-        tasks = _tasks(arguments, arguments.batch, arguments.vehicle or "")
-    done = _all_done(tasks, arguments)
+    title = " ".join(arguments.batch)
+    with waiting_for(f"looking for {title}"):
+        groups = [[bag] for pattern in arguments.batch for bag in matching(pattern)]
+    done = _all_done(groups, arguments.vehicle or "", arguments)
     vehicles = _vehicles(done)
-    document = {
-        "batch": title,
-        "counts": dict(Counter(one.verdict for one in done)),
-        "failures": [one.row["name"] for one in done if one.row["error"]],
-        "vehicles": {name: each.to_dict() for name, each in vehicles.items()},
-    }
     if arguments.out:
         from hand_eye_calib.io.results import save_result
 
-        with waiting_for("writing the summary"):
-            save_text(arguments.out / names.SUMMARY, json_text(document) + "\n")
-            for name, each in vehicles.items():
-                save_result(each, arguments.out / names.VEHICLES / name)
+        for name, each in vehicles.items():
+            save_result(each, arguments.out / names.VEHICLES / name)
         _write_rows_and_page(arguments.out, title, done, vehicles, names.INDEX)
     if arguments.json:
+        document = {
+            "batch": title,
+            "counts": dict(Counter(one.verdict for one in done)),
+            "failures": [one.row["name"] for one in done if one.row["error"]],
+            "vehicles": {name: each.to_dict() for name, each in vehicles.items()},
+        }
         # Their outcomes one by one: they may be many.
         print(json_text(document).removesuffix("\n}") + ',\n  "results": [')
         print(",\n".join(f"    {one.text}" for one in done) + "\n  ]\n}")
@@ -104,8 +102,7 @@ def run_together(
     """Calibrate from several recordings of one rig, each given by its bags or files, for one
     result; returns the exit code.
     """
-    entries = [{"bag": list(map(str, group))} for group in groups]
-    done = _all_done(_tasks(arguments, entries, "rig", are_files=are_files), arguments)
+    done = _all_done([[*map(str, group)] for group in groups], "rig", arguments, are_files)
     usable = {one.row["name"]: one.calibration for one in done if one.row["verdict"]}
     if not usable:
         raise InputError("; ".join(f"{one.row['name']}: {one.row['error']}" for one in done))
@@ -113,19 +110,29 @@ def run_together(
     if arguments.out:
         _write_rows_and_page(arguments.out, "recordings of one rig", done, {"rig": found}, REPORT)
     inputs = {"recordings": {one.row["name"]: json.loads(one.text)["inputs"] for one in done}}
-    code = deliver(found, arguments, inputs, None)
+    code = deliver(found, arguments, inputs)
     return 1 if any(one.row["error"] for one in done) else code
 
 
-def _tasks(arguments: argparse.Namespace, given: Any, vehicle: str, **flags: bool) -> list[Task]:
-    with_report = bool(arguments.out) and not arguments.no_report and can_draw(REPORT)
-    flags |= {"with_fingerprints": bool(arguments.out), "with_report": with_report}
-    return read_batch(given, options_from(arguments), sources_from(arguments), vehicle, **flags)
-
-
-def _all_done(tasks: Sequence[Task], arguments: argparse.Namespace) -> list[Done]:
-    """The recordings of an earlier run, and of this one, in the order of the tasks."""
+def _all_done(
+    groups: Sequence[Sequence[str]],
+    vehicle: str,
+    arguments: argparse.Namespace,
+    are_files: bool = False,
+) -> list[Done]:
+    """The recordings of an earlier run, and of this one, in their order."""
     out: Path | None = arguments.out
+    tasks = [
+        *tasks_of(
+            groups,
+            vehicle,
+            options=options_from(arguments),
+            sources=sources_from(arguments),
+            with_fingerprints=bool(out),
+            with_report=bool(out) and not arguments.no_report and can_draw(REPORT),
+            are_files=are_files,
+        )
+    ]
     found: dict[str, Done] = {}
     for task in with_progress(tasks, len(tasks), "looking for earlier results") if out else ():
         if earlier := stored(task, arguments.out):
