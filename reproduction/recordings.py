@@ -110,7 +110,7 @@ def rigs_of(folder: Path, name: str) -> list[Rig]:
 
 
 # Good to about 0.15 deg and 10 mm, as the flights say of it among themselves.
-_EUROC = Truth.within(
+EUROC = Truth.within(
     np.array(
         [
             [0.0148655, -0.9998809, 0.0041403, -0.0216401],
@@ -135,12 +135,12 @@ def _euroc(folder: Path) -> list[Rig]:
         }
 
     return [
-        Rig(name=f"euroc_{kind}", recordings=recordings(kind), truth=_EUROC)
+        Rig(name=f"euroc_{kind}", recordings=recordings(kind), truth=EUROC)
         for kind in ("stereo", "mono")
     ]
 
 
-_SIMPLE_KITTI = _exact(
+SIMPLE_KITTI = _exact(
     se3.from_quat_xyzw((0.8, -0.3, 0.5), (0.333307, -0.063488, 0.753055, 0.563723))
 )
 
@@ -153,7 +153,7 @@ def _simple_kitti(folder: Path) -> list[Rig]:
         )
         for drive in ("05", "07")
     }
-    return [Rig(name="simple_kitti", recordings=recordings, truth=_SIMPLE_KITTI)]
+    return [Rig(name="simple_kitti", recordings=recordings, truth=SIMPLE_KITTI)]
 
 
 def _kitti(folder: Path) -> list[Rig]:
@@ -277,7 +277,7 @@ def _single(
     return Rig(name=name, recordings={"whole": recording}, options=options, truth=truth)
 
 
-_BOREAS = Truth.within(
+BOREAS = Truth.within(
     se3.from_rotation_translation(
         Rotation.from_euler("xyz", [-180.0, 0.0, 46.67], degrees=True).as_matrix(), [0.0, 0.0, 0.21]
     ),
@@ -291,7 +291,7 @@ def _boreas(folder: Path) -> list[Rig]:
     recording = Recording(
         _boreas_poses(drive / "lidar_poses.csv", 1_000), _boreas_poses(drive / "radar_poses.csv", 1)
     )
-    return [replace(_single("boreas", recording, _BOREAS, {}), is_cut=False)]
+    return [replace(_single("boreas", recording, BOREAS, {}), is_cut=False)]
 
 
 def _boreas_poses(path: Path, unit_ns: int) -> Trajectory:

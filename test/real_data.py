@@ -4,7 +4,6 @@ They are looked for where :mod:`published_data` looks; a test that needs them is
 so, where they are absent.
 """
 
-import csv
 import json
 import random
 from dataclasses import dataclass
@@ -12,17 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from published_data import data_folder
-from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import read_trajectory
-from reproduction.recordings import rigs_of
-
-# WGS 84.
-_EQUATORIAL_RADIUS, _ECCENTRICITY_SQUARED = 6378137.0, 6.69437999014e-3
-_GPS_EPOCH_S, _LEAP_SECONDS = 315_964_800, 18
-
+from reproduction.recordings import BOREAS, EUROC, SIMPLE_KITTI, rigs_of
 
 # Differences that are really there and that the data's documentation does not give: found by this
 # package, and taken out where streams without any fault are wanted. The devices' scales close round
@@ -134,33 +127,14 @@ def zxl19(bag, child):
     return _of_rig("zxl19", rig, f"zxl19 {bag} {child}", offset, scale, f"bag{bag}")
 
 
-def zxl19_raw():
-    """Bag 1's INS and lidar odometry from its CSV exports."""
-    folder = data_folder() / "zxl19" / "raw_bag1"
-    return Recording(
-        "zxl19 1 LO raw", _inspvax(folder), _odometry_csv(folder / "bag1-aft_mapped_to_init.csv")
-    )
-
-
 def boreas():
     """Lidar (stamps in microseconds) and radar (nanoseconds) of a car, both from one INS."""
     return _of_rig("boreas", "boreas", "boreas")
 
 
-BOREAS_TRUTH = se3.from_rotation_translation(
-    Rotation.from_euler("xyz", [-180.0, 0.0, 46.67], degrees=True).as_matrix(), [0.0, 0.0, 0.21]
-)
-
-
-# Of the unit that EuRoC's odometry calls its body: good to about 10 mm and 0.15 deg.
-EUROC_TRUTH = np.array(
-    [
-        [0.0148655, -0.9998809, 0.0041403, -0.0216401],
-        [0.9995572, 0.0149672, 0.0257155, -0.0646770],
-        [-0.0257744, 0.0037562, 0.9996607, 0.0098107],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
+BOREAS_TRUTH = BOREAS.T_parent_child
+EUROC_TRUTH = EUROC.T_parent_child
+SIMPLE_KITTI_TRUTH = SIMPLE_KITTI.T_parent_child
 
 
 def euroc(estimate, flight):
@@ -170,9 +144,6 @@ def euroc(estimate, flight):
     folder = data_folder() / "euroc_vio"
     files = (folder / f"{estimate}_{flight}.tum", folder / f"cam0_truth_{flight}.tum")
     return Recording(f"euroc {estimate} {flight}", *map(read_trajectory, files))
-
-
-SIMPLE_KITTI_TRUTH = se3.from_quat_xyzw((0.8, -0.3, 0.5), (0.333307, -0.063488, 0.753055, 0.563723))
 
 
 def simple_kitti(drive):
@@ -204,62 +175,8 @@ def all_recordings():
     ]
 
 
-def asl_rows(folder, name):
-    """Rows (N, 8) of a file as they are: ``t x y z qx qy qz qw``, repeated and unsorted too."""
-    return np.loadtxt(data_folder() / folder / f"{name}.csv", delimiter=",")
-
-
 def _of_rig(folder, rig, name, offset_s=0.0, scale=1.0, which="whole"):
     """A recording of :mod:`reproduction.recordings` with what is known about it."""
     rigs = {found.name: found for found in rigs_of(data_folder(), folder)}
     recording = rigs[rig].recordings[which]
     return Recording(name, recording.parent, recording.child, offset_s, scale)
-
-
-def _tidy(stamps_ns, translations, quats_xyzw):
-    stamps_ns, first = np.unique(stamps_ns, return_index=True)
-    return Trajectory.from_quat_xyzw(stamps_ns, translations[first], quats_xyzw[first])
-
-
-def _odometry_csv(path):
-    rows = _spaced_csv(path)
-    stamps_ns = np.array(
-        [int(row[".header.stamp.secs"]) * 10**9 + int(row[".header.stamp.nsecs"]) for row in rows]
-    )
-    position, orientation = (
-        np.array([[float(row[f".pose.pose.{part}.{axis}"]) for axis in axes] for row in rows])
-        for part, axes in (("position", "xyz"), ("orientation", "xyzw"))
-    )
-    return _tidy(stamps_ns, position, orientation)
-
-
-def _inspvax(folder):
-    """NovAtel INS: latitude, longitude and height to a tangent plane; sensor y forward, azimuth
-    clockwise from north.
-    """
-    rows = _spaced_csv(folder / "bag1-novatel_data-inspvax.csv")
-    week, milliseconds = (
-        [int(row[f".header.gps_week{key}"]) for row in rows] for key in ("", "_seconds")
-    )
-    seconds = _GPS_EPOCH_S - _LEAP_SECONDS + 604_800 * np.array(week)
-    stamps_ns = seconds * 10**9 + np.array(milliseconds) * 10**6
-    latitude, longitude, height, roll, pitch, azimuth = (
-        np.array([float(row[f".{key}"]) for row in rows])
-        for key in ("latitude", "longitude", "altitude", "roll", "pitch", "azimuth")
-    )
-    north, east = np.radians(latitude - latitude[0]), np.radians(longitude - longitude[0])
-    shrink = 1 - _ECCENTRICITY_SQUARED * np.sin(np.radians(latitude[0])) ** 2
-    prime_vertical = _EQUATORIAL_RADIUS / np.sqrt(shrink)
-    meridional = prime_vertical * (1 - _ECCENTRICITY_SQUARED) / shrink
-    position = np.c_[
-        east * (prime_vertical + height[0]) * np.cos(np.radians(latitude[0])),
-        north * (meridional + height[0]),
-        height,
-    ]
-    rotation = Rotation.from_euler("ZXY", np.c_[-azimuth, pitch, roll], degrees=True)
-    return _tidy(stamps_ns, position, rotation.as_quat())
-
-
-def _spaced_csv(path):
-    with open(path, encoding="utf-8") as file:
-        return list(csv.DictReader(file, skipinitialspace=True))

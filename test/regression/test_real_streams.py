@@ -76,16 +76,6 @@ class TestRoadVehicle:
         assert max(verdicts["x"].sigma, verdicts["y"].sigma) < 0.05
         np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
 
-    def test_lidar_odometry_from_the_csv_exports(self):
-        recording = real_data.zxl19_raw()
-        result = calibrate(
-            recording.parent, recording.child, time_offset="estimate", reference="B10"
-        )
-        assert "z" in result.unobservable()
-        assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
-        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
-        assert result.time_offset_s == pytest.approx(-214.35, abs=0.02)
-
     @pytest.mark.parametrize(("bag", "scale"), [(1, 3.34), (2, 3.76), (3, 2.66)])
     def test_monocular_scale(self, bag, scale):
         recording = real_data.zxl19(bag, "VO")
