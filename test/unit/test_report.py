@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from motions import write_pair
+from motions import child_of, disturbed, wandering_poses, write_pair
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
@@ -284,6 +284,15 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
     assert "nan" not in re.findall(r"[a-z]+", page.text.lower())
     assert not re.search(r"\binf\b", page.text)
+
+
+def test_stops_have_a_page(tmp_path):
+    poses = wandering_poses(40)
+    stops = hec.calibrate_stops(poses, disturbed(child_of(poses), 1, 1e-3, 1e-3))
+    page = Page(stops.report(tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.errors == []
+    assert [a["id"] for a in page.all("figure")] == ["figure-views", "figure-residuals"]
+    assert "Half of the 40 stops agree with the result to" in page.text
 
 
 @pytest.fixture
