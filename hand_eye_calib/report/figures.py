@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.plot import draw_views, said_of_views
@@ -226,25 +226,10 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
             what = "distances from one position to the next"
     height = 1.0 + 1.6 * len(sizes)
     figure, panels = _figure(height, len(sizes), 1, left=0.7, bottom=0.8, top=0.1, sharex=True)
-    dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
-    dots = dots[_downsample(len(dots), _MOST_DOTS)]
-    axis, largest = next(iter(sizes.items()))
-    crosses = crosses[np.argsort(-largest[crosses])[:_MOST_OUTLIERS]]
-    used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
-    rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
-    for panel, (name, sized) in zip(panels, sizes.items(), strict=True):
+    for panel, (name, values) in zip(panels, sizes.items(), strict=True):
         to_unit, of_axis = _UNITS[name]
-        values = np.maximum(sized * to_unit, 1e-5)  # a logarithm has no zero
-        panel.plot(times[dots], values[dots], "o", **used)
-        panel.plot(times[crosses], values[crosses], "x", **rejected)
-        panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
+        _draw_residuals(panel, times, np.maximum(values * to_unit, 1e-5), is_out)
         panel.set_ylabel(of_axis)
-        panel.yaxis.set_label_coords(-0.06, 0.5)
-        if values.max() > 15 * np.median(values):  # the largest would hide the others
-            panel.set_yscale("log")
-            plain_decades(panel.yaxis)
-        else:
-            panel.set_ylim(0, 1.08 * values.max())
     panels[-1].set_xlabel(label)
     _legend(figure, panels[0])
     halves, furthest = (
@@ -253,15 +238,34 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
     )
     said = f"Half of the {len(residuals):,} {what} agree with the result to {halves}"
     if is_out.any():
-        worst = int(np.argmax(np.where(is_out, largest, -1)))
+        axis, values = next(iter(sizes.items()))
+        worst = int(np.argmax(np.where(is_out, values, -1)))
         at = f"at {times[worst]:.1f} {unit}" if unit else f"stop {worst + 1}"
         said += (
             f"; {is_out.sum():,} ({share(float(is_out.mean()))}) were rejected as outliers, the "
-            f"largest {amount(axis, largest[worst])} {at}."
+            f"largest {amount(axis, values[worst])} {at}."
         )
     else:
         said += f", all of them to {furthest}. There are no outliers."
     return Drawn("residuals", "Residuals", said, as_svg(figure, "residuals"))
+
+
+def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:
+    """Sizes (K,) of residuals, above zero, and which were rejected."""
+    dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
+    dots = dots[_downsample(len(dots), _MOST_DOTS)]
+    crosses = crosses[np.argsort(-values[crosses])[:_MOST_OUTLIERS]]
+    used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
+    rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
+    panel.plot(times[dots], values[dots], "o", **used)
+    panel.plot(times[crosses], values[crosses], "x", **rejected)
+    panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
+    panel.yaxis.set_label_coords(-0.06, 0.5)
+    if values.max() > 15 * np.median(values):  # the largest would hide the others
+        panel.set_yscale("log")
+        plain_decades(panel.yaxis)
+    else:
+        panel.set_ylim(0, 1.08 * values.max())
 
 
 def _time_axis(duration_s: float) -> tuple[float, str]:

@@ -126,10 +126,6 @@ def render(
         Where the data came from, in plain values.
     command : str
         Shell command that publishes the result; empty for none.
-
-    Returns
-    -------
-    str
     """
     inputs = inputs or {}
     calibration = replace(
@@ -141,9 +137,9 @@ def render(
     verdict, _, said = calibration.headline.partition(": ")
     document, numbers = calibration.to_dict(), calibration.usable_numbers()
     evidence = gather(calibration, snapshot) if snapshot else None
-    options = snapshot.config.to_options() if snapshot else {}
-    is_poor = calibration.verdict is Verdict.DO_NOT_USE
-    unknown = {*calibration.out_of_reach}
+    advice, unknown = "", {*calibration.out_of_reach}
+    if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
+        advice = what_is_missing(evidence.excitation, calibration)
     return page(
         "report.html",
         TONES[calibration.verdict.value],
@@ -151,7 +147,6 @@ def render(
         said,
         calibration=calibration,
         at_distance=_at_distance(calibration),
-        labels=inputs.get("labels", {}),
         document=document,
         parent=parent,
         child=child,
@@ -162,24 +157,14 @@ def render(
         ],
         axes=list(_axes(calibration)),
         differences=list(_differences(calibration)),
-        advice=what_is_missing(evidence.excitation, calibration)
-        if evidence and not is_poor
-        else "",
+        advice=advice,
         command=command,
         unknown=listing([value for value in numbers.values() if isinstance(value, str)]),
         target=_targets(calibration),
         reasons=[_reason(reason) for reason in shown(calibration.reasons)],
         figures=figures_of(calibration, evidence),
         shown_first=_SHOWN_FIRST,
-        findings=calibration.findings,
-        summary=_summary(calibration, evidence),
-        streams=[
-            _stream(name, inputs, evidence)
-            for name in ("parent", "child")
-            if evidence or name in inputs
-        ],
-        provenance=list(_provenance(inputs)),
-        options={name: each for name, each in options.items() if each != ""},
+        **_data(calibration, snapshot, evidence, inputs),
     )
 
 
@@ -281,6 +266,21 @@ def _differences(calibration: Calibration) -> Iterable[dict[str, str]]:
 
 
 # ---------------------------------------------------------------- data and provenance
+
+
+def _data(
+    calibration: Calibration, snapshot: Snapshot | None, evidence: Evidence | None, inputs: Plain
+) -> dict[str, Any]:
+    """What the result comes from, for the template."""
+    options = snapshot.config.to_options() if snapshot else {}
+    names = [name for name in ("parent", "child") if evidence or name in inputs]
+    return {
+        "labels": inputs.get("labels", {}),
+        "summary": _summary(calibration, evidence),
+        "streams": [_stream(name, inputs, evidence) for name in names],
+        "provenance": list(_provenance(inputs)),
+        "options": {name: each for name, each in options.items() if each != ""},
+    }
 
 
 def _summary(calibration: Calibration, evidence: Evidence | None) -> dict[str, str]:

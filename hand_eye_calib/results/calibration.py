@@ -332,51 +332,39 @@ class Calibration(Result):
             "version": _VERSION,
             "parent_frame": self.parent_frame,
             "child_frame": self.child_frame,
-            "T_parent_child": self._transform_dict(),
+            "T_parent_child": self._printed_dict(
+                self.T_parent_child, self.parent_frame, self.child_frame, sigmas_m=self.sigmas[:3]
+            ),
             "T_child_parent": self._inverse_dict(),
             "status": self.status,
-            "covariance": {
-                "of": "error xi in T_parent_child @ exp(xi)",
-                "order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"],
-                "frame": self.child_frame,
-                "units": "m, rad",
-                "matrix": self.covariance,
-            },
+            "covariance": _matrix_of(
+                "error xi in T_parent_child @ exp(xi)", self.child_frame, self.covariance
+            )
+            | {"order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]},
             "observability": [
                 vars(dof) | {"sigma_total": total, "frame": self.parent_frame}
                 for dof, total in zip(self.observability, self.sigmas_with_floor, strict=True)
             ],
         }
         if self.T_base_child is not None:
-            document["T_base_child"] = self._base_dict(self.T_base_child)
+            frames = self.base_frame, self.child_frame
+            document["T_base_child"] = self._printed_dict(self.T_base_child, *frames)
         if self.T_method is not None:
             document["T_method"] = {
                 "of": "T_parent_child as the method solved it: nothing set, no prior added",
                 "matrix": self.T_method,
             }
         if self.T_world_world is not None and self.cov_world_world is not None:
-            sigmas_m = sigmas_translation(self.T_world_world, self.cov_world_world)
-            document["T_world_world"] = self._printed_dict(
-                self.T_world_world,
-                self.parent_world_frame,
-                self.child_world_frame,
-                np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m),
-                self.cov_world_world,
-                np.zeros((6, 6)),
+            frames = self.parent_world_frame, self.child_world_frame
+            covariances = self.cov_world_world, np.zeros((6, 6))
+            printed = self._printed_dict(self.T_world_world, *frames, *covariances)
+            document["T_world_world"] = printed
+            document["cov_world_world"] = _matrix_of(
+                "error xi in T_world_world @ exp(xi)", self.child_world_frame, self.cov_world_world
             )
-            document["cov_world_world"] = {
-                "of": "error xi in T_world_world @ exp(xi)",
-                "frame": self.child_world_frame,
-                "units": "m, rad",
-                "matrix": self.cov_world_world,
-            }
         if self.floor is not None:
-            document["floor"] = {
-                "of": "errors of a whole recording, the same in every part; not in the covariance",
-                "frame": self.child_frame,
-                "units": "m, rad",
-                "matrix": self.floor,
-            }
+            of = "errors of a whole recording, the same in every part; not in the covariance"
+            document["floor"] = _matrix_of(of, self.child_frame, self.floor)
         document["sigma_total"] = dict(
             zip((dof.name for dof in self.observability), self.sigmas_with_floor, strict=True)
         )
@@ -387,36 +375,23 @@ class Calibration(Result):
         }
         return cast(dict[str, Any], plain(document))
 
-    def _transform_dict(self) -> dict[str, Any]:
-        frames = self.parent_frame, self.child_frame
-        return self._printed_dict(self.T_parent_child, *frames, self.sigmas[:3])
-
-    def _base_dict(self, T_base_child: FloatArray) -> dict[str, Any]:
-        sigmas_m = sigmas_translation(T_base_child, self.covariance)
-        if self.unobservable():
-            sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
-        return self._printed_dict(T_base_child, self.base_frame, self.child_frame, sigmas_m)
-
     def _inverse_dict(self) -> dict[str, Any]:
         covariance, floor = (
             inverse_covariance(self.T_parent_child, each) for each in (self.covariance, self._floor)
         )
-        sigmas_m = sigmas_translation(self.T_child_parent, covariance)
-        if {*ROTATIONS} <= {*self.out_of_reach}:
-            sigmas_m = self.sigmas[:3]  # the axes of both sensors are the same by convention
-        elif self.unobservable():
-            sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
         frames = self.child_frame, self.parent_frame
-        return self._printed_dict(self.T_child_parent, *frames, sigmas_m, covariance, floor)
+        # Where the rotation is out of reach, the axes of both sensors are the same by convention.
+        sigmas_m = self.sigmas[:3] if {*ROTATIONS} <= {*self.out_of_reach} else None
+        return self._printed_dict(self.T_child_parent, *frames, covariance, floor, sigmas_m)
 
     def _printed_dict(
         self,
         T_target_source: FloatArray,
         target: str,
         source: str,
-        sigmas_m: FloatArray,
         covariance: FloatArray | None = None,
         floor: FloatArray | None = None,
+        sigmas_m: FloatArray | None = None,
     ) -> dict[str, Any]:
         """A transform in the notations people and programs use, with the standard deviation of each
         number that is printed, without and with the common-mode uncertainty; infinite, and no
@@ -424,6 +399,10 @@ class Calibration(Result):
         """
         covariance = self.covariance if covariance is None else covariance
         floor = self._floor if floor is None else floor
+        if sigmas_m is None:
+            sigmas_m = sigmas_translation(T_target_source, covariance)
+            if self.unobservable() or covariance is self.cov_world_world:
+                sigmas_m = np.where(sigmas_m > _UNKNOWN_M, np.inf, sigmas_m)
         is_turn_known = not {*ROTATIONS} & {*self.unobservable()}
         rpy = se3.rotation_to_rpy(T_target_source[:3, :3])
         sigmas, of_floor = (sigmas_rpy(T_target_source, each) for each in (covariance, floor))
@@ -469,3 +448,8 @@ class Calibration(Result):
             raise InputError(
                 f"the calibration was changed after it was written: {error}; restore or repeat it"
             ) from None
+
+
+def _matrix_of(of: str, frame: str, matrix: FloatArray) -> dict[str, Any]:
+    """A covariance of a document, and what it is of."""
+    return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
