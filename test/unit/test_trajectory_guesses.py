@@ -26,11 +26,11 @@ from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.trajectory_files import (
     AUTO,
     FileOptions,
-    layout_of_file,
     read_trajectory_file,
     read_trajectory_files,
     write_trajectory,
 )
+from hand_eye_calib.io.trajectory_files.table import Lines, layout_of
 
 NS = "1403637132888318976"
 EUROC_HEADER = (
@@ -64,7 +64,7 @@ SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
 def test_the_layout_is_recognised(tmp_path, text, format, is_named):
     path = tmp_path / "poses"
     path.write_text(text + "\n")
-    assert layout_of_file(path) == (format, is_named)
+    assert layout_of(Lines(path)) == (format, is_named)
 
 
 def test_what_is_no_file_is_refused_in_one_line(tmp_path):

@@ -29,7 +29,7 @@ from hand_eye_calib.io.trajectory_files.reading import (
     read_trajectory_file,
     read_trajectory_files,
 )
-from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, layout_of_file
+from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "FORMATS",
     "FileOptions",
     "FileReading",
-    "layout_of_file",
     "read_trajectory",
     "read_trajectory_file",
     "read_trajectory_files",

@@ -1,7 +1,8 @@
 """Columns of a table by the names in its header."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from hand_eye_calib.config import STAMP_UNITS
@@ -74,27 +75,22 @@ _UNITS = {
 
 
 class Columns(NamedTuple):
-    """Where the stamp and the values of a pose stand in a row.
-
-    Attributes
-    ----------
-    stamp : list of int
-        One column, or those of seconds and nanoseconds.
-    quantities : dict
-        Name of each quantity to its column.
-    measures : str
-        What they measure, one of config.MEASURES.
-    stamp_unit : str
-        As the header has it; empty if it names none.
-    units : dict
-        Units of quantities that the header names.
+    """Where stamp and values stand in a row: the stamp in one column, in those of seconds and
+    nanoseconds, or in none; the column of each quantity, such as "x" or "qw", and the units that
+    the header names (empty for none); and what they measure, one of config.MEASURES.
     """
 
     stamp: list[int]
     quantities: dict[str, int]
-    measures: str
-    stamp_unit: str
-    units: dict[str, str]
+    measures: str = "poses"
+    stamp_unit: str = ""
+    units: Mapping[str, str] = MappingProxyType({})
+
+    @classmethod
+    def in_order(cls, *quantities: str, stamp_unit: str = "", has_stamp: bool = True) -> "Columns":
+        """A stamp, and quantities of poses in this order."""
+        at = {name: place for place, name in enumerate(quantities, start=has_stamp)}
+        return cls([0][:has_stamp], at, stamp_unit=stamp_unit)
 
 
 def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -> Columns:

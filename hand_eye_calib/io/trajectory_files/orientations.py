@@ -67,7 +67,7 @@ def orientations(
 
 def unit_of(table: Table, name: str, known: Mapping[str, float]) -> str:
     """Unit of a quantity in the header; empty if it has none."""
-    unit = table.units.get(name, "")
+    unit = table.columns.units.get(name, "")
     if unit and unit not in known:
         raise InputError(
             f"{table.path}: column of {name} in {unit}; expected {', '.join(filter(None, known))}"

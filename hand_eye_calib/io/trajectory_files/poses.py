@@ -52,7 +52,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     InputError
         If they are too large, or their unit is not clear.
     """
-    unit = stamp_unit or table.stamp_unit
+    unit = stamp_unit or table.columns.stamp_unit
     largest = max(map(abs, table.stamps))
     recognised = unit or unit_by_size(largest)
     factor = STAMP_UNITS[recognised]
@@ -129,11 +129,11 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, FloatArray
         For values that cannot be; the message names the line.
     """
     values = _finite_values(table)
-    if table.quantities == MATRIX:
+    if MATRIX[0] in table.columns.quantities:
         matrices = values.reshape(-1, 3, 4)
         positions = _checked(table, matrices[:, :, 3])
         return positions, from_matrices(table, matrices[:, :, :3])
-    columns = dict(zip(table.quantities, values.T, strict=True))
+    columns = dict(zip(table.columns.quantities, values.T, strict=True))
     if "lat" in columns:
         return _in_local_frame(table, columns, convention)
     positions = np.zeros((len(values), 3))
@@ -153,7 +153,7 @@ def rates_of(table: Table) -> FloatArray:
         For values that cannot be; the message names the line.
     """
     values = _finite_values(table)
-    units = {unit_of(table, name, _RADIANS_PER_S) for name in table.quantities}
+    units = {unit_of(table, name, _RADIANS_PER_S) for name in table.columns.quantities}
     if len(units) > 1:
         raise InputError(f"{table.path}: the columns of the rates have different units")
     unit = units.pop()

@@ -171,7 +171,8 @@ def _read(path: _Path, options: FileOptions, convention: str = "") -> tuple[File
     if not table.stamps:
         raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
     stamps_ns = stamps_in_ns(table, options.stamp_unit)
-    if table.measures == "rates":
+    measures = table.columns.measures
+    if measures == "rates":
         rates = rates_of(table)
         keep, repairs = in_order(table, stamps_ns, options.repair)
         trajectory = Trajectory.from_rates(stamps_ns[keep], rates[keep])
@@ -179,9 +180,9 @@ def _read(path: _Path, options: FileOptions, convention: str = "") -> tuple[File
     positions, quats_xyzw = poses_of(table, convention)
     keep, repairs = in_order(table, stamps_ns, options.repair)
     trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
-    if table.measures != "poses":
-        table.guess(f"{table.measures} alone, as its columns have it")
-    kind = table.measures if options.measures == AUTO else options.measures
+    if measures != "poses":
+        table.guess(f"{measures} alone, as its columns have it")
+    kind = measures if options.measures == AUTO else options.measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
     return FileReading(trajectory, repairs, table.guesses), table

@@ -11,7 +11,7 @@ from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     POSITION,
     QUATERNION,
     UNNAMED,
+    Columns,
     are_columns,
     choose_columns,
     listed,
@@ -171,35 +172,24 @@ def _is_row(cells: Sequence[str]) -> bool:
 # ---- what a file looks like
 
 
-class Layout(NamedTuple):
-    """What a file looks like: one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum in
+def layout_of(lines: Lines) -> tuple[str, bool]:
+    """The format that lines have, one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum in
     doubt, so that its reader says what is wrong; and whether the file itself names its columns.
     """
-
-    format: str
-    is_named: bool
-
-
-def layout_of_file(path: _Path) -> Layout:
-    """What the lines of a file look like; an InputError if it cannot be read."""
-    return _layout_of(Lines(path))
-
-
-def _layout_of(lines: Lines) -> Layout:
     data = lines.first()[1].strip()
     cells = _cells_of(data)
     is_separated, n_cells = "," in data or ";" in data, len(cells)
     if not _is_row(cells):
         is_table = is_separated or n_cells >= 8 or are_columns(cells)
-        return Layout("csv" if is_table else "tum", is_table)
+        return ("csv" if is_table else "tum"), is_table
     names, _ = lines.header()
     if names is not None and are_columns(names):
         is_tum = not is_separated and " ".join(names).lower().endswith(TUM_COLUMNS[10:])
-        return Layout("tum" if is_tum else "csv", True)
+        return ("tum" if is_tum else "csv"), True
     if not is_separated:
-        return Layout("kitti" if n_cells == 12 else "tum", False)
+        return ("kitti" if n_cells == 12 else "tum"), False
     is_ns = cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS
-    return Layout("euroc" if is_ns and n_cells >= 8 else "csv", False)
+    return ("euroc" if is_ns and n_cells >= 8 else "csv"), False
 
 
 # ---- tables
@@ -213,12 +203,7 @@ class Table:
     ----------
     expected : str
         What a row should be, for messages.
-    quantities : tuple of str
-        What the values of a row are, in their order, such as "x" or "qw".
-    measures : str
-        What they measure, one of config.MEASURES.
-    stamp_unit, units : str, dict
-        Those of the stamps and of quantities that the header names.
+    columns : Columns
     guesses : list of str
         What a person should know of how the file was read.
     header : tuple of str
@@ -229,39 +214,34 @@ class Table:
 
     path: _Path
     expected: str
-    quantities: tuple[str, ...]
-    measures: str = "poses"
-    stamp_unit: str = ""
-    units: dict[str, str] = field(default_factory=dict)
+    columns: Columns
+    header: tuple[str, ...] = ()
     line_numbers: "array[int]" = field(default_factory=lambda: array("q"))
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
     guesses: list[str] = field(default_factory=list)
-    header: tuple[str, ...] = ()
     conventions: list[str] = field(default_factory=list)
 
     @property
     def values(self) -> FloatArray:
         """(N, k) array: the values of each row."""
-        return np.asarray(self.numbers, dtype=float).reshape(-1, len(self.quantities))
+        return np.asarray(self.numbers, dtype=float).reshape(-1, len(self.columns.quantities))
 
     def fill(
         self,
         lines: Iterable[tuple[int, Any]],
         cells_of: Callable[[Any], list[str]],
         n_columns: int,
-        at: Sequence[int],
-        stamp_at: Sequence[int] = (0,),
         may_have_more: bool = False,
-    ) -> None:
-        """Add rows from their text: the values of some columns, and the stamp from one column, or
-        from those of seconds and nanoseconds.
+    ) -> Self:
+        """Add rows from their text.
 
         Raises
         ------
         InputError
             At the first line with another number of cells, or with something that is no number.
         """
+        stamp_at, at = self.columns.stamp, [*self.columns.quantities.values()]
         for number, text in lines:
             cells = cells_of(text)
             if len(cells) != n_columns and not (may_have_more and len(cells) > n_columns):
@@ -280,6 +260,7 @@ class Table:
                     f"{self.path}, line {number}: expected {self.expected}; {reason}"
                 ) from None
             self.line_numbers.append(number)
+        return self
 
     def guess(self, text: str) -> None:
         """Note how something was read that the file does not say."""
@@ -335,53 +316,40 @@ def read_table(path: _Path, options: FileOptions) -> Table:
         table.guesses += [f"{path}: {note}" for note in found.notes]
         return table
     lines = Lines(path)
-    layout, guesses = Layout(options.format, True), list[str]()
+    format, is_named, guesses = options.format, True, list[str]()
     columns, times = options.columns, options.times
-    if options.format == AUTO:
-        layout = _layout_of(lines)
+    if format == AUTO:
+        format, is_named = layout_of(lines)
         if columns is None and times is None:
-            if not layout.is_named and len(_cells_of(lines.first()[1])) == 4:
+            if not is_named and len(_cells_of(lines.first()[1])) == 4:
                 columns = _OF_FOUR.get(options.measures)
                 if columns is None:
                     raise InputError(
                         f"{path}: four columns without names; name them with `columns`: t,x,y,z "
                         "for positions, t,wx,wy,wz for angular rates"
                     )
-            elif layout.format != "tum":
-                guesses = [
-                    f"{path} looks like format {layout.format}; to change that, give `format`"
-                ]
+            elif format != "tum":
+                guesses = [f"{path} looks like format {format}; to change that, give `format`"]
         if columns is not None or times is not None:
-            layout = Layout("csv" if columns is not None else "kitti", True)
+            format, is_named = "csv" if columns is not None else "kitti", True
         beside = Path(path).with_name(_TIMES)
-        if layout.format == "kitti" and times is None and beside.is_file():
+        if format == "kitti" and times is None and beside.is_file():
             times = beside
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
-    if layout.format == "csv":
+    if format == "csv":
         table = _read_csv(path, lines, columns, options)
-    elif layout.format == "kitti":
+    elif format == "kitti":
         table = _read_kitti(path, lines, times)
-    else:
-        table = _read_poses(path, lines, layout)
-    table.guesses[:0] = guesses
-    return table
-
-
-def _read_poses(path: _Path, lines: Lines, layout: Layout) -> Table:
-    """A stamp, a position and a quaternion, in the order of tum or of euroc."""
-    if layout.format == "euroc":
+    elif format == "euroc":
         expected = "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz"
-        table = Table(path, expected, (*POSITION, "qw", "qx", "qy", "qz"), stamp_unit="ns")
-        table.fill(
-            lines.data(),
-            lambda text: [*map(str.strip, text.split(","))],
-            *(8, range(1, 8)),
-            may_have_more=True,
-        )
-        return table
-    quaternion = QUATERNION if layout.is_named else UNNAMED
-    table = Table(path, f"8 numbers, {TUM_COLUMNS}", (*POSITION, *quaternion))
-    table.fill(lines.data(), str.split, 8, range(1, 8))
+        places = Columns.in_order(*POSITION, "qw", "qx", "qy", "qz", stamp_unit="ns")
+        table = Table(path, expected, places)
+        table.fill(lines.data(), lambda text: [*map(str.strip, text.split(","))], 8, True)
+    else:
+        places = Columns.in_order(*POSITION, *(QUATERNION if is_named else UNNAMED))
+        table = Table(path, f"8 numbers, {TUM_COLUMNS}", places)
+        table.fill(lines.data(), str.split, 8)
+    table.guesses[:0] = guesses
     return table
 
 
@@ -391,14 +359,14 @@ def _read_kitti(path: _Path, lines: Lines, times: _Path | None) -> Table:
         raise ConfigError(
             f"{path}: the poses of format kitti have no stamps; name their file with `times`"
         )
-    table = Table(path, "12 numbers, the first three rows of a pose", MATRIX)
-    table.fill(lines.data(), str.split, len(MATRIX), range(len(MATRIX)), ())
-    stamps = Table(times, "a stamp", ())
-    stamps.fill(Lines(times, "stamps").data(), str.split, 1, (), may_have_more=True)
-    table.stamps = stamps.stamps
-    if len(stamps.stamps) != len(table.line_numbers):
+    places = Columns.in_order(*MATRIX, has_stamp=False)
+    table = Table(path, "12 numbers, the first three rows of a pose", places)
+    table.fill(lines.data(), str.split, len(MATRIX))
+    stamps = Table(times, "a stamp", Columns.in_order())
+    table.stamps = stamps.fill(Lines(times, "stamps").data(), str.split, 1, True).stamps
+    if len(table.stamps) != len(table.line_numbers):
         raise InputError(
-            f"{path}: {len(table.line_numbers)} poses, but {times} has {len(stamps.stamps)} "
+            f"{path}: {len(table.line_numbers)} poses, but {times} has {len(table.stamps)} "
             "stamps; they belong to different recordings"
         )
     return table
@@ -413,20 +381,18 @@ def _read_csv(path: _Path, lines: Lines, columns: str | None, options: FileOptio
     else:
         header = [name.strip() for name in columns.split(",")]
         after = 0 if any(map(_NUMBER.fullmatch, cells)) else number
-    if header is None:  # a stamp, a position and a quaternion, whose order is to be found
-        if cells and not (options.format == AUTO and len(cells) == 8):
-            raise InputError(
-                f"{path}: the first line names no columns, so the order of the quaternion is "
-                "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
-                f"{len(cells)}"
-            )
-        expected = "8 columns: a stamp, a position and a quaternion"
-        table = Table(path, expected, (*POSITION, *UNNAMED))
-        table.fill(lines.data(), _cells_of, 8, range(1, 8))
-        return table
-    table = table_of(path, header, lines.data(after), _cells_of, options.measures)
-    table.header = tuple(header)
-    return table
+    if header is not None:
+        return table_of(path, header, lines.data(after), _cells_of, options.measures)
+    if cells and not (options.format == AUTO and len(cells) == 8):
+        raise InputError(
+            f"{path}: the first line names no columns, so the order of the quaternion is "
+            "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
+            f"{len(cells)}"
+        )
+    # A stamp, a position and a quaternion, whose order is to be found.
+    places = Columns.in_order(*POSITION, *UNNAMED)
+    table = Table(path, "8 columns: a stamp, a position and a quaternion", places)
+    return table.fill(lines.data(), _cells_of, 8)
 
 
 def table_of(
@@ -445,9 +411,6 @@ def table_of(
     """
     if len(names) > MOST_COLUMNS:
         raise InputError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
-    chosen = choose_columns(path, names, measures)
     expected = f"{len(names)} columns: {listed(names)}"
-    quantities, at = zip(*chosen.quantities.items(), strict=True)
-    table = Table(path, expected, quantities, chosen.measures, chosen.stamp_unit, chosen.units)
-    table.fill(lines, cells_of, len(names), at, chosen.stamp)
-    return table
+    table = Table(path, expected, choose_columns(path, names, measures), tuple(names))
+    return table.fill(lines, cells_of, len(names))
