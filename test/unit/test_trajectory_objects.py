@@ -41,14 +41,12 @@ class TestReading:
         assert_same(hec.read_trajectory(POSES, times=dates), 0)
         assert_same(hec.read_trajectory(POSES.tolist(), times=SECONDS.tolist()))
 
-    def test_rows_in_the_order_of_tum_or_in_one_that_is_named(self):
+    def test_rows_in_the_order_of_tum(self):
         tum = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
         assert_same(hec.read_trajectory(rows(*tum)))
         assert_same(hec.read_trajectory(rows(*tum[1:]), times=SECONDS))
-        other = ("qw", "qx", "qy", "qz", "x", "y", "z", "t")
-        assert_same(hec.read_trajectory(rows(*other), columns=",".join(other)))
         with pytest.raises(InputError, match="quaternion of length"):
-            hec.read_trajectory(rows(*other))
+            hec.read_trajectory(rows(*reversed(tum)))
 
     def test_a_topic_of_a_bag(self, tmp_path):
         hec.write_trajectory(tmp_path / "bag", TRAJECTORY, "mcap", topic="/lidar")
@@ -63,8 +61,8 @@ class TestReading:
             (POSES, {"times": SECONDS[:-1]}, InputError, "one stamp per pose; found 29 stamps"),
             (5, {"times": SECONDS}, InputError, r"expected a path, .* found an array \(\)"),
             ({"a": 1}, {}, InputError, "expected a path, .* found dict"),
-            (np.zeros((3, 5)), {}, InputError, "found 5 columns"),
-            (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "tables and for arrays"),
+            (np.zeros((3, 5)), {}, InputError, r"rows are of t, x, .*; found an array \(3, 5\)"),
+            (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "for text files"),
             (POSES, {"times": SECONDS, "stamp_unit": "h"}, ConfigError, "unknown unit"),
             (POSES, {"times": "file.txt"}, ConfigError, "for text files"),
             (POSES, {"times": SECONDS, "format": "csv"}, ConfigError, "for text files"),
@@ -97,14 +95,12 @@ class TestTables:
         names = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
         return self.pd.DataFrame(rows(*names), columns=names).assign(**more)
 
-    def test_columns_are_found_by_their_names_or_named(self):
+    def test_columns_are_found_by_their_names(self):
         assert_same(hec.read_trajectory(self.frame(speed=1.0)))
         exact = self.frame(t=TRAJECTORY.stamps_ns)
         assert_same(hec.read_trajectory(exact), 0)
         assert_same(hec.read_trajectory(exact[[*reversed(exact.columns)]]), 0)
-        renamed = exact.rename(columns=str.upper)
-        assert_same(hec.read_trajectory(renamed, columns="t,x,y,z,qx,qy,qz,qw"), 0)
-        with pytest.raises(InputError, match="found 7 columns, without qw"):
+        with pytest.raises(InputError, match="the columns lack qw of t, x, y"):
             hec.read_trajectory(exact.drop(columns="qw"))
 
     def test_an_index_of_times_is_the_stamps(self):

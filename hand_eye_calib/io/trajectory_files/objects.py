@@ -32,7 +32,6 @@ PoseObject: TypeAlias = Trajectory | NamedColumns | np.ndarray | Sequence[Any]
 def trajectory_from_object(
     source: PoseObject,
     times: ArrayLike | None = None,
-    columns: str | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
 ) -> tuple[Trajectory, list[str]]:
@@ -46,29 +45,31 @@ def trajectory_from_object(
         If options do not go together.
     """
     if isinstance(source, Trajectory):
-        if times is not None or columns or stamp_unit:
+        if times is not None or stamp_unit:
             raise ConfigError("a Trajectory has stamps and poses already: give no other option")
         return source, []
-    names = [name.strip() for name in columns.split(",")] if columns is not None else None
-    values = np.empty(0)
+    names = [*_POSE] if times is not None else ["t", *_POSE]
     if hasattr(source, "columns"):
-        cells = [np.asarray(source[key]) for key in source.columns]
-        names = names or [str(name) for name in source.columns]
+        cells = {str(key): np.asarray(source[key]) for key in source.columns}
+        if missing := {*names} - cells.keys():
+            raise InputError(
+                f"expected {_KINDS}; the columns lack {', '.join(sorted(missing))} of "
+                f"{', '.join(names)}; give the stamps with `times` if they are elsewhere"
+            )
+        values = np.stack([cells[name] for name in _POSE], axis=1).astype(float)
+        times = cells["t"] if times is None else times
     else:
         try:
             values = np.asarray(source, dtype=float)
         except (TypeError, ValueError):
             raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
-        if values.ndim != 2 and values.shape[1:] != (4, 4):
-            raise InputError(f"expected {_KINDS}; found an array {values.shape}")
-        cells = [*values.T] if values.ndim == 2 else []
-        names = names or [*(("t", *_POSE) if times is None else _POSE)]
-    if values.ndim != 3:
-        cell_of = _by_name(cells, names, times is None)
-        times = cell_of["t"] if times is None else times
-        values = np.stack([cell_of[name] for name in _POSE], axis=1).astype(float)
-    elif columns:
-        raise ConfigError("columns are named for tables and for arrays of rows only")
+        is_of_rows = values.ndim == 2 and values.shape[1] == len(names)
+        if not is_of_rows and values.shape[1:] != (4, 4):
+            raise InputError(
+                f"expected {_KINDS}: rows are of {', '.join(names)}; found an array {values.shape}"
+            )
+        if is_of_rows and times is None:
+            times, values = values[:, 0], values[:, 1:]
     if times is None:
         raise InputError("the poses have no stamps: give them with `times`, in seconds")
     stamps_ns, notes = to_nanoseconds(times, stamp_unit), list[str]()
@@ -85,21 +86,6 @@ def trajectory_from_object(
     if values.ndim == 3:
         return Trajectory(stamps_ns, values), notes
     return Trajectory.from_quat_xyzw(stamps_ns, values[:, :3], values[:, 3:]), notes
-
-
-def _by_name(
-    cells: Sequence[np.ndarray], names: Sequence[str], needs_times: bool
-) -> dict[str, np.ndarray]:
-    """Columns by their names; those of a stamp and a pose must be among them."""
-    missing = {*_POSE, *(["t"] if needs_times else [])} - {*names}
-    if len(cells) != len(names) or missing:
-        lacks = f", without {', '.join(sorted(missing))}" if missing else ""
-        raise InputError(
-            f"expected {_KINDS}; found {len(cells)} columns{lacks}. Columns are "
-            "t,x,y,z,qx,qy,qz,qw, without t if there are `times`; another order or other names "
-            "are given with `columns`"
-        )
-    return dict(zip(names, cells, strict=True))
 
 
 def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:

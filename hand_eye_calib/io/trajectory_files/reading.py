@@ -57,7 +57,7 @@ def read_trajectory(
         Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf``
         and ``/tf_static``.
     columns : str, optional
-        For csv without a header, tables and rows in memory: the columns' names, such as
+        For csv without a header: the columns' names, such as
         ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other
         names are columns to skip.
     times : str, path-like or (N,) array-like, optional
@@ -122,9 +122,9 @@ def read_trajectory(
         )
         notes = [*guesses, *repairs]
     else:
-        if format != _USUAL or isinstance(times, _Path) or measures != AUTO:
-            raise ConfigError("format, measures and a file of times are for text files")
-        trajectory, notes = trajectory_from_object(source, times, columns, stamp_unit, repair)
+        if format != _USUAL or columns or isinstance(times, _Path) or measures != AUTO:
+            raise ConfigError("format, columns, measures and a file of times are for text files")
+        trajectory, notes = trajectory_from_object(source, times, stamp_unit, repair)
     for text in notes:
         warnings.warn(text, UserWarning, stacklevel=2)
     return trajectory

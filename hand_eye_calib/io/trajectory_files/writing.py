@@ -47,13 +47,10 @@ def write_trajectory(
             raise ConfigError(f"trajectories are written in one of {known}; got {format!r}")
         return write_bag(path, {topic: (trajectory, "nav_msgs/msg/Odometry")}, format)
     try:
-        write_atomically({Path(path): _tum_text(trajectory)})
+        text = "\n".join([f"# {TUM_COLUMNS}", *tum_lines(trajectory), ""])
+        write_atomically({Path(path): text})
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
-
-
-def _tum_text(trajectory: Trajectory) -> str:
-    return "\n".join([f"# {TUM_COLUMNS}", *tum_lines(trajectory), ""])
 
 
 def tum_lines(trajectory: Trajectory) -> list[str]:
