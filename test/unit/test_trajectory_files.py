@@ -300,7 +300,7 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
     write_trajectory(tmp_path / "child.tum", child)
     lines = rows(TRAJECTORY.stamps_ns, "wxyz")
     files = [str(file([*lines, lines[3]])), str(tmp_path / "child.tum")]
-    command = ["calibrate", *files, "--json", "--reference", "B5", "--columns", WXYZ]
+    command = ["calibrate", *files, "--json", "--reference", "B5", "--parent-columns", WXYZ]
     command += ["--parent-frame", "a", "--child-frame", "b"]
     assert main([*command, "--parent-format", "csv", "--out", str(tmp_path / "out")]) in (0, 3)
     out, err = capsys.readouterr()
