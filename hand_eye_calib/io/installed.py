@@ -22,7 +22,7 @@ from hand_eye_calib.io.urdf import read_urdf
 from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.exports import FORMATS, arranged
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.text import parse_pose
 
 # Results say what they are.
@@ -135,7 +135,8 @@ def pose_of(*values: Any) -> FloatArray:
     elif sizes == (3, 9):
         T[:3, 3], T[:3, :3] = flat[:3], flat[3:].reshape(3, 3)
     elif sizes == (3, 3):
-        T = _of_angles(np.r_[flat[:3], np.radians(flat[3:])])
+        rotation = se3.rotation_from_rpy(np.radians(flat[3:]))
+        T = se3.from_rotation_translation(rotation, flat[:3])
     else:
         raise InputError(
             "expected a pose: 12 or 16 numbers of a matrix, 7 of x, y, z, qx, qy, qz, qw, or "
@@ -167,20 +168,15 @@ def _numbers(value: Any) -> list[float]:
         return []
 
 
-def _of_angles(values: Any) -> FloatArray:
-    """A pose (4, 4) from x, y, z, roll, pitch, yaw."""
-    rotation = se3.rotation_from_rpy(np.array(values[3:]))
-    return se3.from_rotation_translation(rotation, np.array(values[:3]))
-
-
 def _of_numbers(text: str) -> FloatArray:
     try:
-        return _of_angles(parse_pose("installed", text))
+        values = parse_pose("installed", text)
     except ConfigError as error:
         raise ConfigError(
             "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or six "
             f"numbers in m and rad: {error}"
         ) from None
+    return se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
 
 
 def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
@@ -223,9 +219,9 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
     """
     nodes, frames = [*_nodes(document, ())], FrameTree("the file")
     for above, node in nodes:
-        for parent, child, value in _named(above, node):
-            T = value if isinstance(value, np.ndarray) else pose_of(value)
-            frames.add(str(parent).lstrip("/"), str(child).lstrip("/"), T)
+        if named := _named(above, node):
+            parent, child = (str(name).lstrip("/") for name in named[:2])
+            frames.add(parent, child, pose_of(*named[2:]))
     if frames.edges:
         return frames.pose(parent_frame, child_frame)
     for layouts in FORMATS.values():
@@ -234,7 +230,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
         ]
         if fitting:
             layout, is_inverted, _ = arranged(fitting, parent_frame, child_frame)
-            T = pose_of(*_of_sensors(nodes, layout.keys, parent_frame, child_frame))
+            T = pose_of(*_of_sensors(nodes, layout.keys, {parent_frame, child_frame}))
             return se3.inverse(T) if is_inverted else T
     if len(_numbers(document)) in (12, 16):
         return pose_of(document)
@@ -256,42 +252,37 @@ def _nodes(document: Any, above: tuple[str, ...]) -> Iterator[_Node]:
             yield from _nodes(each, above)
 
 
-def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> Iterator[tuple[Any, Any, Any]]:
-    """Parent, child and pose of a node that names both frames."""
+def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Parent, child and pose of a node that names both frames; empty for another one."""
     header, about = node.get("header"), node.get("parameters")
     if isinstance(header, Mapping) and "child_frame_id" in node:  # TransformStamped
-        yield header.get("frame_id"), node["child_frame_id"], node.get("transform")
-    elif {"parent", "child", "value"} <= node.keys():
-        yield node["parent"], node["child"], node["value"]
-    elif {*AXES} <= node.keys() and len(above) > 1:
-        values = _numbers([node[name] for name in AXES])
-        if not np.isfinite(values).all() or len(values) != len(AXES):
-            raise InputError("expected six numbers: x, y, z, roll, pitch, yaw")
-        yield above[-2], above[-1], _of_angles(values)
-    elif isinstance(about, Mapping) and "transform" in node:  # easy_handeye2
+        return header.get("frame_id"), node["child_frame_id"], node.get("transform")
+    if {"parent", "child", "value"} <= node.keys():
+        return node["parent"], node["child"], node["value"]
+    if {*AXES} <= node.keys() and len(above) > 1:
+        rpy_deg = np.degrees(_numbers([node[name] for name in ROTATIONS]))
+        return *above[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
+    if isinstance(about, Mapping) and "transform" in node:  # easy_handeye2
         is_fixed = about.get("calibration_type") == "eye_on_base"
         robot = about.get("robot_base_frame" if is_fixed else "robot_effector_frame")
-        yield robot, about.get("tracking_base_frame"), node["transform"]
+        return robot, about.get("tracking_base_frame"), node["transform"]
+    return ()
 
 
-def _of_sensors(
-    nodes: list[_Node], keys: tuple[str, ...], parent_frame: str, child_frame: str
-) -> list[Any]:
-    """What stands under some keys; of several, that of these sensors."""
-    found = [
-        ({*above, *map(str, node.values())}, values)
-        for above, node in nodes
-        if (values := _at(node, keys))
-    ]
+def _of_sensors(nodes: list[_Node], keys: tuple[str, ...], frames: set[str]) -> list[Any]:
+    """What stands under some keys; of several, that of these frames."""
+    found = [(node, values) for node in nodes if (values := _at(node[1], keys))]
     if len(found) > 1:
-        names = {parent_frame, child_frame}
-        named = [each for each in found if any(name.strip("/") in names for name in each[0])]
-        if len(named) != 1:
-            raise InputError(
-                f"has {len(found)} extrinsics, and none or several of them are named "
-                f"{child_frame}; leave the one that is meant"
-            )
-        found = named
+        found = [
+            ((above, node), values)
+            for (above, node), values in found
+            if any(name.strip("/") in frames for name in (*above, *map(str, node.values())))
+        ]
+    if len(found) != 1:
+        raise InputError(
+            "has several extrinsics, and none or several of them are named "
+            f"{' or '.join(sorted(frames))}; leave the one that is meant"
+        )
     return found[0][1]
 
 
@@ -302,7 +293,5 @@ def _at(node: Mapping[str, Any], keys: tuple[str, ...]) -> list[Any]:
         value: Any = node
         for part in [key] if key in node else key.split("."):
             value = value.get(part) if isinstance(value, Mapping) else None
-        if value is None:
-            return []
         found.append(value)
-    return found
+    return [] if None in found else found

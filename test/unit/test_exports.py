@@ -236,7 +236,7 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
         (
             "cam0: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}\n"
             "cam1: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}",
-            "has 2 extrinsics, and none",
+            "has several extrinsics, and none",
         ),
     ],
 )
