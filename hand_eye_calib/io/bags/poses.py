@@ -7,10 +7,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry.trajectory import Trajectory
 
 ObjectArray = NDArray[np.object_]
+
+# A delay against the bag's time is of a wrong stamp if it is this many times farther from both
+# neighbours than these from each other (and than the usual step), and this far.
+_FACTOR, _SMALLEST_JUMP_S = 10.0, 0.5
 
 
 class PoseColumns(NamedTuple):
@@ -95,3 +99,21 @@ class PoseBlock:
         positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
         frames = poses.sensor_frames[0] or "", poses.world_frames[0]
         return Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)
+
+
+def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
+    """Mask (N,) of the stamps (N,) that can be right, of messages in the order of the recording.
+
+    A single stamp that jumps away from the bag's own time (N,) and back is wrong: with it, a
+    recording of minutes would last for years.
+    """
+    if len(stamps_ns) < 3:
+        return np.ones(len(stamps_ns), dtype=bool)
+    delays_s = np.asarray(bag_ns - stamps_ns, dtype=float) * 1e-9
+    # At both ends the two neighbours are on one side.
+    delays_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
+    steps_s, across_s = np.abs(np.diff(delays_s)), np.abs(delays_s[2:] - delays_s[:-2])
+    off_s = np.minimum(steps_s[:-1], steps_s[1:])
+    usual_s = across_s + np.median(steps_s[1:-1])
+    is_believable: BoolArray = (off_s <= _SMALLEST_JUMP_S) | (off_s <= _FACTOR * usual_s)
+    return is_believable

@@ -33,10 +33,9 @@ from hand_eye_calib.io.bags.messages import (
     unpack_path,
     unpack_transforms,
 )
-from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns
+from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, are_believable
 from hand_eye_calib.io.bags.storage import BLOCK_SIZE, message_blocks, open_bags
 from hand_eye_calib.io.bags.topics import Source, Topics, joined_parts
-from hand_eye_calib.io.plausibility import are_believable
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
 
 T = TypeVar("T")

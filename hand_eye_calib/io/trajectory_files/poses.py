@@ -8,8 +8,8 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import FARTHEST_M, far_position
 from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
-from hand_eye_calib.io.plausibility import check_positions
 from hand_eye_calib.io.trajectory_files.columns import MATRIX
 from hand_eye_calib.io.trajectory_files.orientations import (
     LARGEST_RAD,
@@ -178,11 +178,8 @@ def _finite_values(table: Table) -> FloatArray:
 
 def _checked(table: Table, positions: FloatArray) -> FloatArray:
     """The positions (N, 3), none of which is too far away."""
-    try:
-        check_positions(positions)
-    except InputError as error:
-        line = table.line_numbers[getattr(error, "index", 0)]
-        raise InputError(f"{table.path}, line {line}: {error}; check its unit") from None
+    is_far = (np.abs(positions) > FARTHEST_M).any(axis=1)
+    table.refuse(is_far, lambda row: f"{far_position(*positions[row])}; check its unit")
     return positions
 
 
