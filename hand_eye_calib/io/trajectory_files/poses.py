@@ -178,8 +178,8 @@ def _finite_values(table: Table) -> FloatArray:
 
 def _checked(table: Table, positions: FloatArray) -> FloatArray:
     """The positions (N, 3), none of which is too far away."""
-    is_far = (np.abs(positions) > FARTHEST_M).any(axis=1)
-    table.refuse(is_far, lambda row: f"{far_position(*positions[row])}; check its unit")
+    is_far = np.abs(positions).max(axis=1) > FARTHEST_M
+    table.refuse(np.asarray(is_far), lambda row: f"{far_position(*positions[row])}; check its unit")
     return positions
 
 
