@@ -14,7 +14,7 @@ longer than that between the sensors.
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -189,42 +189,25 @@ _ORIENTATIONS = [
 ]
 
 
-@functools.cache
-def _axis_hypotheses() -> list[Hypothesis]:
-    """All permutations and flips of the axes of the positions, except the mirror of all three; the
-    simplest first.
-    """
-    hypotheses = []
+def _axis_hypotheses() -> Iterator[Hypothesis]:
+    """All permutations and flips of the axes of the positions, except the mirror of all three."""
     for order, signs in itertools.product(
         itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     ):
         matrix = np.zeros((3, 3))
         matrix[range(3), order] = signs
         n_changed = int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
-        detail = " ".join(
-            f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in zip(order, signs, strict=True)
-        )
+        parts = zip(order, signs, strict=True)
+        detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in parts)
         if n_changed and not np.array_equal(matrix, _MIRROR):
-            hypotheses += [
-                Hypothesis("axes", stream, functools.partial(_with_axes, matrix), n_changed, detail)
-                for stream in ("child", "parent")
-            ]
-    return sorted(hypotheses, key=lambda hypothesis: hypothesis.complexity)
+            correct = functools.partial(_with_axes, matrix)
+            for stream in ("child", "parent"):
+                yield Hypothesis("axes", stream, correct, n_changed, detail)
 
 
 def explain(streams: StreamPair, thorough: bool) -> Explanation:
-    """Find the mistake that explains the streams, or that none does.
-
-    Parameters
-    ----------
-    streams : StreamPair
-    thorough : bool
-        The angular rates agree, so that it pays to try wrong axes, too. They are many and tried
-        once.
-
-    Returns
-    -------
-    Explanation
+    """Find the mistake that explains the streams, or that none does; ``thorough`` if the angular
+    rates agree, so that it pays to try wrong axes, too, which are many.
 
     Raises
     ------

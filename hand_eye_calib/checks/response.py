@@ -52,14 +52,8 @@ MAX_ROTATION = 2.8
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a group of columns is fitted with.
-
-    Attributes
-    ----------
-    values, sigmas : (m,) arrays
-        Of the group's columns; standard deviations by the jackknife over blocks of time.
-    share : float
-        Share of the squared residuals that the group takes away.
+    """What a group of m columns is fitted with: values and standard deviations (m,), by the
+    jackknife over blocks of time, and the share of the squared residuals that it takes away.
     """
 
     values: FloatArray
@@ -100,18 +94,13 @@ class Regression:
             for (name, column), end in zip(columns.items(), ends, strict=True)
         }
         flat = np.concatenate([*columns.values(), target[:, :, None]], axis=2)
-        edges = np.linspace(0, len(flat), _BLOCKS + 1).astype(int)[:-1]
+        edges = np.linspace(0, len(flat), _BLOCKS + 1).astype(int)[1:-1]
         known = self._indices(())
         weights = np.ones(len(flat))
         for _ in range(_ROUNDS):
-            weighted = flat * weights[:, None, None]
+            parts = np.split(flat * weights[:, None, None], edges), np.split(flat, edges)
             self.blocks = np.stack(
-                [
-                    np.tensordot(part, other, axes=((0, 1), (0, 1)))
-                    for part, other in zip(
-                        np.split(weighted, edges[1:]), np.split(flat, edges[1:]), strict=True
-                    )
-                ]
+                [np.tensordot(*pair, axes=((0, 1), (0, 1))) for pair in zip(*parts, strict=True)]
             )
             if noise:
                 gram = self.blocks.sum(axis=0)[:3, :3]
@@ -195,12 +184,10 @@ def long_response(
     a, b = A[:, :3, 3], B[:, :3, 3] @ R.T
     chords = A[:, :3, :3] - np.eye(3)
     target_t, target_r = b - a - chords @ t, y - x
-    units = [
+    unit_t, unit_r = (
         max(median(np.linalg.norm(v, axis=1)) / MEDIAN_LENGTH, least)
         for v, least in ((target_t, 1e-7), (target_r, 1e-8))
-    ]
-    K = len(x)
-    none = np.zeros((K, 3, 3))
+    )
     from_parent = np.swapaxes(pose_pairs.Ts_pw_p[motions.i, :3, :3], 1, 2)
     from_child = R @ np.swapaxes(pose_pairs.Ts_cw_c[motions.i, :3, :3], 1, 2)
     dp = pose_pairs.Ts_pw_p[motions.j, :3, 3] - pose_pairs.Ts_pw_p[motions.i, :3, 3]
@@ -215,33 +202,28 @@ def long_response(
     middle = middle - middle.mean(axis=0)
     axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
     along = (x @ axes)[:, None, :] * axes[None]
+
+    def both(of_t: FloatArray, of_r: FloatArray | None = None) -> FloatArray:
+        of_r = np.zeros_like(of_t) if of_r is None else of_r
+        return np.concatenate([of_t / unit_t, of_r / unit_r], axis=1)
+
     columns = {
-        "lever": (chords, none),
-        "rotation": (se3.skew(b), se3.skew(y)),
-        "scale": (b[:, :, None], none[:, :, :1]),
-        "turned_child": (-from_child @ se3.skew(dc), none),
-        "turned_parent": (from_parent @ se3.skew(dp), none),
-        "axes_child": (from_child * dc_seen[:, None, :], none),
-        "axes_parent": (-from_parent * dp_seen[:, None, :], none),
-        "drift": (
-            np.concatenate([moved, -moved @ se3.skew(middle)], axis=2),
-            np.concatenate([none, moved], axis=2),
-        ),
-        "gain": (none, along),
+        "lever": both(chords),
+        "rotation": both(se3.skew(b), se3.skew(y)),
+        "scale": both(b[:, :, None]),
+        "turned_child": both(-from_child @ se3.skew(dc)),
+        "turned_parent": both(from_parent @ se3.skew(dp)),
+        "axes_child": both(from_child * dc_seen[:, None, :]),
+        "axes_parent": both(-from_parent * dp_seen[:, None, :]),
+        "drift": np.concatenate([both(moved), both(-moved @ se3.skew(middle), moved)], axis=2),
+        "gain": both(np.zeros_like(along), along),
     }
     if moved_at_ns is not None:
         middles_ns = (pose_pairs.stamps_ns[motions.i] + pose_pairs.stamps_ns[motions.j]) // 2
-        is_after = (middles_ns >= moved_at_ns)[:, None, None]
-        lever, rotation = columns["lever"], columns["rotation"]
-        columns["moved"] = tuple(
-            is_after * np.concatenate(parts, axis=2) for parts in zip(lever, rotation, strict=True)
-        )
-    target = np.concatenate([target_t / units[0], target_r / units[1]], axis=1)
-    stacked = {
-        name: np.concatenate([of_t / units[0], of_r / units[1]], axis=1)
-        for name, (of_t, of_r) in columns.items()
-    }
-    return Regression(target, stacked, ("lever", "rotation", "scale")), axes
+        of_mount = np.concatenate([columns["lever"], columns["rotation"]], axis=2)
+        columns["moved"] = (middles_ns >= moved_at_ns)[:, None, None] * of_mount
+    target = both(target_t[:, :, None], target_r[:, :, None])[:, :, 0]
+    return Regression(target, columns, ("lever", "rotation", "scale")), axes
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:

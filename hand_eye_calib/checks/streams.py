@@ -1,6 +1,6 @@
 """Checks of a single stream, and of the stamps of two."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -160,11 +160,14 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         return [*findings, finding("interleaved", stream, **levels)]
     if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
         return [*findings, finding("repeated", stream, times=times)]
-    coarse = _check_grid(trajectory.poses[:, :3, 3], stream)
-    if coarse and coarse.makes_unusable and not trajectory.has_rotations:
+    step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
+    if step_m >= _COARSE_NOTE_M:
+        severity = Severity.WARNING if step_m > _COARSE_WARNING_M else Severity.NOTE
         # Of positions alone, rounding is noise like any other.
-        coarse = replace(coarse, severity=Severity.WARNING)
-    return [*findings, coarse] if coarse else findings
+        if step_m > _COARSE_ERROR_M and trajectory.has_rotations:
+            severity = Severity.ERROR
+        findings.append(finding("coarse_positions", stream, severity, step_m=step_m))
+    return findings
 
 
 def _repeated(trajectory: Trajectory) -> int:
@@ -261,16 +264,6 @@ def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArra
     elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
     share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
     return middle - before - share[:, None] * (after - before)
-
-
-def _check_grid(positions: FloatArray, stream: str) -> Finding | None:
-    """Finding about positions that are multiples of a step, or None."""
-    step_m = max(_grid_step(column) for column in positions.T)
-    if step_m < _COARSE_NOTE_M:
-        return None
-    severity = Severity.WARNING if step_m > _COARSE_WARNING_M else Severity.NOTE
-    severity = Severity.ERROR if step_m > _COARSE_ERROR_M else severity
-    return finding("coarse_positions", stream, severity, step_m=step_m)
 
 
 def _grid_step(values: FloatArray) -> float:

@@ -1,8 +1,7 @@
 """Ten faults in fifteen real recordings: found, named right, and no false alarm.
 
 The test takes every eighth cell, all faults and recordings among them; HAND_EYE_CALIB_ALL_FAULTS=1
-makes it take all 150, several minutes. ``PYTHONPATH=.:test python
-test/regression/test_fault_table.py`` prints the table as Markdown, for docs/stream_checks.md.
+makes it take all 150, several minutes.
 """
 
 import os
@@ -55,34 +54,12 @@ def fault_table(every=1):
     return table
 
 
-def as_markdown(table):
-    columns = [CLEAN, *FAULTS]
-    lines = ["| Recording | " + " | ".join(columns) + " |", "|" + " --- |" * (1 + len(columns))]
-    for name, cells in table.items():
-        marks = [
-            ""
-            if column not in cells
-            else "yes"
-            if cells[column][0]
-            else ", ".join(cells[column][1]) or "missed"
-            for column in columns
-        ]
-        lines.append(f"| {name.replace('<-', ' from ')} | " + " | ".join(marks) + " |")
-    return "\n".join(lines)
-
-
 @pytest.mark.slow
-def test_faults_are_found_and_named(capsys):
+def test_faults_are_found_and_named():
     every = 1 if os.environ.get("HAND_EYE_CALIB_ALL_FAULTS") else 8
     table = fault_table(every)
-    with capsys.disabled():
-        print("\n" + as_markdown(table))
     false_alarms = {name: cells[CLEAN][1] for name, cells in table.items() if not cells[CLEAN][0]}
     assert false_alarms == {}
     cells = [cell for row in table.values() for fault, cell in row.items() if fault != CLEAN]
     assert len(cells) == (150 if every == 1 else 18)
     assert sum(right for right, _ in cells) / len(cells) >= LEAST_SHARE
-
-
-if __name__ == "__main__":
-    print(as_markdown(fault_table()))
