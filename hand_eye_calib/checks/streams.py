@@ -1,7 +1,6 @@
 """Checks of a single stream, and of the stamps of two."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -143,8 +142,8 @@ def check_stream(
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(finding.code != "gaps" for finding in findings):
         return findings
-    if levels := _mixed(trajectory):
-        return [*findings, finding("interleaved", stream, **levels)]
+    if apart_m := _mixed(trajectory):
+        return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
         findings.append(finding("jumps", stream, options={"method": "dnlo"}, share=share))
@@ -156,8 +155,8 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
     findings = check_sampling(trajectory, stream, max_gap_s)
     if any(finding.severity is Severity.ERROR for finding in findings):
         return findings
-    if levels := _interleaved(trajectory):
-        return [*findings, finding("interleaved", stream, **levels)]
+    if apart_m := _interleaved(trajectory):
+        return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
         return [*findings, finding("repeated", stream, times=times)]
     step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
@@ -193,24 +192,22 @@ def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> lis
     return [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
 
 
-def _interleaved(trajectory: Trajectory) -> dict[str, Any] | None:
-    """How much rougher the positions are from one pose to the next than over several, and the
-    distance of the two levels (m), if two sensors take turns in a stream; otherwise None.
+def _interleaved(trajectory: Trajectory) -> float:
+    """Distance of the two levels (m), if two sensors take turns in a stream: positions that are
+    rougher from one pose to the next than over several; otherwise 0.
     """
     positions, stamps_ns = trajectory.poses[:, :3, 3], trajectory.stamps_ns
     if len(positions) < _MIN_POSES_OF_TURNS:
-        return None
+        return 0.0
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME_POSE
-    if repeats.mean() > _MAX_REPEATS:
-        return None
     off = [_off_line(positions, stamps_ns, lag) for lag in range(1, _MAX_PERIOD + 1)]
     rough = [median(np.linalg.norm(vectors, axis=1)) for vectors in off]
     period = 2 + int(np.argmin(rough[1:]))
-    smoothest = max(rough[period - 1], 1e-9)
-    if rough[0] < max(_ALTERNATES * smoothest, _LEAST_LEVELS_M):
-        return None
-    in_body = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])
+    least_m = max(_ALTERNATES * rough[period - 1], _LEAST_LEVELS_M)
+    if repeats.mean() > _MAX_REPEATS or rough[0] < least_m:
+        return 0.0
     # Share of the mean square that repeats after a period: the median over some turns each.
+    in_body = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])
     n_turns = min(_TURNS, len(in_body) // period)
     n_windows = len(in_body) // (n_turns * period)
     shares = []
@@ -219,32 +216,24 @@ def _interleaved(trajectory: Trajectory) -> dict[str, Any] | None:
         levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
         total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
         shares.append(median(levels / np.maximum(total, 1e-300)))
-    if max(shares) < _STEADY_SHARE:
-        return None
-    return {"roughness_ratio": rough[0] / smoothest, "distance_m": rough[0]}
+    return rough[0] if max(shares) >= _STEADY_SHARE else 0.0
 
 
-def _mixed(trajectory: Trajectory) -> dict[str, Any] | None:
+def _mixed(trajectory: Trajectory) -> float:
     """Like :func:`_interleaved`, for two sensors in no order: seen from the sensor, a pose is off
     those around it along one direction, by one of few amounts.
     """
     positions, rotations = trajectory.poses[:, :3, 3], trajectory.poses[:, :3, :3]
     if len(positions) < _MIN_POSES_OF_MIX:
-        return None
+        return 0.0
     near, far = (
-        np.einsum(
-            "kji,kj->ki",
-            rotations[lag:-lag],
-            positions[lag:-lag] - 0.5 * (positions[2 * lag :] + positions[: -2 * lag]),
-        )
+        np.einsum("kji,kj->ki", rotations[lag:-lag], _off_line(positions, None, lag))
         for lag in (1, 2)
     )
     sizes, directions = np.linalg.eigh(near.T @ near / len(near))
-    if sizes[2] <= max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4):
-        return None
     along = near @ directions[:, -1]
     peakedness = float(np.mean(along**4) / max(np.mean(along**2) ** 2, 1e-300))
-    growth = float(np.sqrt(np.mean((far**2).sum(axis=1)) / np.mean((near**2).sum(axis=1))))
+    growth = float(np.sqrt((far**2).sum(axis=1).mean() / max(sizes.sum(), 1e-300)))
     # Sensors in no order have all frequencies, an oscillation few: of the positions themselves,
     # without the slow motion.
     windows = along[: len(along) // _SPECTRUM_POSES * _SPECTRUM_POSES].reshape(-1, _SPECTRUM_POSES)
@@ -252,15 +241,20 @@ def _mixed(trajectory: Trajectory) -> dict[str, Any] | None:
     cycles = np.arange(_SPECTRUM_POSES // 8, len(power))
     power = power[cycles] / (1.0 - np.cos(2 * np.pi * cycles / _SPECTRUM_POSES)) ** 2
     shakes = np.convolve(power, np.ones(3), "valid").max() > _SHAKES * power.sum()
-    if peakedness >= _FEW_AMOUNTS or growth >= _STEADY or shakes:
-        return None
+    is_along_one = sizes[2] > max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4)
+    if not is_along_one or peakedness >= _FEW_AMOUNTS or growth >= _STEADY or shakes:
+        return 0.0
     # A quarter of the poses are off by the distance of the levels, half by a half of it.
-    return {"roughness_ratio": 1.0 / growth, "distance_m": float(np.sqrt(sizes[2] / 0.375))}
+    return float(np.sqrt(sizes[2] / 0.375))
 
 
-def _off_line(positions: FloatArray, stamps_ns: IntArray, lag: int) -> FloatArray:
-    """How far (M, 3) each position is off the line between those ``lag`` poses before and after."""
+def _off_line(positions: FloatArray, stamps_ns: IntArray | None, lag: int) -> FloatArray:
+    """How far (M, 3) each position is off the line between those ``lag`` poses before and after, at
+    its stamp, or off the middle.
+    """
     before, middle, after = positions[: -2 * lag], positions[lag:-lag], positions[2 * lag :]
+    if stamps_ns is None:
+        return middle - 0.5 * (before + after)
     elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
     share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
     return middle - before - share[:, None] * (after - before)
