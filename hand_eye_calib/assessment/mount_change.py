@@ -125,7 +125,7 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     after_H, after_S = H.sum(axis=0) - before_H, S.sum(axis=0) - before_S
     # The common answer is free.
     contrast = before_H - before_H @ _inverse(H.sum(axis=0)) @ before_H
-    ratios = log_ratio(contrast, before_S, long_run)
+    ratios = log_ratio(contrast / long_run, before_S / long_run)
     n_edge = max(int(len(S) * _LEAST_WINDOWS / max(_WINDOWS)), 1)
     ratios[: n_edge - 1] = ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))

@@ -7,9 +7,9 @@ makes of any of six once in 200 comparisons, or all together by what chance make
 shift is looked for at many times: with shifts of covariance L expected, the logarithm of the
 likelihood ratio of a shift against none is, with ``H = C^-1`` and ``S = H d``,
 
-    1/2 S' (H + f L^-1)^-1 S / f - 1/2 log|I + L H / f|;
+    1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|,
 
-f says how much more S scatters than H predicts.
+both divided before by how much more S scatters than H predicts.
 
 Answers of one rig scatter from recording to recording by more than each of them states, as no
 recording shows its own constant errors: that belongs to C (docs/session.md has the measurements).
@@ -160,9 +160,7 @@ def shift_covariance(metres: float = SHIFT_M, radians: float = SHIFT_RAD) -> Flo
     return np.diag(np.repeat([metres**2, radians**2], 3))
 
 
-def log_ratio(
-    H: FloatArray, S: FloatArray, long_run: float = 1.0, shift: FloatArray | None = None
-) -> FloatArray:
+def log_ratio(H: FloatArray, S: FloatArray, shift: FloatArray | None = None) -> FloatArray:
     """Logarithm of the likelihood ratio of a shift against none.
 
     Parameters
@@ -170,15 +168,12 @@ def log_ratio(
     H : (..., 6, 6) array
         Information since the time from which on the mount may have moved.
     S : (..., 6) array
-    long_run : float
-        f.
     shift : (6, 6) array, optional
         L; :func:`shift_covariance` if left out.
     """
     L = shift_covariance() if shift is None else shift
-    solved = solve(H + long_run * np.linalg.inv(L), S)
-    _, log_volume = np.linalg.slogdet(np.eye(6) + L @ H / long_run)
-    return 0.5 * (S * solved).sum(axis=-1) / long_run - 0.5 * log_volume
+    _, log_volume = np.linalg.slogdet(np.eye(6) + L @ H)
+    return 0.5 * (S * solve(H + np.linalg.inv(L), S)).sum(axis=-1) - 0.5 * log_volume
 
 
 def solve(H: FloatArray, S: FloatArray) -> FloatArray:

@@ -273,7 +273,7 @@ class MountMonitor:
         if len(self._S) < _LAGS[0]:
             return
         lags, H, S = self._sums()
-        ratios = log_ratio(H, S, 1.0, _KNOCKS[:, None]).max(axis=0)
+        ratios = log_ratio(H, S, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
         if ratios[best] < (self.alarm.log_ratio if self.alarm else THRESHOLD):
             return
