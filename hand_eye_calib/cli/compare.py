@@ -11,9 +11,7 @@ from hand_eye_calib.text import amount
 
 if TYPE_CHECKING:
     from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.session.compare import Comparison, Difference
-
-EXIT_SAME, EXIT_CANNOT_TELL, EXIT_MOVED = 0, 3, 4
+    from hand_eye_calib.session.compare import Comparison
 
 _EPILOG = """\
 examples:
@@ -28,20 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] RESULT ..."
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "results",
-        metavar="RESULT",
-        nargs="+",
-        help="extrinsic.yaml, or the directory that holds it; without --with two or more",
+    results = "extrinsic.yaml, or the directory that holds it; without --with two or more"
+    parser.add_argument("results", metavar="RESULT", nargs="+", help=results)
+    installed = (
+        "what is installed: a URDF, an earlier extrinsic.yaml, a file of another program (as of "
+        'info --as), a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
     )
-    parser.add_argument(
-        "--with",
-        dest="installed",
-        metavar="SOURCE",
-        help="what is installed: a URDF, an earlier extrinsic.yaml, a file of "
-        "another program (as of info --as), a bag with /tf_static, or "
-        '"X Y Z ROLL PITCH YAW" in m and rad',
-    )
+    parser.add_argument("--with", dest="installed", metavar="SOURCE", help=installed)
     add_json_argument(parser)
 
 
@@ -70,8 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json_text(found.to_dict()))
     else:
         print("\n".join(printable(line) for line in _lines(found, results[0])))
-    codes = {Change.SAME: EXIT_SAME, Change.MOVED: EXIT_MOVED}
-    return codes.get(found.verdict, EXIT_CANNOT_TELL)
+    return {Change.SAME: 0, Change.MOVED: 4}.get(found.verdict, 3)
 
 
 def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
@@ -79,13 +69,8 @@ def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
     for each in found.differences:
         sentence = "" if len(found.differences) == 1 else each.sentence
         yield f"{each.second} minus {each.first}: {sentence}".rstrip(": ")
-        yield from _table(each)
-
-
-def _table(difference: "Difference") -> Iterator[str]:
-    """A row per axis."""
-    yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
-    for axis, row in difference.to_dict()["axes"].items():
-        numbers = (row["difference"], row["sigma"], row["visible"])
-        cells = ["unknown" if value is None else amount(axis, value) for value in numbers]
-        yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12}  {row['verdict']}"
+        yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
+        for axis, row in each.to_dict()["axes"].items():
+            numbers = (row["difference"], row["sigma"], row["visible"])
+            cells = ["unknown" if value is None else amount(axis, value) for value in numbers]
+            yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12}  {row['verdict']}"

@@ -45,14 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --seed 7 --out demo_7"
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        default=Path("demo_output"),
-        help="directory for the bag, the node's log and report.html; those of an earlier demo are "
-        "replaced. Default: demo_output",
+    out = (
+        "directory for the bag, the node's log and report.html; those of an earlier demo are "
+        "replaced. Default: demo_output"
     )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_output"), help=out)
     seed = "another seed gives another recording. Default: 0"
     parser.add_argument("--seed", type=at_least(0), default=0, help=seed)
     add_json_argument(parser)

@@ -110,25 +110,18 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
-    group.add_argument(
-        "--prior",
-        metavar="AXIS=VALUE+-SIGMA",
-        action="append",
-        type=_prior_argument,
-        default=[],
-        help="what is known of an axis beforehand, such as z=1.85+-0.02 (m) or yaw=-90deg+-2deg; "
-        f"AXIS is one of {_AXES}; may be repeated",
+    add, metavar = group.add_argument, "AXIS=VALUE+-SIGMA"
+    prior = (
+        "what is known of an axis beforehand, such as z=1.85+-0.02 (m) or yaw=-90deg+-2deg; AXIS "
+        f"is one of {_AXES}; may be repeated"
     )
-    group.add_argument(
-        "--config",
-        metavar="FILE",
-        type=Path,
-        help="YAML file with these options by name, or a ROS parameter file",
-    )
+    add("--prior", metavar=metavar, action="append", type=_prior, default=[], help=prior)
+    config = "YAML file with these options by name, or a ROS parameter file"
+    add("--config", metavar="FILE", type=Path, help=config)
 
 
 @argument_type
-def _prior_argument(text: str) -> tuple[str, Any]:
+def _prior(text: str) -> tuple[str, Any]:
     axis, equals, value = text.partition("=")
     name = f"prior.{axis}"
     if not equals or name not in OPTION_FIELDS:
@@ -225,24 +218,16 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         "out if the bag has only two",
     )
     for stream in STREAMS:
-        source = group.add_mutually_exclusive_group()
-        source.add_argument(
-            f"--{stream}-topic",
-            metavar="TOPIC",
-            help=f"poses of the {stream} sensor, of any type, or FIX+IMU of two topics",
+        add = group.add_mutually_exclusive_group().add_argument
+        topic = f"poses of the {stream} sensor, of any type, or FIX+IMU of two topics"
+        add(f"--{stream}-topic", metavar="TOPIC", help=topic)
+        tf = "the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar"
+        add(f"--{stream}-tf", metavar="WORLD:SENSOR", type=_frames, help=tf)
+        fields = (
+            f"where the poses are in messages of any type on --{stream}-topic: "
+            "t=header.stamp,x=pose.position.x,..."
         )
-        source.add_argument(
-            f"--{stream}-tf",
-            metavar="WORLD:SENSOR",
-            type=argument_type(lambda text: ":".join(split_frames(text))),
-            help="the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar",
-        )
-        parser.add_argument(
-            f"--{stream}-fields",
-            metavar="NAME=PATH,...",
-            help=f"where the poses are in messages of any type on --{stream}-topic: "
-            "t=header.stamp,x=pose.position.x,...",
-        )
+        group.add_argument(f"--{stream}-fields", metavar="NAME=PATH,...", help=fields)
     group = parser.add_argument_group(
         "trajectory files", "each also as --parent-... and --child-... for one of the two files"
     )
@@ -266,6 +251,7 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
     return {stream: source for stream, source in found.items() if source}
 
 
+@argument_type
 def _label(text: str) -> tuple[str, str]:
     name, sign, value = text.partition("=")
     if not (name and sign and value):
@@ -276,20 +262,18 @@ def _label(text: str) -> tuple[str, str]:
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--label``, ``--json`` and ``--verbose``."""
     group = parser.add_argument_group("output")
-    group.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        help="save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
-        "static_transform.launch.py and report.html",
+    out = (
+        "save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
+        "static_transform.launch.py and report.html"
     )
+    group.add_argument("--out", metavar="DIR", type=Path, help=out)
     group.add_argument(
         "--label",
         metavar="NAME=VALUE",
         nargs="+",
         action="extend",
         default=[],
-        type=argument_type(_label),
+        type=_label,
         help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
     )
     add_json_argument(group)
@@ -298,16 +282,19 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_json_argument(parser: argparse._ActionsContainer) -> None:
     """Add ``--json``."""
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON document on stdout instead of text"
-    )
+    text = "print one JSON document on stdout instead of text"
+    parser.add_argument("--json", action="store_true", help=text)
 
 
 def add_verbose_argument(parser: argparse._ActionsContainer) -> None:
     """Add ``--verbose``."""
-    parser.add_argument(
-        "-v", "--verbose", action="store_true", help="print details of the solution, too"
-    )
+    text = "print details of the solution, too"
+    parser.add_argument("-v", "--verbose", action="store_true", help=text)
+
+
+@argument_type
+def _frames(text: str) -> str:
+    return ":".join(split_frames(text))
 
 
 def _path(text: str) -> Path | str:

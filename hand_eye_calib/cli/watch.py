@@ -37,27 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = EXAMPLES
-    parser.add_argument(
-        "--node",
-        metavar="NAME",
-        default="",
-        help="full name of the node, such as /robot1/calibrator. Default: the first that is heard",
-    )
-    parser.add_argument(
-        "--web",
-        metavar="[HOST:]PORT",
-        nargs="?",
-        const=("", _PORT),
-        type=_address,
-        help=f"also serve a page for browsers, at port {_PORT} of all addresses by default",
-    )
-    parser.add_argument(
-        "--key",
-        metavar="WORD",
-        default="",
-        help="word that is part of the page's address, so that the address stays the same. "
-        "Default: a new one at each start",
-    )
+    add = parser.add_argument
+    node = "full name of the node, such as /robot1/calibrator. Default: the first that is heard"
+    add("--node", metavar="NAME", default="", help=node)
+    web = f"also serve a page for browsers, at port {_PORT} of all addresses by default"
+    at = ("", _PORT)
+    add("--web", metavar="[HOST:]PORT", nargs="?", const=at, type=_address, help=web)
+    key = "word in the page's address, so that it stays the same. Default: a new one at each start"
+    add("--key", metavar="WORD", default="", help=key)
 
 
 def run(arguments: argparse.Namespace) -> int:
