@@ -167,6 +167,7 @@ def _difference(T_parent_child: "FloatArray", other: "FloatArray") -> dict[str, 
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    """Both directions of each result beside the truth, and how far they are off."""
     from hand_eye_calib.geometry import se3
 
     parent, child = document["parent_frame"], document["child_frame"]

@@ -18,13 +18,11 @@ from hand_eye_calib.cli.console import as_typed, fail
 from hand_eye_calib.config import did_you_mean
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.limits import ReadingMemory
+from hand_eye_calib.text import shown_value
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
 EXIT_INTERRUPTED = 128 + 2  # what a shell reports for SIGINT and SIGPIPE
 EXIT_BROKEN_PIPE = 128 + 13
-
-# Characters of a name that a message shows.
-_MOST_SHOWN = 60
 
 COMMANDS = {
     "calibrate": "calibrate from two trajectory files, a bag or a journal",
@@ -54,19 +52,18 @@ _COMPLETING = "_ARGCOMPLETE"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code.
+    """Run a command; without one, print the help.
 
     Parameters
     ----------
     argv : list of str, optional
-        Arguments after the program's name; by default those of the process. Without any, the help
-        is printed.
+        Arguments after the program's name; by default those of the process.
 
     Returns
     -------
     int
-        0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is unobservable or the
-        verdict is DO NOT USE; 130 interrupted.
+        The exit code: 0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is
+        unobservable or the verdict is DO NOT USE; 130 interrupted.
 
     Raises
     ------
@@ -109,9 +106,8 @@ def exit_code_of(run: Callable[[], int]) -> int:
     except OSError as error:
         if error.filename is None:
             raise
-        name = str(error.filename)
-        shown = name if len(name) <= _MOST_SHOWN else f"{name[:_MOST_SHOWN]}..."
-        return fail(f"cannot use {shown}: {error.strerror}; choose another", EXIT_FAILED)
+        name = shown_value(error.filename)
+        return fail(f"cannot use {name}: {error.strerror}; choose another", EXIT_FAILED)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 

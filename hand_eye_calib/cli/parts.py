@@ -37,22 +37,10 @@ def refuse_recordings(
     sources: "Mapping[Source, str]",
     max_gap_s: float = CalibratorConfig.max_gap,
 ) -> None:
-    """Refuse bags that are not parts of one recording.
-
-    Parts continue each other, hold different topics, or repeat the same poses, as two recorders do
-    that run side by side.
-
-    Parameters
-    ----------
-    paths : list of path-like
-    sources : mapping
-        What the poses of each topic or pair of frames are read as.
-    max_gap_s : float
-        Poses of two parts may be out of order for so long.
-
-    Raises
-    ------
-    SeveralRecordings
+    """Raise SeveralRecordings for bags that are not parts of one recording: parts continue each
+    other, hold different topics, or repeat the same poses, as two recorders do that run side by
+    side. ``sources`` has what each topic or pair of frames is read as; poses of two parts may be
+    out of order for ``max_gap_s``.
     """
     if len(paths) < 2:
         return

@@ -56,17 +56,8 @@ def deliver(
 ) -> int:
     """Print a calibration, save it if ``--out`` asks for that, and return the exit code.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    arguments : argparse.Namespace
-        With ``json``, ``out``, ``verbose``, ``installed`` and ``base_frame``.
-    inputs : dict
-        Where the data came from, in plain values; it is saved, too.
-    snapshot : Snapshot, optional
-        The poses and options that gave it; None for stops.
-    bag : path-like, optional
-        The bag that it is from, whose transforms may have the base frame.
+    ``inputs`` say where the data came from, in plain values. The snapshot has the poses and options
+    that gave it, unless they were stops; the bag may have the base frame among its transforms.
     """
     if not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
@@ -129,16 +120,8 @@ def exit_code(calibration: Calibration) -> int:
 
 
 def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False) -> str:
-    """What a person needs to see: verdict and reasons, the extrinsic in both directions, what to do
-    next.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    steps : sequence of str
-        What to do next: sentences and commands.
-    with_details : bool
-        Also quaternions, and how it was solved.
+    """What a person needs to see: verdict and reasons, the extrinsic in both directions, the steps
+    to take next; with details also quaternions, and how it was solved.
     """
     parent, child = calibration.parent_frame, calibration.child_frame
     document = calibration.to_dict()

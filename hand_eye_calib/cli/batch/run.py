@@ -3,7 +3,6 @@ already, what is left, and what all results say.
 """
 
 import argparse
-import contextlib
 import csv
 import io
 import json
@@ -32,7 +31,7 @@ from hand_eye_calib.text import counted, listing
 _MOST_LINES = 200
 _GRAVITY = ("failed", *(each.value for each in reversed(Verdict)))
 # Text that begins with one of these is a formula to spreadsheets, with full width to some.
-_FORMULA = tuple("=+-@＝＋－＠")
+_FORMULA = ("=", "+", "-", "@", *"＝＋－＠")
 
 Row = dict[str, Any]
 
@@ -122,17 +121,15 @@ def _all_done(
 ) -> list[Done]:
     """The recordings of an earlier run, and of this one, in their order."""
     out: Path | None = arguments.out
-    tasks = [
-        *tasks_of(
-            groups,
-            vehicle,
-            options=options_from(arguments),
-            sources=sources_from(arguments),
-            with_fingerprints=bool(out),
-            with_report=bool(out) and not arguments.no_report and can_draw(REPORT),
-            are_files=are_files,
-        )
-    ]
+    tasks = tasks_of(
+        groups,
+        vehicle,
+        options=options_from(arguments),
+        sources=sources_from(arguments),
+        with_fingerprints=bool(out),
+        with_report=bool(out) and not arguments.no_report and can_draw(REPORT),
+        are_files=are_files,
+    )
     found: dict[str, Done] = {}
     for task in with_progress(tasks, len(tasks), "looking for earlier results") if out else ():
         if earlier := stored(task, arguments.out):
@@ -189,9 +186,9 @@ def _store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> N
 def row_of(outcome: Outcome) -> Row:
     """The row of an outcome in plain values, for tables of other programs."""
     inputs, calibration = outcome["inputs"], outcome["calibration"]
-    row: Row = {"name": outcome["name"], "vehicle": outcome["vehicle"]}
-    row |= {"bags": " ".join(outcome["bags"]), "error": outcome["error"], "start": None}
-    row |= {"verdict": None, "headline": None}
+    row: Row = {name: outcome[name] for name in ("name", "vehicle", "error")}
+    row |= dict.fromkeys(("start", "duration_s", "verdict", "headline"))
+    row["bags"] = " ".join(outcome["bags"])
     stamps = [inputs[each] for each in STREAMS if each in inputs]
     starts = [stream["first_stamp_ns"] for stream in stamps]
     if starts and None not in starts:
@@ -211,29 +208,26 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(text, columns, None, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
     writer.writeheader()
     for row in rows:
+        texts = {name: value for name, value in row.items() if isinstance(value, str)}
         # An apostrophe stands before text that would be a formula.
-        formulas = {
-            name: f"'{value}"
-            for name, value in row.items()
-            if isinstance(value, str) and value.lstrip().startswith(_FORMULA)
-        }
-        writer.writerow(row | formulas)
+        are = {name: f"'{text}" for name, text in texts.items() if text.lstrip()[:1] in _FORMULA}
+        writer.writerow(row | are)
     save_text(path, text.getvalue())
 
 
 def _vehicles(done: Sequence[Done]) -> dict[str, Calibration]:
-    """What the recordings of each vehicle say together; those of other frames are another rig."""
-    rigs: dict[tuple[str, ...], list[Done]] = {}
+    """What the recordings of each vehicle say together."""
+    groups: dict[str, list[Done]] = {}
     for one in done:
         if one.row["vehicle"] and one.row["verdict"]:
-            rig = tuple(one.row[name] for name in ("vehicle", "parent_frame", "child_frame"))
-            rigs.setdefault(rig, []).append(one)
+            groups.setdefault(one.row["vehicle"], []).append(one)
     found: dict[str, Calibration] = {}
-    for rig, group in sorted(rigs.items()):
-        name = rig[0] if rig[0] not in found else "_".join(rig).replace("/", "_")
-        with contextlib.suppress(InputError):  # no recording of it can be used
+    for vehicle, group in sorted(groups.items()):
+        try:
             if len(group) > 1:
-                found[name] = together({one.row["name"]: one.calibration for one in group})
+                found[vehicle] = together({one.row["name"]: one.calibration for one in group})
+        except InputError as error:
+            note(f"{vehicle} has no common result: {error}")
     return found
 
 

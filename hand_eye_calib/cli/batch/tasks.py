@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
 from itertools import chain, count
@@ -62,29 +62,31 @@ def _state(bag: str) -> list[Any]:
     return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
 
-def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) -> Iterator[Task]:
+def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) -> list[Task]:
     """A task for each group of bags or files that are one recording; ``vehicle`` is its name, or
     has ``{vehicle}`` at its place in their paths. The other values are those of every Task.
     """
-    found = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
-    pattern = found.replace(re.escape("{vehicle}"), "([^/]+)")
+    pattern = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
+    pattern = pattern.replace(re.escape("{vehicle}"), "([^/]+)")
     # A path as "." has no name of its own.
     paths = [
-        group[0].partition("?")[0] if remote.is_url(group[0]) else str(Path(group[0]).resolve())
-        for group in groups
+        bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
+        for bag, *_ in groups
     ]
-    names = {STATE, TABLE, INDEX, VEHICLES}
     stems = told_apart([str(Path(path).with_suffix("")) for path in paths])
+    tasks: list[Task] = []
+    names = {STATE, TABLE, INDEX, VEHICLES}
     for group, stem in zip(groups, stems, strict=True):
         name = stem.replace("/", "_")
         numbered = chain([name], (f"{name}_{number}" for number in count(2)))
         name = next(one for one in numbered if one not in names)
         names.add(name)
-        of_vehicle = vehicle
-        if pattern != found:
+        of = vehicle
+        if "{vehicle}" in vehicle:
             match = re.search(pattern, group[0])
-            of_vehicle = match[1] if match else ""
-        yield Task(name=name, bags=tuple(group), vehicle=of_vehicle.strip("."), **common)
+            of = match[1].strip(".") if match else ""
+        tasks.append(Task(name=name, bags=tuple(group), vehicle=of, **common))
+    return tasks
 
 
 def matching(pattern: str) -> list[str]:

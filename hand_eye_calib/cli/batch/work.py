@@ -34,12 +34,9 @@ _MOST_DEATHS = 3
 def work(task: Task) -> Outcome:
     """Do a task; what goes wrong becomes part of the outcome, so that the others go on.
 
-    Returns
-    -------
-    dict
-        ``name``, ``vehicle``, ``bags``, ``calibration`` (Calibration.to_dict or None), ``findings``
-        of the stream checks, ``inputs``, ``error`` (text or None), the ``page`` of the report if
-        the task wants one, and a ``traceback`` for errors that are defects of the program.
+    It has ``name``, ``vehicle``, ``bags``, ``calibration`` (Calibration.to_dict or None),
+    ``findings``, ``inputs``, ``error`` (text or None), the ``page`` of the report if it is wanted,
+    and a ``traceback`` for defects of the program.
     """
     ReadingMemory.switch_on()  # this may be a process of its own
     try:
@@ -86,13 +83,6 @@ def outcomes(
     """Do tasks in so many processes of this machine, or on the Dask cluster at an address, whose
     workers must see the bags under the same paths; yields each with its outcome when it is done.
     What a worker that dies had to do is done again.
-
-    Raises
-    ------
-    InputError
-        If there is no cluster.
-    MissingDependencyError
-        Without Dask.
     """
     with _on_dask(dask, do) if dask else _on_cores(jobs, do) as (executor, attempt):
         futures = {executor.submit(attempt, task): task for task in tasks}
