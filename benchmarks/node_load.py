@@ -1,16 +1,13 @@
 """Load, soak and crashes of the node, measured.
 
-    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [slow] [share] [busy] [watch]
-    [monitor] [solver] [soak] [kill] [--seconds 60] [--hours 10] [--kills 20]
+    OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [share] [busy] [soak] [kill]
+    [--seconds 60] [--hours 10] [--kills 20]
 
 load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages
        lost, latency of the callbacks, CPU
-slow   the same while every solve takes two seconds of pure Python
-share  the same with a share of a core for the node and for its solving process (cgroups v1)
+share  the same with a share of a core for the node and for its solving process (cgroups v1), every
+       solve taking two seconds of pure Python
 busy   the same while other programs load all cores: messages lost against messages reported lost
-watch  the same while somebody watches, on a terminal and in a browser
-monitor  the same of a node that watches the mount
-solver the same while the solving process is killed again and again
 soak   10 hours of 2 x 100 Hz, simulated, through the engine: memory and solve time hour by hour
 kill   kill -9 of the node at random moments, and resuming: what is lost
 
@@ -36,7 +33,6 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from urllib.request import urlopen
 
 import numpy as np
 from rich.console import Console
@@ -52,7 +48,7 @@ from hand_eye_calib.geometry import se3  # noqa: E402
 from hand_eye_calib.io.journal import read_journal  # noqa: E402
 from hand_eye_calib.io.results import load_result, save_result  # noqa: E402
 
-PARTS = ("load", "slow", "share", "busy", "watch", "monitor", "solver", "soak", "kill")
+PARTS = ("load", "share", "busy", "soak", "kill")
 STREAMS = ("parent", "child")
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 START_NS = 1_700_000_000_000_000_000
@@ -142,7 +138,7 @@ def measured_node(report, arguments):
         result = self._cycle.result
         document = {
             "received": len(latencies),
-            "lost_as_reported": sum(each.delivery.lost for each in self._inputs),
+            "lost_as_reported": sum(each._lost for each in self._inputs),
             "cpu": (end_cpu_s - start_cpu_s) / (end_s - start_s),
             "latency": np.percentile(latencies, [50, 99, 99.9, 100]).tolist(),
             "duration": np.percentile(durations, [50, 99, 99.9, 100]).tolist(),
@@ -320,76 +316,9 @@ def others(count):
     return lambda: [(each.kill(), each.wait()) for each in busy]
 
 
-def solver_killer(node, report, domain):
-    """Kill the node's solving process twenty times, every two seconds; ends that."""
-    done, stop = [], threading.Event()
-
-    def run():
-        while len(done) < 20 and not stop.wait(2.0):
-            for pid in children(node.pid):
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-                    done.append(pid)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-
-    def end():
-        stop.set()
-        thread.join()
-        report.with_suffix(".killed").write_text(str(len(done)))
-
-    return end
-
-
-def watcher(node, report, domain):
-    """Somebody who watches on a terminal and in a browser; ends that and notes what it has cost."""
-    page, key = 8700 + domain, "load"
-    words = ("-m", "hand_eye_calib", "watch", "--web", f"127.0.0.1:{page}", "--key", key)
-    process = start(domain, *words, stdout=subprocess.DEVNULL)
-    begun, events = time.monotonic(), []
-
-    def browse():
-        while process.poll() is None:
-            try:
-                events_page = urlopen(f"http://127.0.0.1:{page}/events?key={key}", timeout=5)
-                events.extend(len(line) for line in events_page if len(line) > 10)
-            except OSError:
-                time.sleep(0.2)
-
-    browser = threading.Thread(target=browse)
-    browser.start()
-
-    def end():
-        stat = Path(f"/proc/{process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2]
-        ticks = sum(map(int, stat.split()[11:13]))
-        cost = ticks / os.sysconf("SC_CLK_TCK") / (time.monotonic() - begun)
-        process.send_signal(signal.SIGINT)
-        process.wait()
-        browser.join()
-        report.with_suffix(".watched").write_text(json.dumps([cost, len(events)]))
-
-    return end
-
-
-def watched(folder, name, seconds, options=()):
-    """Rows of the node while somebody watches, and of a node that watches the mount."""
-    seen = loaded_node(folder, name, seconds, disturb=watcher, more=options)
-    cost, views = json.loads((folder / f"{name}.watched").read_text())
-    rows = load(seen, solves="monitor" not in dict(options))
-    return [*rows, ("watch: CPU (cores), views", f"{cost:.3f}, {views}", "views > 5", views > 5)]
-
-
-def loaded_node(folder, name, seconds, disturb=None, more=(), **environment):
-    """What the node saw of two streams at 400 Hz.
-
-    Parameters
-    ----------
-    more : mapping
-        Other parameters.
-    disturb : callable, optional
-        Given the node's process, its report and the domain, makes life hard for the node; returns
-        what undoes that.
+def loaded_node(folder, name, seconds, disturb=None, **environment):
+    """What the node saw of two streams at 400 Hz; ``disturb(node)`` makes life hard for its process,
+    and returns what undoes that.
     """
     rate_hz, domain = 400, random.randint(1, 100)
     report = folder / f"{name}.json"
@@ -401,13 +330,12 @@ def loaded_node(folder, name, seconds, disturb=None, more=(), **environment):
         "output_directory": folder / name,
         "report": "false",  # it would load the machine in the next part
     }
-    options |= dict(more)
     parameters = [
         word for option, value in options.items() for word in ("-p", f"{option}:={value}")
     ]
     words = ("--node", report, "--ros-args", "--log-level", "warn", *parameters)
     node = start(domain, __file__, *words, **environment)
-    undo = disturb(node, report, domain) if disturb else lambda: None
+    undo = disturb(node) if disturb else lambda: None
     n_poses = round(seconds * rate_hz)
     try:
         if start(domain, __file__, "--publish", rate_hz, n_poses).wait():
@@ -423,7 +351,7 @@ def loaded_node(folder, name, seconds, disturb=None, more=(), **environment):
     return seen | {"published": 2 * n_poses, "ended_s": ended_s, "code": code}
 
 
-def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False, solves=True):
+def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
     """Rows (what, value, promise, kept) of the node under load."""
     latency, duration = seen["latency"], seen["duration"]
     lost, reported = seen["published"] - seen["received"], seen["lost_as_reported"]
@@ -444,26 +372,13 @@ def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False, solves=True):
         (
             "solves",
             str(seen["solves"]),
-            "> 0" if promise and solves else "",
-            may_lose or not solves or seen["solves"] > 0,
+            "> 0" if promise else "",
+            may_lose or seen["solves"] > 0,
         ),
         ("pairs, inliers of the last", f"{seen['pairs']}, {seen['inliers']}", "", True),
         ("error of the last (mm)", f"{1000 * (seen['error_m'] or 0):.2f}", "", True),
         ("end after Ctrl-C (s), code", f"{seen['ended_s']:.2f}, {code}", "code 0", code == 0),
     ]
-
-
-def solver(folder, seconds):
-    """Rows of the node while its solving process is killed."""
-    seen = loaded_node(folder, "solver", seconds, disturb=solver_killer)
-    killed = int((folder / "solver.killed").read_text())
-    return [*load(seen), ("solving process killed", str(killed), "20", killed == 20)]
-
-
-def in_words(T):
-    """X Y Z ROLL PITCH YAW, as the parameter installed takes it."""
-    values = (*T[:3, 3], *se3.rotation_to_rpy(T[:3, :3]))
-    return " ".join(f"{value:.9f}" for value in values)
 
 
 def _ms(values):
@@ -634,19 +549,9 @@ def start_logged(domain, output, log, journal):
     with log.open("wb") as file:
         return subprocess.Popen(
             [
-                sys.executable,
-                "-m",
-                "hand_eye_calib",
-                "calibrator",
-                "--ros-args",
-                *(
-                    "-p",
-                    f"output_directory:={output}",
-                    "-p",
-                    f"journal:={journal}",
-                    "-p",
-                    "solve_period:=0.5",
-                ),
+                *(sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args"),
+                *("-p", f"output_directory:={output}", "-p", f"journal:={journal}"),
+                *("-p", "solve_period:=0.5"),
             ],
             env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"},
             cwd=PROJECT,
@@ -696,13 +601,12 @@ def main(arguments):
         folder = Path(name)
         run = {
             "load": lambda: load(loaded_node(folder, "load", options.seconds)),
-            "slow": lambda: load(loaded_node(folder, "slow", options.seconds, **{SLOW: "1"})),
             "share": lambda: load(
                 loaded_node(
                     folder,
                     "share",
                     options.seconds,
-                    disturb=lambda node, *_: slow_processor(node, options.share),
+                    disturb=lambda node: slow_processor(node, options.share),
                     **{SLOW: "1"},
                 ),
                 MOST_LATENCY_OF_A_SHARE_S,
@@ -712,19 +616,11 @@ def main(arguments):
                     folder,
                     "busy",
                     options.seconds,
-                    disturb=lambda *_: others(4 * (os.cpu_count() or 1)),
+                    disturb=lambda _: others(4 * (os.cpu_count() or 1)),
                     **{SLOW: "1"},
                 ),
                 may_lose=True,
             ),
-            "watch": lambda: watched(folder, "watch", options.seconds),
-            "monitor": lambda: watched(
-                folder,
-                "monitor",
-                options.seconds,
-                {"monitor": "true", "installed": f'"{in_words(T_PARENT_CHILD)}"'},
-            ),
-            "solver": lambda: solver(folder, options.seconds),
             "soak": lambda: soak(options.hours),
             "kill": lambda: kill(folder, options.kills),
         }
