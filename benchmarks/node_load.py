@@ -317,8 +317,8 @@ def others(count):
 
 
 def loaded_node(folder, name, seconds, disturb=None, **environment):
-    """What the node saw of two streams at 400 Hz; ``disturb(node)`` makes life hard for its process,
-    and returns what undoes that.
+    """What the node saw of two streams at 400 Hz; ``disturb(node)`` makes life hard for it, and
+    returns what undoes that.
     """
     rate_hz, domain = 400, random.randint(1, 100)
     report = folder / f"{name}.json"
