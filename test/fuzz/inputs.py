@@ -124,26 +124,10 @@ def info(chaos, folder):
     return min(command("info", folder), command("info", folder, "--json"))
 
 
-def metadata(chaos, folder):
-    """List a bag whose metadata.yaml is not as it should be."""
-    streams = {"/a": (text_inputs.PARENT, ODOMETRY), "/b": (text_inputs.CHILD, ODOMETRY)}
-    write_bag(folder / "bag", streams)
-    (folder / "bag" / "metadata.yaml").write_bytes(text_inputs.yaml_text(chaos, "metadata"))
-    code = command("replay", folder / "bag", "--list", "--json")
-    if code:
-        raise Finding("the bag beside it is not read")
-    return code
-
-
 def journal(chaos, folder):
     """Resume a session."""
     for stream in ("parent", "child"):
         (folder / f"{stream}.tum").write_bytes(text_inputs.journal(chaos, stream))
-    return resume(folder)
-
-
-def resume(folder):
-    """Resume the session in a folder."""
     if not has_session(folder):
         raise Finding("the journal is not seen")
     count_poses(folder)
@@ -165,7 +149,6 @@ FORMATS = {
     "trajectory": trajectory,
     "config": config,
     "info": info,
-    "metadata": metadata,
     "journal": journal,
 }
 
