@@ -244,17 +244,10 @@ def test_paths_that_are_no_bag(tmp_path):
         assert re.search(message, *read(tmp_path / name)[1]), name
 
 
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
-        (b"", "unpack_from requires a buffer|expected plain CDR"),
-        (b"\x00\x01\x00\x00" + b"\x01" * 11, "requires a buffer"),
-        (b"\x00\x07\x00\x00" + b"\x00" * 100, "expected plain CDR, found encoding 0x0007"),
-    ],
-)
-def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data, reason):
+@pytest.mark.parametrize("data", [b"", b"\x00\x07\x00\x00" + b"\x00" * 100])
+def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data):
     with_message(tmp_path / "bag", "sqlite3", data)
-    message = f"/a, message 61: not a readable nav_msgs/msg/Odometry .*{reason}|{reason}"
+    message = "/a, message 61: not a readable nav_msgs/msg/Odometry .*expected plain CDR"
     with pytest.raises(InputError, match=message):
         all_poses(tmp_path / "bag")
 
@@ -291,14 +284,6 @@ def with_message(path, kind, data):
     return path
 
 
-def mcap_bomb(path):
-    return with_message(path / "bag", "mcap", BOMB)
-
-
-def sqlite3_bomb(path):
-    return with_message(path / "bag", "sqlite3", BOMB)
-
-
 def rosbag1_bomb(path):
     """A chunk of 700 MiB of zeros."""
     path = path / "bag.bag"
@@ -312,9 +297,11 @@ def rosbag1_bomb(path):
     return path
 
 
-@pytest.mark.parametrize("make", [mcap_bomb, sqlite3_bomb, rosbag1_bomb])
-def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, make):
-    command = [sys.executable, "-c", REPLAY, str(make(tmp_path)), *TOPICS]
+@pytest.mark.parametrize("kind", STORAGES)
+def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, kind):
+    is_ros1 = kind == "rosbag1"
+    path = rosbag1_bomb(tmp_path) if is_ros1 else with_message(tmp_path / "bag", kind, BOMB)
+    command = [sys.executable, "-c", REPLAY, str(path), *TOPICS]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     code, mib = map(int, done.stdout.split())
     errors = [line for line in done.stderr.splitlines() if ": error: " in line]
@@ -331,7 +318,7 @@ def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
         PoseBag(path)
 
 
-def database(path, rows, script=""):
+def database(path, rows):
     connection = sqlite3.connect(path)
     connection.executescript(
         "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
@@ -341,7 +328,6 @@ def database(path, rows, script=""):
     )
     connection.execute("INSERT INTO topics VALUES(1, '/a', ?, 'cdr', '')", (ODOMETRY,))
     connection.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", rows)
-    connection.executescript(script)
     connection.commit()
     connection.close()
     return path
@@ -354,22 +340,13 @@ def odometry():
     return bytes(JAZZY.serialize_cdr(message, ODOMETRY))
 
 
-@pytest.mark.parametrize("bad", [(5, "text"), (5, None), ("five", b""), (-5, b"")])
+@pytest.mark.parametrize("bad", [(5, "text"), (5, None), ("five", b""), (-5, b""), None])
 def test_values_of_other_types_are_refused(tmp_path, odometry, bad):
-    path = database(tmp_path / "bag.db3", [(1, odometry), bad, (9, odometry)])
-    assert read(path)[0] is None
-
-
-def test_messages_without_an_index_of_times_are_read_in_order(tmp_path, odometry):
-    path = database(tmp_path / "bag.db3", [(stamp, odometry) for stamp in (7, 3, 5)])
-    assert [pose.bag_ns for pose in all_poses(path, child=None)] == [3, 5, 7]
-
-
-def test_rows_that_are_computed_are_refused(tmp_path):
-    computed = (
-        "DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE n(k) AS (SELECT 1 UNION"
-        " ALL SELECT k + 1 FROM n) SELECT 1 AS topic_id, k AS timestamp, zeroblob(1000) AS data"
-        " FROM n;"
-    )
-    with pytest.raises(InputError, match="database missing tables"):
-        PoseBag(database(tmp_path / "bag.db3", [], computed))
+    """Without an index of times, the rest is read in the order of these."""
+    rows = [(9, odometry), bad or (5, odometry), (1, odometry)]
+    path = database(tmp_path / "bag.db3", rows)
+    if bad:
+        with pytest.raises(InputError, match=r"^[^\n]+$"):
+            all_poses(path, child=None)
+    else:
+        assert [pose.bag_ns for pose in all_poses(path, child=None)] == [1, 5, 9]

@@ -85,12 +85,6 @@ def test_every_type_of_stamped_pose(new_bag, storage, message_type):
     assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", sensor)
 
 
-def test_reading_from_a_bag_takes_no_options_of_text_files(tmp_path):
-    for options in ({"format": "csv"}, {"columns": "t"}, {"repair": True}, {"tf": "a:b"}):
-        with pytest.raises(ConfigError, match="topic and tf are for bags"):
-            hec.read_trajectory(tmp_path, topic="/a", **options)
-
-
 # ---- which topics are meant
 
 
@@ -126,14 +120,6 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
     for streams in (STREAMS, STREAMS | goal):
         with PoseBag(new_bag(streams=streams, name=f"bag{len(streams)}")) as bag:
             assert bag.topics.select(*named) == selected
-
-
-def test_a_path_counts_where_there_are_not_two_others(tmp_path):
-    path = (PARENT.stamps_ns[0], "/path", PATH, path_message(PARENT.stamps_ns, POSES))
-    write_messages(tmp_path / "path", [path])
-    write_bag(tmp_path / "poses", {"/z": STREAMS["/a"]})
-    with PoseBag(tmp_path / "path", tmp_path / "poses") as bag:
-        assert bag.topics.select() == ("/path", "/z")
 
 
 @pytest.mark.parametrize(

@@ -225,18 +225,13 @@ def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
         (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
         (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),
         (b'{"frames":' * 100_000, "recursion|expected|JSON"),
-        (b'{"frames": [7]}', "."),
-        (b"<gpx>" * 100_000, "no element found|not well-formed|unclosed"),
         (b"%  GPST  latitude(deg) longitude(deg)\n1\n", "list index out of range|expected"),
-        (b"$GPGGA,1,2,3,4,5,6,7,8,9,10,11,12\n", "."),
         (b"Format Version,1\nTime (Seconds)\n", "Motive|list index"),
-        (b"Segments\n100\n", "list index"),
         (
             b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, "
             b"'shape': (10000000000, 8), }" + b" " * 42 + b"\n",
             "cannot read",
         ),
-        (b"VERTEX_SE2 0 x y 1\n", "could not convert|expected"),
         (of_colmap().replace(str(TRUTH.stamps_ns[3]), "a").encode(), "has no number in its name"),
     ],
 )
