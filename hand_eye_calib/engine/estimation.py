@@ -5,6 +5,7 @@ assess, add the prior, judge.
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes
 from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs
 from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
-from hand_eye_calib.assessment.prior import fuse, widened
+from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
@@ -82,11 +83,11 @@ class Solved:
         fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), config.prior())
         residuals = residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns)
         scale, offset = self.scale, self.time_offset
-        result = Calibration(
-            T_parent_child=fused.T_parent_child,
-            covariance=fused.assessment.cov_parent_child_in_child,
+        result = calibration_of(
+            fused,
+            residuals,
+            config,
             status=fused.status(self.solution.converged),
-            observability=fused.assessment.observability,
             T_method=T_method,
             floor=None if self.is_beside else config.odometry_share * self._floor(),
             objective=self.solution.objective,
@@ -98,10 +99,6 @@ class Solved:
             noise=found.describe(self.stamps_ns) if found else None,
             backend=config.backend,
             n_poses=len(self.stamps_ns),
-            n_pairs=len(residuals),
-            n_inliers=int(residuals.is_inlier.sum()),
-            contradictions=fused.contradictions,
-            **config.target_fields(),
             stamp_ns=int(self.stamps_ns[-1]),
             time_offset_s=offset.seconds if offset else fixed_time_offset(config),
             time_offset_sigma_s=offset.sigma_s if offset else 0.0,
@@ -110,7 +107,6 @@ class Solved:
             scale_sigma=scale.estimate.sigma if scale.estimate else 0.0,
             warnings=(*scale.warnings, *fused.warnings, *self.warnings)
             + (self.shift.warnings if self.shift else ()),
-            motion_residuals=residuals,
             model=self.model,
         )
         if found is None:
@@ -129,6 +125,23 @@ class Solved:
             return floor_of_pairs(self.pairs, self.weights, self.solution.T_parent_child)
         lasting = [slow.sigma for slow in found.noise.slow if slow.part == "translation"]
         return common_mode_floor(found.by_scale, found.scale_variance, math.hypot(*lasting))
+
+
+def calibration_of(
+    fused: Fused, residuals: Residuals, config: CalibratorConfig, **fields: Any
+) -> Calibration:
+    """A result from what was fused with the prior, the residuals, and further fields."""
+    return Calibration(
+        T_parent_child=fused.T_parent_child,
+        covariance=fused.assessment.cov_parent_child_in_child,
+        observability=fused.assessment.observability,
+        n_pairs=len(residuals),
+        n_inliers=int(residuals.is_inlier.sum()),
+        contradictions=fused.contradictions,
+        **config.target_fields(),
+        motion_residuals=residuals,
+        **fields,
+    )
 
 
 def residuals_of(

@@ -7,6 +7,7 @@ it finds for the rotation does not depend on the rest. Of both: the time offset.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.checks.check import in_other_units, unit_of
 from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import residuals_of
+from hand_eye_calib.engine.estimation import calibration_of, residuals_of
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator as adaptive_estimator
@@ -61,30 +62,28 @@ _TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
 def _calibration(
     solution: AdaptiveSolution | LeverArmSolution,
     fused: Fused,
-    within_reach: slice,
     residuals: Residuals,
     pose_pairs: PosePairs,
     config: CalibratorConfig,
+    **fields: Any,
 ) -> Calibration:
-    """What both have: a result without frame names, time offset and scale."""
-    return Calibration(
-        T_parent_child=fused.T_parent_child,
-        covariance=fused.assessment.cov_parent_child_in_child,
-        status=fused.status(solution.converged, within_reach),
-        observability=fused.assessment.observability,
+    """A result without frame names."""
+    is_of_positions = isinstance(solution, LeverArmSolution)
+    return calibration_of(
+        fused,
+        residuals,
+        config,
+        status=fused.status(solution.converged, _TRANSLATION if is_of_positions else _ROTATION),
         objective=solution.objective,
         method="adaptive",
         reference="increments",
         backend="fast",
         n_poses=len(pose_pairs),
-        n_pairs=len(residuals),
-        n_inliers=int(residuals.is_inlier.sum()),
         time_offset_sigma_s=solution.time_offset_sigma_s,
         noise=solution.describe(pose_pairs.stamps_ns),
-        contradictions=fused.contradictions,
-        **config.target_fields(),
         stamp_ns=int(pose_pairs.stamps_ns[-1]),
-        motion_residuals=residuals,
+        measured="positions" if is_of_positions else "rotations",
+        **fields,
     )
 
 
@@ -126,9 +125,12 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     # What does not explain the positions has no time offset either.
     offset_s = 0.0 if findings else sign * solution.time_offset_s
     middle_ns = int(stamps_ns[0] + (stamps_ns[-1] - stamps_ns[0]) // 2)
-    return replace(
-        _calibration(solution, fused, _TRANSLATION, residuals, pose_pairs, config),
-        measured="positions",
+    return _calibration(
+        solution,
+        fused,
+        residuals,
+        pose_pairs,
+        config,
         T_method=T,
         floor=floor,
         time_offset_s=float(config.time_offset) + offset_s,
@@ -186,60 +188,49 @@ def _of_path(
     is_child: bool,
 ) -> list[Finding]:
     """A finding if the path of the positions is not that of the odometry, or in other units."""
+
+    def mended(positions: FloatArray, with_scale: bool) -> tuple[float, LeverArmSolution]:
+        """The share of the path that other positions leave unexplained, and their solution."""
+        try:
+            found = _lever_arm(stamps_ns, poses, positions, with_scale)
+        except InputError:
+            return 1.0, solution
+        return unexplained_share(poses, positions, found.lever_arm, found.scale), found
+
     share = unexplained_share(poses, positions, solution.lever_arm, solution.scale)
     if share < _EXPLAINED_PATH:
         return []
-    if found := _coordinates(share, stamps_ns, poses, positions, "child" if is_child else "parent"):
-        return [found]
+    # What is wrong with east and north, if that explains the path.
+    factors = horizontal_factors(poses[:, :3, 3], positions)
+    hypotheses = [(1.0, 1.0, True)]
+    if abs(factors[0] - factors[1]) > _FACTORS_APART * factors[1]:
+        hypotheses = [(*factors, False), (*factors, True), *hypotheses]
+    for east, north, is_swapped in hypotheses:
+        order = [1, 0, 2] if is_swapped else [0, 1, 2]
+        left, _ = mended((positions * [east, north, 1.0])[:, order], with_scale=False)
+        if left < _MENDED * share:
+            known: dict[str, Any] = {
+                "factor_x": east,
+                "factor_y": north,
+                "unexplained_share": share,
+            }
+            known |= {"unexplained_share_mended": left}
+            swapped = " and then swapped" if is_swapped else ""
+            stream = "child" if is_child else "parent"
+            return [finding("coordinates", stream, swapped=swapped, **known)]
     if is_known and share < _UNRELATED_PATH:
         return []
-    found = finding(
-        "unrelated_parts",
-        share=min(share, 1.0),
-        other="odometry",
-        part="motion of the positions",
-        units="the units, the scale",
-    )
-    try:
-        scaled = _lever_arm(stamps_ns, poses, positions, with_scale=True)
-    except InputError:
-        return [found]
+    left, scaled = mended(positions, with_scale=True)
     scale = scaled.scale if is_child else 1.0 / scaled.scale
-    explains = unexplained_share(poses, positions, scaled.lever_arm, scaled.scale) < _UNRELATED_PATH
-    if explains and (in_unit := unit_of(scale)):
+    if left < _UNRELATED_PATH and (in_unit := unit_of(scale)):
         factor, unit = in_unit
-        found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)
-    return [found]
-
-
-def _coordinates(
-    share: float, stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, stream: str
-) -> Finding | None:
-    """What is wrong with east and north, if that explains the path: of which the given share is
-    unexplained as it is.
-    """
-    found = horizontal_factors(poses[:, :3, 3], positions)
-    hypotheses = [(1.0, 1.0, True)]
-    if abs(found[0] - found[1]) > _FACTORS_APART * found[1]:
-        hypotheses = [(*found, False), (*found, True), *hypotheses]
-    for east, north, is_swapped in hypotheses:
-        mended = (positions * [east, north, 1.0])[:, [1, 0, 2] if is_swapped else [0, 1, 2]]
-        try:
-            solution = _lever_arm(stamps_ns, poses, mended, with_scale=False)
-        except InputError:
-            continue
-        left = unexplained_share(poses, mended, solution.lever_arm, solution.scale)
-        if left < _MENDED * share:
-            return finding(
-                "coordinates",
-                stream,
-                factor_x=east,
-                factor_y=north,
-                swapped=" and then swapped" if is_swapped else "",
-                unexplained_share=share,
-                unexplained_share_mended=left,
-            )
-    return None
+        return [in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)]
+    what: dict[str, Any] = {
+        "other": "odometry",
+        "part": "motion of the positions",
+        "units": "the units, the scale",
+    }
+    return [finding("unrelated_parts", share=min(share, 1.0), **what)]
 
 
 def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -277,9 +268,12 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
     weights, stamps_ns = (~solution.jumps).astype(float), pose_pairs.stamps_ns
     residuals = residuals_of(pairs, solution.T_parent_child, weights, stamps_ns)
-    return replace(
-        _calibration(solution, fused, _ROTATION, residuals, pose_pairs, config),
-        measured="rotations",
+    return _calibration(
+        solution,
+        fused,
+        residuals,
+        pose_pairs,
+        config,
         T_method=solution.T_parent_child,
         time_offset_s=float(config.time_offset) + solution.time_offset_s,
         rate_bias=_rate_bias(solution, config) if has_rates else None,
@@ -332,14 +326,12 @@ def _of_rotation(
     share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
     if share < _UNRELATED_ROTATION:
         return ()
-    found = finding(
-        "unrelated_parts",
-        share=min(share, 1.0),
-        part="rotation of one sensor",
-        other="other",
-        units="the unit of the rates",
-    )
-    return (found,)
+    what: dict[str, Any] = {
+        "part": "rotation of one sensor",
+        "other": "other",
+        "units": "the unit of the rates",
+    }
+    return (finding("unrelated_parts", share=min(share, 1.0), **what),)
 
 
 def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:

@@ -10,6 +10,7 @@ from hand_eye_calib.assessment.covariance import combined
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.checks.findings import finding
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.estimation import calibration_of
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration, Finding, Residuals
 from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
@@ -68,8 +69,9 @@ def calibrate_stops(
     """
     config = config or CalibratorConfig()
     fit = solve(Stops.of_one(Ts_world_parent, Ts_world_child))
-    mirrored = solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
-    findings = [finding("inverse", "child")] if _is_clearly_better(mirrored, fit) else []
+    other = solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
+    is_smaller = max(other.level_m / fit.level_m, other.level_rad / fit.level_rad) < 1.0 / _CLEARLY
+    findings = [finding("inverse", "child")] if is_smaller and other.converged else []
     return _assessed(fit, Ts_world_parent, Ts_world_child, config, frames, findings)
 
 
@@ -116,14 +118,6 @@ def calibrate_arm(
     return _assessed(fit, poses, Ts_target_camera, config or CalibratorConfig(), frames, [])
 
 
-def _is_clearly_better(one: RobotWorld, other: RobotWorld) -> bool:
-    return (
-        _CLEARLY * one.level_m < other.level_m
-        and _CLEARLY * one.level_rad < other.level_rad
-        and one.converged
-    )
-
-
 def _assessed(
     fit: RobotWorld,
     Ts_world_parent: FloatArray,
@@ -134,23 +128,27 @@ def _assessed(
 ) -> Calibration:
     X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
     fused = fuse(X, combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
-    residuals = _residuals(fit, Ts_world_parent, Ts_world_child)
-    return Calibration(
-        T_parent_child=fused.T_parent_child,
-        covariance=fused.assessment.cov_parent_child_in_child,
+    errors = se3.log(se3.inverse(Z @ Ts_world_child) @ Ts_world_parent @ X)
+    rows = np.arange(len(errors))
+    residuals = Residuals(
+        translation=errors[:, :3] @ X[:3, :3].T,
+        rotation=errors[:, 3:],
+        weights=fit.weights,
+        start_ns=rows,
+        end_ns=rows,
+    )
+    return calibration_of(
+        fused,
+        residuals,
+        config,
         status=fused.status(fit.converged),
-        observability=fused.assessment.observability,
         T_method=X,
         objective=-fit.log_likelihood,
         method="adaptive",
         reference="stops",
         backend="fast",
         n_poses=len(residuals),
-        n_pairs=len(residuals),
-        n_inliers=int(residuals.is_inlier.sum()),
         findings=tuple(findings),
-        contradictions=fused.contradictions,
-        **config.target_fields(),
         parent_frame=config.parent_frame or frames.parent,
         child_frame=config.child_frame or frames.child,
         T_world_world=Z,
@@ -158,21 +156,4 @@ def _assessed(
         parent_world_frame=frames.parent_world,
         child_world_frame=frames.child_world,
         warnings=tuple(fused.warnings),
-        motion_residuals=residuals,
-    )
-
-
-def _residuals(
-    fit: RobotWorld, Ts_world_parent: FloatArray, Ts_world_child: FloatArray
-) -> Residuals:
-    """Errors of each stop, child's axes."""
-    X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
-    errors = se3.log(se3.inverse(Z @ Ts_world_child) @ Ts_world_parent @ X)
-    rows = np.arange(len(errors))
-    return Residuals(
-        translation=errors[:, :3] @ X[:3, :3].T,
-        rotation=errors[:, 3:],
-        weights=fit.weights,
-        start_ns=rows,
-        end_ns=rows,
     )
