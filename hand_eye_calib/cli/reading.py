@@ -258,18 +258,16 @@ def feed(calibrator: Calibrator, blocks: "Iterable[PoseBlock]", topics: Mapping[
     count = 0
     for block in blocks:
         count += len(block)
+        columns = (block.streams, block.sensor_frames, block.stamps_ns, block.poses)
         row = 0
         try:
-            named = zip(block.streams.tolist(), block.sensor_frames.tolist(), strict=True)
-            for row, pair in enumerate(named):  # noqa: B007
-                if pair not in frames:
-                    calibrator.set_frame(*pair)
-                    frames.add(pair)
-            calibrator.add_poses(
-                block.streams, block.stamps_ns, block.poses[:, :3], block.poses[:, 3:]
-            )
+            rows = zip(*(column.tolist() for column in columns), strict=True)
+            for row, (stream, frame, stamp_ns, pose) in enumerate(rows):  # noqa: B007
+                if (stream, frame) not in frames:
+                    calibrator.set_frame(stream, frame)
+                    frames.add((stream, frame))
+                calibrator.add_pose(stream, stamp_ns, pose[:3], pose[3:])
         except InputError as error:
-            row = getattr(error, "index", row)
             seconds, nanoseconds = divmod(int(block.stamps_ns[row]), 1_000_000_000)
             raise InputError(
                 f"{topics[block.streams[row]]}, message {block.message_numbers[row]}, stamp "

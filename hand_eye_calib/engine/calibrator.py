@@ -5,7 +5,6 @@ files.
 """
 
 import contextlib
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.pose_buffer import BufferLimits, PoseBuffer, StreamStatistics
@@ -36,20 +34,6 @@ _MAX_NORM2 = (1 + QUATERNION_NORM_TOLERANCE) ** 2
 
 # Share of the poses that are paired if a buffer is full.
 _PAIRED_IF_FULL = 0.9
-
-
-class UnusablePose(InputError):
-    """One of many poses cannot be used.
-
-    Attributes
-    ----------
-    index : int
-        Its index among them.
-    """
-
-    def __init__(self, index: int, reason: InputError) -> None:
-        super().__init__(str(reason))
-        self.index = index
 
 
 class Calibrator:
@@ -189,66 +173,6 @@ class Calibrator:
             self._make_pairs()
         return buffer.add(stamp_ns, position, quat_xyzw)
 
-    def add_poses(
-        self,
-        stream: str | Sequence[str] | np.ndarray,
-        stamps_ns: IntArray,
-        positions: FloatArray,
-        quats_xyzw: FloatArray,
-    ) -> BoolArray:
-        """Take many poses: the same as :meth:`add_pose` with one after the other, to the last bit,
-        but faster.
-
-        Parameters
-        ----------
-        stream : str, or sequence of N str
-            "parent" or "child": of all the poses, or of each.
-        stamps_ns : (N,) int64 array
-        positions : (N, 3) array
-        quats_xyzw : (N, 4) array
-
-        Returns
-        -------
-        (N,) bool array
-            False for poses that were refused.
-
-        Raises
-        ------
-        UnusablePose
-            At the first pose for which :meth:`add_pose` raises; those before it were taken.
-        """
-        stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
-        poses = np.concatenate([positions, quats_xyzw], axis=1, dtype=float)
-        names = np.broadcast_to(np.asarray(stream), len(stamps_ns))
-        rows_of = {name: np.flatnonzero(names == name) for name in self._buffers}
-        is_plain = np.zeros(len(stamps_ns), dtype=bool)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for name, rows in rows_of.items():
-                is_newer = self._buffers[name].are_newer(stamps_ns[rows])
-                is_plain[rows] = _is_pose(*poses[rows].T) & is_newer
-        others = [*np.flatnonzero(~is_plain).tolist(), len(stamps_ns)]
-        taken = np.ones(len(stamps_ns), dtype=bool)
-        first = 0
-        while first < len(stamps_ns):
-            # Up to the next pose that is not plain, or that needs pairing first, they are only
-            # stored.
-            stop = others[bisect_left(others, first)]
-            for name, rows in rows_of.items():
-                due = int(rows.searchsorted(first)) + self._buffers[name].room_until_pairing
-                stop = min(stop, int(rows[due])) if due < len(rows) else stop
-            for name, rows in rows_of.items():
-                part = rows[rows.searchsorted(first) : rows.searchsorted(stop)]
-                if len(part):
-                    self._buffers[name].extend(stamps_ns[part], poses[part])
-            if stop < len(stamps_ns):
-                stamp_ns, pose = int(stamps_ns[stop]), poses[stop].tolist()
-                try:
-                    taken[stop] = self.add_pose(str(names[stop]), stamp_ns, pose[:3], pose[3:])
-                except InputError as error:
-                    raise UnusablePose(stop, error) from None
-            first = stop + 1
-        return taken
-
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
         parent, child = self._buffers["parent"], self._buffers["child"]
@@ -346,12 +270,11 @@ class Calibrator:
         return replace(self._config, time_offset=found.seconds) if found else None
 
 
-def _is_pose(x: Any, y: Any, z: Any, qx: Any, qy: Any, qz: Any, qw: Any) -> Any:
-    """Whether these values are a pose; of arrays, each row of them."""
+def _is_pose(x: float, y: float, z: float, qx: float, qy: float, qz: float, qw: float) -> bool:
     norm2 = qx * qx + qy * qy + qz * qz + qw * qw
     # NaN fails every comparison.
-    is_near = (abs(x) <= FARTHEST_M) & (abs(y) <= FARTHEST_M) & (abs(z) <= FARTHEST_M)
-    return is_near & (norm2 >= _MIN_NORM2) & (norm2 <= _MAX_NORM2)
+    is_near = abs(x) <= FARTHEST_M and abs(y) <= FARTHEST_M and abs(z) <= FARTHEST_M
+    return is_near and _MIN_NORM2 <= norm2 <= _MAX_NORM2
 
 
 def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> InputError:

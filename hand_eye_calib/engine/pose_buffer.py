@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry.trajectory import REACH, Trajectory
 
 
@@ -51,14 +51,15 @@ class StreamStatistics:
     first_stamp_ns: int | None = None
     last_stamp_ns: int | None = None
 
-    def note(self, first_ns: int, last_ns: int, count: int) -> None:
-        """Count poses that were taken."""
-        self.received += count
+    def note(self, stamp_ns: int) -> None:
+        """Count a pose that was taken."""
+        self.received += 1
         if self.first_stamp_ns is None or self.last_stamp_ns is None:
-            self.first_stamp_ns, self.last_stamp_ns = first_ns, last_ns
+            self.first_stamp_ns = self.last_stamp_ns = stamp_ns
+        elif stamp_ns > self.last_stamp_ns:
+            self.last_stamp_ns = stamp_ns
         else:
-            self.first_stamp_ns = min(self.first_stamp_ns, first_ns)
-            self.last_stamp_ns = max(self.last_stamp_ns, last_ns)
+            self.first_stamp_ns = min(self.first_stamp_ns, stamp_ns)
 
     def to_dict(self) -> dict[str, int | None]:
         """What a result says of its inputs."""
@@ -117,16 +118,6 @@ class PoseBuffer:
         is_many = self._count > self._limits.pairing_starts
         return is_many and self.statistics.received % self._limits.batch_every == 0
 
-    @property
-    def room_until_pairing(self) -> int:
-        """Number of newer poses that :meth:`extend` may take before the buffer is full or pairs are
-        due.
-        """
-        until_start = max(self._limits.pairing_starts + 1 - self._count, 0)
-        received = self.statistics.received + until_start
-        until_due = until_start + -received % self._limits.batch_every
-        return min(until_due, self._limits.capacity - self._count)
-
     def add(self, stamp_ns: int, position: Any, quat_xyzw: Any) -> bool:
         """Take a pose; False if the stamp is a duplicate or too late."""
         if stamp_ns <= self._dropped_until_ns:
@@ -143,22 +134,8 @@ class PoseBuffer:
         self._stamps_ns[index] = stamp_ns
         self._poses[index, :3], self._poses[index, 3:] = position, quat_xyzw
         self._count += 1
-        self.statistics.note(stamp_ns, stamp_ns, 1)
+        self.statistics.note(stamp_ns)
         return True
-
-    def extend(self, stamps_ns: IntArray, poses: FloatArray) -> None:
-        """Take poses (N, 7), each newer than all before; there must be room for them."""
-        end = self._count + len(stamps_ns)
-        self._stamps_ns[self._count : end] = stamps_ns
-        self._poses[self._count : end] = poses
-        self._count = end
-        self.statistics.note(int(stamps_ns[0]), int(stamps_ns[-1]), len(stamps_ns))
-
-    def are_newer(self, stamps_ns: IntArray) -> BoolArray:
-        """(N,) whether each stamp is newer than all before it."""
-        last_ns = self.statistics.last_stamp_ns
-        last_ns = np.iinfo(np.int64).min if last_ns is None else last_ns
-        return stamps_ns > np.maximum.accumulate(np.concatenate([[last_ns], stamps_ns]))[:-1]
 
     def stamp_at(self, share: float) -> int:
         """Stamp below which this share of the poses lies."""

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.journal import (
@@ -55,10 +53,11 @@ def give(journal: Journal, directory: Path, engines: Engines) -> None:
             for stream, own_stream in (("parent", "parent"), (name, "child")):
                 if frame := journal.about.get(stream, {}).get("frame"):
                     engine.set_frame(own_stream, frame)
-            rows = np.isin(journal.streams, ["parent", name])
-            poses = journal.poses[rows]
-            own_streams = np.where(journal.streams[rows] == "parent", "parent", "child")
-            engine.add_poses(own_streams, journal.stamps_ns[rows], poses[:, :3], poses[:, 3:])
+            columns = (journal.streams, journal.stamps_ns, journal.poses)
+            for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
+                if stream in ("parent", name):
+                    own_stream = "parent" if stream == "parent" else "child"
+                    engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
     except InputError as error:
         raise InputError(f"cannot use the session journal {directory}: {error}") from None
 
