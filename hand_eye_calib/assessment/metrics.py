@@ -59,8 +59,9 @@ def absolute_errors(
 
 
 def deviation(T_parent_child: FloatArray, T_reference: FloatArray) -> FloatArray:
-    """Deviation (6,) of a transform from another, along (m) and about (rad) the axes of the parent
-    sensor's frame.
+    """Deviations (..., 6) of transforms (..., 4, 4) from another (4, 4), along (m) and about (rad)
+    the axes of the parent sensor's frame.
     """
-    rotation = se3.rotation_log(T_parent_child[:3, :3] @ T_reference[:3, :3].T)
-    return np.r_[T_parent_child[:3, 3] - T_reference[:3, 3], rotation]
+    rotation = se3.rotation_log(T_parent_child[..., :3, :3] @ T_reference[:3, :3].T)
+    translation = T_parent_child[..., :3, 3] - T_reference[:3, 3]
+    return np.concatenate([translation, rotation], axis=-1)

@@ -20,7 +20,7 @@ from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, sync
 from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
-    from hand_eye_calib.engine.pose_buffer import RawPoses
+    from hand_eye_calib.engine.calibrator import RawPoses
 
 STREAMS = ("parent", "child")
 

@@ -27,7 +27,7 @@ from hand_eye_calib.assessment.moved import (
     shift_covariance,
     squared_shift,
 )
-from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.live.log import NodeLog

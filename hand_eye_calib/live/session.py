@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.pose_buffer import BufferLimits, StreamStatistics
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.geodetic import LocalOrigin

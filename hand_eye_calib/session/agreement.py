@@ -25,6 +25,7 @@ from enum import Enum
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import amount, axes_in_words, listing
@@ -146,13 +147,12 @@ def agreement_of(
     level : float
         Probability to accuse one of results that belong together.
     """
-    Ts = np.asarray(Ts_parent_child, dtype=float)
-    tau = np.zeros(6) if usual is None else np.asarray(usual, dtype=float)
+    Ts, tau = Ts_parent_child, np.zeros(6) if usual is None else usual
     stated = np.array([_without_unknown(each) for each in covariances])
     weights = np.linalg.inv(stated + np.diag(tau**2))
     best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
     start = common_of(Ts, np.linalg.inv(weights), np.zeros(6), Ts[best])[0]
-    errors = errors_of(Ts, start)
+    errors = deviation(Ts, start)
     kind, apart, chi2, dof, p_value = _explanation(errors, weights, level)
     T, covariance, scatter = common_of(Ts[~apart], stated[~apart], tau, start)
     _, _, left, free, _ = _explanation(errors[~apart], weights[~apart], 0.0)
@@ -168,7 +168,7 @@ def agreement_of(
         dof=dof,
         p_value=p_value,
         excess=math.sqrt(left / free) if free else 1.0,
-        deviations=np.where(np.isfinite(sigmas), errors_of(Ts, T), np.nan),
+        deviations=np.where(np.isfinite(sigmas), deviation(Ts, T), np.nan),
         sigmas=sigmas,
     )
 
@@ -187,7 +187,7 @@ def common_of(
     chunks = np.array_split(np.arange(len(factors)), max(1, len(factors) * len(Ts) // 5000))
     T = start
     for _ in range(_ROUNDS):
-        errors = errors_of(Ts, T)
+        errors = deviation(Ts, T)
         found = [_at_scatter(errors, covariances, variances[chunk]) for chunk in chunks]
         means, each, likelihoods = map(np.concatenate, zip(*found, strict=True))
         shares = log_prior + likelihoods
@@ -215,12 +215,6 @@ def _at_scatter(
     squared = (rest * np.einsum("gnij,gnj->gni", weights, rest)).sum(axis=(1, 2))
     volumes = np.linalg.slogdet(spread)[1].sum(axis=1) - np.linalg.slogdet(each)[1]
     return means, each, -0.5 * (volumes + squared)
-
-
-def errors_of(Ts: FloatArray, T: FloatArray) -> FloatArray:
-    """Deviations (N, 6) of transforms from one, along and about the parent's axes."""
-    rotations = se3.rotation_log(Ts[:, :3, :3] @ T[:3, :3].T)
-    return np.concatenate([Ts[:, :3, 3] - T[:3, 3], rotations], axis=1)
 
 
 def unknown_directions(covariance: FloatArray) -> FloatArray:

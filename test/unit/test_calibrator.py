@@ -13,9 +13,8 @@ from motions import (
 )
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.offline import calibrate, offline_config, whole_snapshot
-from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

@@ -6,8 +6,7 @@ from motions import as_trajectory, child_of, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal

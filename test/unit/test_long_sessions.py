@@ -18,9 +18,8 @@ from motions import (
 )
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.engine.snapshot import downsample
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs

@@ -14,8 +14,7 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.pose_buffer import BufferLimits
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.run import review
 from hand_eye_calib.live import processes
 from hand_eye_calib.live.processes import SolvingProcess

@@ -18,9 +18,8 @@ from motions import (
 from hand_eye_calib.alignment.angular_rates import correlate_rates
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.engine.pose_buffer import BufferLimits
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
