@@ -144,10 +144,6 @@ class TestPrior:
         known = {"x": (np.float64(1 / 3), 1e-7), "yaw": (-2.0e-12, np.pi / 7)}
         assert CalibratorConfig(**prior_fields(known)).prior() == known
 
-    def test_texts_are_those_of_the_options(self):
-        config = CalibratorConfig(**prior_fields({"z": "185cm+/-2cm", "transform": ""}))
-        assert (config.prior_z, config.prior_transform) == ("185cm+/-2cm", "")
-
     @pytest.mark.parametrize(
         ("prior", "message"),
         [

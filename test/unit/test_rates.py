@@ -354,10 +354,6 @@ class TestMessages:
         with pytest.raises(InputError, match="^found latitude 139.7"):
             read(fix(0, latitude=139.7))
 
-    def test_an_imu_can_be_read_as_rotations(self):
-        reader = MessageReader("sensor_msgs/msg/Imu", "rotations")
-        assert reader.columns([imu((1, 1, 1))], False)[0].poses[0, 3:].tolist() == [0, 0, 0.6, 0.8]
-
     def test_what_a_type_does_not_have_is_refused(self):
         assert measured_as("sensor_msgs/msg/Imu", "auto", "/imu") == "rates"
         assert measured_as("nav_msgs/msg/Odometry", "positions", "/odom") == "positions"

@@ -10,7 +10,7 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
-from hand_eye_calib.checks.check import CheckResult, check_streams
+from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
@@ -265,14 +265,6 @@ def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
     given = replace(late.config, time_offset="estimate", given={"time_offset"})
     asked = run(replace(late, buffered_child=child, config=given)).calibration
     assert asked.findings == ()
-
-
-def test_the_check_takes_the_correlation_as_it_is(late):
-    known, child = 0.049, late.child
-    found = check_streams(late.parent, child, known)
-    same = check_streams(late.parent, child, known, correlation=late.correlation)
-    assert same.findings == found.findings
-    assert same.correlation.offset_s == pytest.approx(found.correlation.offset_s, abs=1e-9)
 
 
 @pytest.mark.parametrize(
