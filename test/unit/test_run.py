@@ -6,6 +6,7 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
+from hand_eye_calib.geometry.misread import put_right
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
@@ -17,7 +18,6 @@ from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import review, run, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.misread import put_right
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
 from reproduction.coverage.classes import make
