@@ -6,7 +6,6 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
-from hand_eye_calib.geometry.misread import put_right
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
@@ -70,7 +69,7 @@ def written_otherwise(trajectory, convention):
         quats = np.roll(se3.to_quat_xyzw(trajectory.poses), 1, axis=1)
         poses = se3.from_quat_xyzw(trajectory.poses[:, :3, 3], quats)
     else:
-        poses = put_right(trajectory.poses, **convention)
+        poses = se3.put_right(trajectory.poses, **convention)
     return replace(trajectory, poses=poses)
 
 
