@@ -7,17 +7,17 @@ files.
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import (
     STREAMS,
+    RawPoses,
     Snapshot,
     downsample,
     estimated_time_offset,
@@ -29,7 +29,6 @@ from hand_eye_calib.geometry.trajectory import (
     FARTHEST_M,
     QUATERNION_NORM_TOLERANCE,
     REACH,
-    Trajectory,
     far_position,
 )
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
@@ -98,19 +97,6 @@ class StreamStatistics:
         """What a result says of its inputs."""
         values = {name: each for name, each in vars(self).items() if name != "dropped_unpaired"}
         return {"messages": values.pop("received"), **values}
-
-
-@dataclass(frozen=True)
-class RawPoses:
-    """Poses as they came in, in order of time: stamps (N,) int64, and x y z qx qy qz qw (N, 7)."""
-
-    stamps_ns: IntArray
-    poses: FloatArray
-
-    @cached_property
-    def trajectory(self) -> Trajectory:
-        """The same as a Trajectory. This is the expensive part."""
-        return Trajectory.from_quat_xyzw(self.stamps_ns, self.poses[:, :3], self.poses[:, 3:])
 
 
 class PoseBuffer:

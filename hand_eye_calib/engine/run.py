@@ -169,28 +169,19 @@ def review(
 
 def _of_clear_offset(first: Run, certain: Options) -> Run:
     """The run whose time offset :func:`_at_clear_offset` had estimated, or a second one: without
-    that, or with what else is certain.
+    that if it is small, or with what else is certain.
     """
     ahead = {"time_offset": "estimate"}
     clock, offset_s = first.snapshot.time_offset, first.calibration.time_offset_s
     if clock and clock.rate and clock.rate.is_used:
         offset_s = replace(clock, seconds=offset_s).largest_s(first.snapshot.child.duration_s)
-    is_large = _is_large(offset_s, first.calibration)
     others = {name: value for name, value in certain.items() if name != "time_offset"}
-    if is_large and (others or first._is_sound):
-        second = None if first._is_sound else first._improved(others, by=1)
-        if second is None:
-            return _telling(first, ahead, ())
-        return _telling(second, ahead | others, first.check.findings)
-    without = _solved_with(first.snapshot, {"time_offset": CalibratorConfig.time_offset} | others)
-    if without is None:
+    if _is_large(offset_s, first.calibration):
+        if second := first._improved(others, by=1):
+            return _telling(second, ahead | others, first.check.findings)
         return _telling(first, ahead, ())
-    given = first.snapshot.config.given
-    certain = _certain(without.check.findings, given)
-    asks = certain or _offset_of_model(without.calibration, without.snapshot, given)
-    if asks and first._is_better_than(without, by=int(bool(certain))):
-        return _telling(first, ahead, without.check.findings)
-    return _telling(without, others, first.check.findings)
+    without = _solved_with(first.snapshot, {"time_offset": CalibratorConfig.time_offset} | others)
+    return _telling(without, others, first.check.findings) if without else first
 
 
 def _repaired(first: Run, second: Run, options: Options) -> Run:

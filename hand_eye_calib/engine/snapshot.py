@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
@@ -18,9 +18,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, synchronise
 from hand_eye_calib.results.calibration import Calibration
-
-if TYPE_CHECKING:
-    from hand_eye_calib.engine.calibrator import RawPoses
 
 STREAMS = ("parent", "child")
 
@@ -35,6 +32,19 @@ _BELIEVABLE_S = 1.0
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
 GAP_INTERVALS = 4
+
+
+@dataclass(frozen=True)
+class RawPoses:
+    """Poses as they came in, in order of time: stamps (N,) int64, and x y z qx qy qz qw (N, 7)."""
+
+    stamps_ns: IntArray
+    poses: FloatArray
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The same as a Trajectory. This is the expensive part."""
+        return Trajectory.from_quat_xyzw(self.stamps_ns, self.poses[:, :3], self.poses[:, 3:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +69,8 @@ class Snapshot:
 
     config: CalibratorConfig
     kept: PosePairs
-    buffered_parent: "RawPoses | Trajectory"
-    buffered_child: "RawPoses | Trajectory"
+    buffered_parent: RawPoses | Trajectory
+    buffered_child: RawPoses | Trajectory
     paired_at: str | None
     parent_frame: str
     child_frame: str
@@ -245,7 +255,7 @@ def conventions(config: CalibratorConfig, stream: str) -> dict[str, float | str]
     return {name: each for name, each in given.items() if each != getattr(CalibratorConfig, name)}
 
 
-def _put_right(poses: "RawPoses | Trajectory", stream: str, config: CalibratorConfig) -> Trajectory:
+def _put_right(poses: RawPoses | Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
     """The trajectory of a stream in the usual convention, from that of the options."""
     trajectory = poses if isinstance(poses, Trajectory) else poses.trajectory
     if not conventions(config, stream):
