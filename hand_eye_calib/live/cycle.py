@@ -49,8 +49,7 @@ class SolveCycle:
 
     Attributes
     ----------
-    solves : int
-        Solves of this node so far; the last one took so many ``seconds``.
+    is_solving : bool
     result : Calibration or None
         The session's result, which is told, published, saved and broadcast: the newest usable one;
         once the goal is reached, the one kept, whose warnings say why the newest is not. The
@@ -70,7 +69,7 @@ class SolveCycle:
         publish: Callable[[Calibration], None],
         targets: Sequence[float],
     ) -> None:
-        self.solves, self.seconds, self.is_solving = 0, 0.0, False
+        self.is_solving = False
         self.checks, self.goal = StreamChecks(), Goal(targets)
         self._session, self._log = session, log
         self._complete, self._publish = complete, publish
@@ -153,8 +152,6 @@ class SolveCycle:
         """Take an answer; whether it is good, and a line about it."""
         if answer.session != self._session.number:
             return False, "the session was reset during the solve: its result is dropped"
-        self.solves += 1
-        self.seconds = answer.seconds
         # Solves that take longer than their period leave the processor free for half the time.
         self._rest_until_s = time.monotonic() + answer.seconds
         self.seen, self.failure = answer.seen, answer.failure

@@ -64,8 +64,6 @@ def extrinsic_state(
         level=level,
         text=text,
         is_solving=cycle.is_solving,
-        solves=cycle.solves,
-        last_solve_s=cycle.seconds,
         n_poses=seen.n_poses if seen else 0,
         path_m=seen.distance if seen else 0.0,
         motion_s=seen.motion_s if seen else 0.0,
@@ -101,7 +99,7 @@ def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultSta
     T = result.T_parent_child
     pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
     sigmas = np.concatenate([result.sigmas[:3], result.sigmas_rpy])
-    same = ("parent_frame", "child_frame", "warnings", "n_poses", "n_pairs", "time_offset_s",
+    same = ("parent_frame", "child_frame", "warnings", "n_poses", "time_offset_s",
             "time_offset_sigma_s", "scale", "scale_sigma")  # fmt: skip
     return ResultState(
         **{name: getattr(result, name) for name in same},
@@ -110,8 +108,6 @@ def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultSta
         reasons=tuple(f"{each.sentence}: {each.what_to_do}" for each in result.reasons),
         pose=_by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
         pose_sigma=_by_axis(sigmas),
-        axis_verdict={dof.name: dof.verdict.value for dof in result.observability},
-        method=f"{result.method} {result.reference} {result.backend}",
         inlier_share=result.n_inliers / max(result.n_pairs, 1),
         age_s=age_s,
         newest_pose_age_s=(clock_ns - result.stamp_ns) * 1e-9 if clock_ns else None,

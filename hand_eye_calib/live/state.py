@@ -55,10 +55,7 @@ class ResultState:
     warnings: tuple[str, ...]
     pose: AxisValues
     pose_sigma: AxisValues
-    axis_verdict: Mapping[str, str]
-    method: str
     n_poses: int
-    n_pairs: int
     inlier_share: float
     time_offset_s: float
     time_offset_sigma_s: float
@@ -81,8 +78,6 @@ class ExtrinsicState(Part):
     """
 
     is_solving: bool
-    solves: int
-    last_solve_s: float
     n_poses: int
     path_m: float
     motion_s: float = 0.0
@@ -128,7 +123,6 @@ class ChecksState(Part):
     """Findings of the stream checks; ``age_s`` is None before the first one."""
 
     age_s: float | None = None
-    correlation: float | None = None
     findings: tuple[str, ...] = ()
 
 

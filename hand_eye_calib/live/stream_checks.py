@@ -89,7 +89,6 @@ class StreamChecks:
             level=Level.WARN if faults else Level.OK,
             text="; ".join(faults) or "both streams can be of one rigid body",
             age_s=steady_s - self._checked_at_s,
-            correlation=result.correlation.correlation,
             findings=tuple(
                 f"{each.severity.value}: {in_parameters(each)}" for each in result.findings
             ),

@@ -46,15 +46,15 @@ PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 
 RESULT = ResultState(
     parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
-    reasons=("a: b", "c: d"), warnings=(), method="adaptive", n_poses=9, n_pairs=9,
+    reasons=("a: b", "c: d"), warnings=(), n_poses=9,
     inlier_share=1.0, time_offset_s=0.0, time_offset_sigma_s=0.0, scale=1.0, scale_sigma=0.0,
-    age_s=1.0, newest_pose_age_s=None, axis_verdict={},
+    age_s=1.0, newest_pose_age_s=None,
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
     pose_sigma={"x": 0.004, "y": 0.004, "z": None, "roll": 0.01, "pitch": 0.01, "yaw": 0.01},
 )  # fmt: skip
 EXTRINSIC = ExtrinsicState(
-    level=Level.OK, text="known", is_solving=False, solves=1, last_solve_s=0.1, n_poses=9,
-    path_m=3.0, rotation_deg={}, tf_static=Broadcast.OFF,
+    level=Level.OK, text="known", is_solving=False, n_poses=9, path_m=3.0, rotation_deg={},
+    tf_static=Broadcast.OFF,
     tf_static_reason="", result=RESULT,
 )  # fmt: skip
 ROTATION = AxisProgress(sigma=0.001, target=0.00524, seconds_left=0.0)
@@ -65,7 +65,7 @@ AT = Progress(
     limiting_axis="z",
     axes=dict.fromkeys(AXES, ROTATION) | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
 )
-CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, correlation=0.9, findings=())
+CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, findings=())
 MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
 
 
