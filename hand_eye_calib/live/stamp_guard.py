@@ -9,8 +9,8 @@ import itertools
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 # A real change this far back is a jump of the clock, and a new session.
 BACKWARD_JUMP_NS = 1_000_000_000
@@ -31,22 +31,14 @@ _OTHERS_FOLLOW_S = 2.0
 Stamped = tuple[int, Any]
 
 
-@dataclass
-class Judgement:
-    """What a message has brought about.
-
-    Attributes
-    ----------
-    taken : list of (stamp_ns, message)
-        To be used now; messages that waited are among them.
-    dropped : list of int
-        Corrupt stamps of messages that are not to be used.
-    jumped_back : bool
-        The messages taken are the first of a new session.
+class Judgement(NamedTuple):
+    """What a message has brought about: stamps and messages to be used now, of which some have
+    waited; corrupt stamps of messages that are not to be used; whether those to be used are the
+    first of a new session.
     """
 
-    taken: list[Stamped] = field(default_factory=list)
-    dropped: list[int] = field(default_factory=list)
+    taken: Sequence[Stamped] = ()
+    dropped: Sequence[int] = ()
     jumped_back: bool = False
 
 
@@ -86,8 +78,7 @@ class StampGuard:
             dropped = self._drop_held()
         self._held.append((stamp_ns, message))
         judgement = self._believe() if len(self._held) >= WITNESSES else Judgement()
-        judgement.dropped = dropped
-        return judgement
+        return judgement._replace(dropped=dropped)
 
     def flush(self, now_s: float) -> Judgement:
         """Judge the messages that wait if the stream is silent; to be called often."""
