@@ -91,15 +91,12 @@ def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
             yield Case(name, (drive.parent, drive.child), {}, *truth, drive.bound())
 
 
-def solved(cases: list[Case], package: Path, method: str) -> list[Any]:
+def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
     """Answers of the version of the package in a folder."""
     with tempfile.TemporaryDirectory() as folder:
         given, found = (str(Path(folder) / name) for name in ("given", "found"))
         asked = [
-            (
-                [(each.stamps_ns, each.poses) for each in case.streams],
-                case.options | {"method": method},
-            )
+            ([(each.stamps_ns, each.poses) for each in case.streams], case.options | options)
             for case in cases
         ]
         Path(given).write_bytes(pickle.dumps(asked))
@@ -155,11 +152,12 @@ def row(cases: list[Case], found: list[Any], others: dict[str, list[Any]]) -> di
 
 def table(cases: list[Case], package: Path, against: Path | None) -> str:
     """A row for every family, and one for all."""
-    found = solved(cases, package, "auto")
+    found = solved(cases, package, {})
     others = {}
     if against is not None:
         others = {
-            f"its {method}": solved(cases, against, method) for method in ("auto", "adaptive")
+            "its default": solved(cases, against, {}),
+            "its adaptive": solved(cases, against, {"method": "adaptive"}),
         }
     rows = []
     families = [*dict.fromkeys(case.family for case in cases)]

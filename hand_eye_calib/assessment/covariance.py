@@ -40,10 +40,6 @@ SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 _BLOCKS = 10
 _MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
 
-# What the ascending eigenvalues of the covariance (6, 6) of ten independent draws of unit variance
-# exceed once in ten times; the same of three.
-_CHANCE = {6: np.array([0.20, 0.46, 0.83, 1.34, 2.07, 3.28]), 3: np.array([0.64, 1.31, 2.44])}
-
 # An unseen direction with at least this length in its rotation is not one of translation alone.
 _SHARE_OF_ROTATION = 0.5
 
@@ -105,7 +101,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         pose_pairs.Ts_pw_p,
         solution.T_parent_child,
         solution.jumps,
-        solution.noise.rotation_variance,
+        solution.rotation_variance,
         # Rotations below the noise of single poses cannot be told from none.
         MIN_SHARE if solution.is_drowned else MIN_SHARE_WITH_TILT,
     )
@@ -124,7 +120,7 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     whole = np.zeros((6, 6))
     whole[part, part] = _widened(solution.cov_parent_child_in_child[part, part], solution, part)
     lone_axes = noise_driven(
-        Ts_pw_p, solution.T_parent_child, solution.jumps, solution.noise.rotation_variance
+        Ts_pw_p, solution.T_parent_child, solution.jumps, solution.rotation_variance
     )
     hidden = [direction for direction in unseen.T if np.linalg.norm(direction) > _SHARE_OF_ROTATION]
     hidden += [axis[:3] for axis in lone_axes]
@@ -137,7 +133,7 @@ def assess_lever_arm(Ts: FloatArray, solution: LeverArmSolution) -> Assessment:
     a transform with no rotation, which is unknown.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3)) + solution.beyond
+    whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3))
     white, walk = _white_rotation(Ts), solution.rotation_walk
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
@@ -165,7 +161,9 @@ def _widened(
     if len(solution.jumps) < _BLOCKS * _MIN_PAIRS_PER_BLOCK:
         return covariance
     steps = answers_without(solution.part_products, _BLOCKS)[:, part]
-    covariance = beyond_chance(covariance, _spread_of_blocks(steps))
+    spread = np.linalg.pinv(covariance, hermitian=True) @ _spread_of_blocks(steps)
+    # One factor for all directions: that of a single direction scatters too much.
+    covariance = max(float(np.trace(spread)) / len(covariance), 1.0) * covariance
     return widened_by_halves(covariance, solution.part_products, solution.misfit, part)
 
 
@@ -216,7 +214,7 @@ def combined(
     resampling if there is one, and directions (6, U) that the motion does not reveal.
     """
     known, scaled = np.eye(6) - unknown @ unknown.T, UNKNOWN_SIGMAS[:, None] * unknown
-    raised = model if resampled is None else _raised(model, resampled, np.ones(len(model)))
+    raised = model if resampled is None else _raised(model, resampled)
     covariance = known @ raised @ known + scaled @ scaled.T
     return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
 
@@ -315,16 +313,6 @@ def _spread_of_blocks(deviations: FloatArray) -> FloatArray:
     return (n_blocks - 1) / n_blocks * centred.T @ centred
 
 
-def beyond_chance(model: FloatArray, resampled: FloatArray) -> FloatArray:
-    """The model's covariance, raised in the directions in which that of ten blocks exceeds what
-    chance makes of it.
-
-    The ratios of the jackknife to a model that is right scatter: with ten blocks the largest of six
-    exceeds 3.3 once in ten recordings. They are divided by what is exceeded so often.
-    """
-    return _raised(model, resampled, _CHANCE[len(model)])
-
-
 def widened_by_halves(
     model: FloatArray, products: FloatArray, misfit: float, part: slice = slice(0, 6)
 ) -> FloatArray:
@@ -332,7 +320,8 @@ def widened_by_halves(
     both halves of the recording disagree by more than chance.
 
     ``products`` (K, p + 1, p + 1) are what each part of the recording adds, see
-    :mod:`~hand_eye_calib.gls.parts`; ``misfit`` is a factor of the covariances of the halves.
+    :func:`~hand_eye_calib.gls.state_space.part_products`; ``misfit`` is a factor of the covariances
+    of the halves.
     """
     half = len(products) // 2
     halves = NormalEquations(np.array([products[:half].sum(axis=0), products[half:].sum(axis=0)]))
@@ -348,15 +337,15 @@ def widened_by_halves(
     return model + (excess - 1.0) / float(error @ away) * np.outer(error, error)
 
 
-def _raised(first: FloatArray, second: FloatArray, limits: FloatArray) -> FloatArray:
-    """The first covariance, with the ratios of the second to it, ascending, beyond limits (6,)."""
+def _raised(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The larger of two covariances, direction by direction."""
     # In the coordinates where the first is the identity, the eigenvalues of the second are the
     # ratios.
     variances, axes = np.linalg.eigh(first)
     root = axes * np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE))
     values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, second).T))
     raised = root @ vectors
-    return (raised * np.maximum(values / limits, 1.0)) @ raised.T
+    return (raised * np.maximum(values, 1.0)) @ raised.T
 
 
 def _verdicts(

@@ -213,7 +213,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
+        Of :func:`~hand_eye_calib.gls.state_space.part_products`.
     misfit : float
         Factor of the covariances.
     """

@@ -123,8 +123,8 @@ class Solved:
         """Common-mode floor (6, 6) of errors of two odometries."""
         if (found := self.adaptive) is None:
             return floor_of_pairs(self.pairs, self.weights, self.solution.T_parent_child)
-        lasting = [slow.sigma for slow in found.noise.slow if slow.part == "translation"]
-        return common_mode_floor(found.by_scale, found.scale_variance, math.hypot(*lasting))
+        lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
+        return common_mode_floor(np.zeros(6), 0.0, math.hypot(*lasting))
 
 
 def calibration_of(
@@ -267,7 +267,7 @@ def _adaptive_solution(
         pose_pairs.stamps_ns,
         pose_pairs.Ts_pw_p,
         pose_pairs.Ts_cw_c,
-        [name for name in SYSTEMATIC if known.isdisjoint(name.split("+"))],
+        [name for name in SYSTEMATIC if name not in known],
         is_clock_free=is_clock_free,
     )
 

@@ -120,7 +120,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     weights = ~(solution.jumps | solution.spikes[1:])
     residuals = _steps(solution, poses, positions, pose_pairs, weights)
     floor = np.zeros((6, 6))
-    floor[:3, :3] = solution.common + 2.0 * _POINT_M**2 * np.eye(3)
+    floor[:3, :3] = 2.0 * _POINT_M**2 * np.eye(3)
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
     offset_s = 0.0 if findings else sign * solution.time_offset_s

@@ -15,14 +15,12 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.increments import SCALE, SYSTEMATIC, Streams
+from hand_eye_calib.gls.increments import N_SYSTEMATIC, SYSTEMATIC, Streams
 from hand_eye_calib.gls.noise_model import ROTATION
-from hand_eye_calib.gls.normal import N_BLOCKS, answers_without
-from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.problem import Fit, Problem
 from hand_eye_calib.gls.solution import AdaptiveSolution
-from hand_eye_calib.gls.stages import STAGES, start
-from hand_eye_calib.gls.state_space import Posterior
+from hand_eye_calib.gls.stages import STAGES, is_settled, start
+from hand_eye_calib.gls.state_space import part_products
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 from hand_eye_calib.stats import median
 
@@ -48,12 +46,11 @@ def solve(
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of both sensors in their own worlds at these stamps.
     systematic : sequence of str
-        Systematic errors to choose from, the plainest first; the choice if there is only one.
+        Systematic errors in the model.
     quick : bool
         Stop at white noise, drift and outliers: neither errors that last nor heavy tails.
     is_clock_free : bool
-        The clock offset was estimated from these poses, so that X is as uncertain as that makes it:
-        the model has a time offset, unless the motion hardly tells it from X.
+        The clock offset was estimated from these poses: it is not known beforehand.
     without : collection of str
         Names of :data:`~hand_eye_calib.gls.stages.STAGES` to leave out.
     tuning : Tuning
@@ -84,11 +81,9 @@ def solve(
         )
         return _at_all_poses(fewer, kept, first.outliers.spikes)
     fit = _passed(problem, first, STAGES[_FIRST:])
-    if not fit.converged:
-        plainest = replace(
-            problem, systematic=problem.systematic[:1], without=problem.without | {"lasting"}
-        )
-        fit = _passed(plainest, first, STAGES[_FIRST:])
+    if not is_settled(problem, fit):
+        problem = replace(problem, without=problem.without | {"lasting"})
+        fit = _passed(problem, first, STAGES[_FIRST:])
     return _solution(problem, fit)
 
 
@@ -134,62 +129,34 @@ def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) ->
 
 def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     """The solution one step from where the search stands."""
-    streams, posterior = problem.streams, problem.posterior(fit)
+    streams, posterior, columns = problem.streams, problem.posterior(fit), problem.columns
     normal = posterior.normal
     n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
-    misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - len(fit.columns), 1)
+    misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - len(columns), 1)
     # Steps smaller than predicted do not make what was learned over long baselines more certain.
     covariance = max(misfit, 1.0) * normal.covariance
-    covariance[:6, :6] += fit.cov_beyond
-    parts = part_products(posterior)
+    sigmas = np.zeros(N_SYSTEMATIC)
+    sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
+    unseen = problem.tuning.unseen_share * fit.model.fixed_to_body(fit.levels)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
-    final = fit.moved(normal.step)
-    by_scale, scale_variance = _of_scale(posterior, fit)
+    final = fit.moved(normal.step, columns)
+    is_there = fit.sigmas > problem.tuning.none
     return AdaptiveSolution(
         T_parent_child=final.T,
-        cov_parent_child_in_child=covariance[:6, :6],
+        cov_parent_child_in_child=covariance[:6, :6] + np.diag(unseen),
         unseen=normal.unseen[:6],
         model=fit.model,
         levels=fit.levels,
         weights=fit.weights,
-        systematic=fit.systematic,
-        parameters=final.parameters,
-        parameter_sigmas=_sigmas(problem.tuning, fit, covariance[6:, 6:], parts),
+        parameters=np.where(is_there, final.parameters, 0.0),
+        parameter_sigmas=np.where(is_there, sigmas, 0.0),
         jumps=fit.outliers.jumps,
         spikes=fit.outliers.spikes,
         heavy_tails=fit.has_heavy_tails and "tails" not in problem.without,
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
-        part_products=parts,
-        by_scale=by_scale,
-        scale_variance=max(misfit, 1.0) * scale_variance,
+        part_products=part_products(posterior),
         objective=0.5 * (posterior.precision.log_determinant + normal.cost),
-        converged=fit.converged,
+        converged=is_settled(problem, fit),
         iterations=fit.n_evaluations,
     )
-
-
-def _of_scale(posterior: Posterior, fit: Fit) -> tuple[FloatArray, float]:
-    """Derivative (6,) of xi by a scale of the child's path that is not in the model, and what the
-    data leave open of that scale, as a variance.
-    """
-    if SCALE in fit.columns:
-        return np.zeros(6), 0.0
-    columns = fit.linearised(fit.poses, fit.course, fit.error, [*fit.columns, SCALE]).columns
-    products = posterior.with_columns(columns).products[:-1, :-1]
-    by_scale = -posterior.normal.covariance @ products[:-1, -1]
-    information = products[-1, -1] + products[-1, :-1] @ by_scale
-    return by_scale[:6], 1.0 / max(float(information), np.finfo(float).tiny)
-
-
-def _sigmas(tuning: Tuning, fit: Fit, covariance: FloatArray, parts: FloatArray) -> FloatArray:
-    """Standard deviations (8,) of all parameters: of those in the model by their covariance or, if
-    that is larger beyond chance, the jackknife over ten blocks; of the scale and the time offset
-    otherwise by the models that have them.
-    """
-    sigmas, variances = fit.other_sigmas.copy(), np.diag(covariance)
-    if len(parts) >= N_BLOCKS:
-        spread = answers_without(parts)[:, 6:].var(axis=0) * (N_BLOCKS - 1)
-        variances = np.maximum(variances, spread / tuning.chance_of_jackknife)
-    sigmas[fit.columns] = np.sqrt(variances)
-    return sigmas

@@ -35,30 +35,16 @@ from hand_eye_calib.stats import median
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
 # of the child's path along its axes (m/m), by how much the child's stamps are late (s), the bias of
 # the child's rates minus that of the parent's, along the axes of the child (rad/s).
-_PARAMETERS: dict[str, list[int]] = {
-    "none": [],
-    "scale": [0],
-    "bias": [1, 2, 3],
-    "time": [4],
-    "rate": [5, 6, 7],
-}
-SYSTEMATIC = ("none", "scale", "bias", "time", "scale+time", "bias+time")
+PARAMETERS: dict[str, list[int]] = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
+SYSTEMATIC = ("scale", "bias", "time")
 # Of streams without positions, and of those whose rotations are integrated rates.
-SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("rate+time",)
+SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
 N_SYSTEMATIC = 8
-
-# Steps that vary by less than this share are alike.
-_EVEN = 0.2
 
 # Steps count as noise until they differ from their neighbours by so many times its variance.
 _CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
 
 SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
-
-
-def parameters_of(systematic: str) -> list[int]:
-    """Which of the parameters of all systematic errors a model has."""
-    return [index for name in systematic.split("+") for index in _PARAMETERS[name]]
 
 
 @dataclass(frozen=True)
@@ -162,12 +148,6 @@ class Course:
     path: FloatArray
     along: FloatArray
 
-    @property
-    def is_uneven(self) -> bool:
-        """Whether the child is not about as fast at all times."""
-        metres = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
-        return bool(np.std(metres) > _EVEN * np.mean(metres))
-
     def __getitem__(self, index: IntArray | slice) -> Course:
         return Course(self.twists[index], self.path[index], self.along[index])
 
@@ -244,16 +224,10 @@ class Linearisation:
         Derivatives by xi in ``X Exp(xi)`` and by k parameters of systematic errors; last, e.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
-    by_scale : (n, 6, 1) array
-        Derivative by the scale.
-    metres : (n,) array
-        Path of the child.
     """
 
     columns: FloatArray
     adjoints: FloatArray
-    by_scale: FloatArray
-    metres: FloatArray
 
     @property
     def jacobian(self) -> FloatArray:
@@ -301,23 +275,21 @@ def linearise(
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     by_child = motions(Ts_cw_c)
-    if used & {*_PARAMETERS["rate"]}:
+    if used & {*PARAMETERS["rate"]}:
         by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
     by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
-    if used & {*_PARAMETERS["bias"]}:
+    if used & {*PARAMETERS["bias"]}:
         metres = back_c @ np.diff(course.along, axis=0)
         by_child[:, :3, 3] -= metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
     by = np.zeros((len(step), 6, 6 + len(columns) + 1))
     np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
-    by_scale = np.zeros((len(step), 6, 1))
-    by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
     for at, index in enumerate(columns, start=6):
         if index == SCALE:
-            by[:, :, at] = by_scale[:, :, 0]
-        elif index in _PARAMETERS["bias"]:
+            by[:, :3, at] = -turned(back[:, :3, :3], step)
+        elif index in PARAMETERS["bias"]:
             by[:, :3, at] = turned(back[:, :3, :3], metres[:, :, index - BIAS.start])
         elif index == TIME:
             by[:, :, at] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
@@ -326,7 +298,7 @@ def linearise(
     by[:, :, -1] = se3.log(back @ _as_child(streams.motions_p, T_parent_child))
     if error is not None:
         by[:, :, -1] += error[1:] - turned(adjoints, error[:-1])
-    return Linearisation(by, adjoints, by_scale, np.linalg.norm(step, axis=1))
+    return Linearisation(by, adjoints)
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:

@@ -1,9 +1,9 @@
 """The noise of two trajectories: which errors there are, how strong, and how they enter.
 
 Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
-stamps that jitter), the motions a random walk that grows with time or with the path, and slow
-errors are first-order Gauss-Markov processes: fixed to the child's body, fixed to the parent's
-world, and a drifting scale. Each has one variance for translation and one for rotation.
+stamps that jitter), the motions a random walk, and errors that last are first-order Gauss-Markov
+processes, fixed to the child's body or to the parent's world. Each has one variance for translation
+and one for rotation.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hand_eye_calib.gls.state_space import WHITE, Group, StateSpace
 # child's or of the parent's world, as of a camera that sees a target.
 CENTRES = ("sensors", "child", "parent")
 
-# Log levels before those of slow processes: white translation (m^2), white rotation (rad^2), jitter
+# Log levels before those of lasting errors: white translation (m^2), white rotation (rad^2), jitter
 # of stamps (s^2), walk of translation and of rotation.
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(5)
 N_FAST = 5
@@ -34,22 +34,17 @@ LOWEST_VARIANCE = 1e-14
 _LEAST_WHITE, _LEAST_WALK = np.exp(-14.0), np.exp(-12.0)
 _LOWEST_LEVEL, _HIGHEST_LEVEL = -32.0, 14.0
 
-# Expected jitter of stamps (s^2), expected variance of a drifting scale, and how well they are
-# known; of time constants, too.
-_JITTER, _SCALE_VARIANCE = np.exp(-14.0), np.exp(-10.0)
-_JITTER_PRECISION, _SCALE_PRECISION, _TAU_PRECISION = 0.05, 0.02, 0.3
+# Expected jitter of stamps (s^2), and how well it is known; time constants, too.
+_JITTER, _JITTER_PRECISION, _TAU_PRECISION = np.exp(-14.0), 0.05, 0.3
 
 # Time constants are between an interval and this share of the recording.
 _LONGEST_SHARE = 0.25
 
-# A scale drifts no faster than within this share of the recording.
-_SLOWEST_SCALE = 0.02
-
 # A walk's variance over an increment, in units of a typical one: bounded, so that neither a gap nor
-# twin stamps nor a halt dominate.
-_RELATIVE = {"time": (0.1, 100.0), "distance": (0.05, 1e3)}
+# twin stamps dominate.
+_RELATIVE = (0.1, 100.0)
 
-# Processes that last are looked for at so many time constants, from a few intervals to a share of
+# Errors that last are looked for at so many time constants, from a few intervals to a share of
 # the recording, where they have this share of the white and walking noise; one is tried if a step
 # of its variance alone promises to lower the loss by so much.
 _N_TAUS, _FIRST_TAU, _LAST_TAU = 2, 10.0, 0.06
@@ -63,38 +58,25 @@ _LEAST_INFORMATION = 0.3
 
 _TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 _ROTATIONS = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-_PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
+PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
 
 
 @dataclass(frozen=True)
 class Slow:
-    """A slow process: ``kind`` body, world or scale; ``part`` translation, rotation or scale."""
+    """A process of errors that last: ``kind`` body or world, ``part`` translation or rotation."""
 
     kind: str
     part: str
 
-    @property
-    def size(self) -> int:
-        """Number of states."""
-        return 1 if self.kind == "scale" else 3
 
-
-# Variance of the mean over a recording of a process with the longest time constant, as a share of
-# its own: 2 r (1 - r (1 - exp(-1 / r))) with r the share of the recording.
-LONGEST_IN_THE_MEAN = (
-    2.0 * _LONGEST_SHARE * (1.0 - _LONGEST_SHARE * -float(np.expm1(-1.0 / _LONGEST_SHARE)))
-)
-
-SCALE_DRIFT = Slow("scale", "scale")
-LASTING = tuple(Slow(kind, part) for kind in ("body", "world") for part in _PARTS)
+LASTING = tuple(Slow(kind, part) for kind in ("body", "world") for part in PARTS)
 
 
 @dataclass(frozen=True)
 class Extent:
-    """Typical interval (s), typical step (m) and duration (s) of a recording."""
+    """Typical interval (s) and duration (s) of a recording."""
 
     interval_s: float
-    metres: float
     duration_s: float
 
 
@@ -105,13 +87,11 @@ class NoiseModel:
     Attributes
     ----------
     slow : tuple of Slow
-    walk_by : {"time", "distance"}
     centre : {"sensors", "child", "parent"}
     extent : Extent
     """
 
     slow: tuple[Slow, ...]
-    walk_by: str
     centre: str
     extent: Extent
 
@@ -123,6 +103,7 @@ class NoiseModel:
         T_parent_child: FloatArray,
         weights: FloatArray,
         cut: BoolArray,
+        prior: FloatArray,
     ) -> StateSpace:
         """The state space of a linearisation.
 
@@ -135,17 +116,15 @@ class NoiseModel:
         T_parent_child : (4, 4) array
         weights : (N,) array
         cut : (n,) bool array
+        prior : (p + 1, p + 1) array
         """
         to_child, intervals_s = se3.adjoint(se3.inverse(T_parent_child)), np.diff(streams.stamps_s)
-        steps = intervals_s / self.extent.interval_s
-        if self.walk_by == "distance":
-            steps = linearisation.metres / self.extent.metres
         ahead, behind = self._entries(streams, linearisation, to_child)
         walk = (_TRANSLATIONS, _both_rotations(to_child))
         white = (_TRANSLATIONS[None], self._white_rotation(streams, to_child))
         return StateSpace(
             intervals_s=intervals_s,
-            relative=np.clip(steps, *_RELATIVE[self.walk_by]),
+            relative=np.clip(intervals_s / self.extent.interval_s, *_RELATIVE),
             columns=linearisation.columns,
             ahead=ahead,
             behind=behind,
@@ -155,29 +134,22 @@ class NoiseModel:
             groups=self._groups(),
             weights=weights,
             cut=cut,
+            prior=prior,
         )
 
     def _groups(self) -> tuple[Group, ...]:
-        groups, state, level = [], WHITE, N_FAST
-        for process in self.slow:
-            groups.append(Group(slice(state, state + process.size), level, level + 1))
-            state, level = state + process.size, level + 2
-        return tuple(groups)
+        return tuple(
+            Group(slice(WHITE + 3 * k, WHITE + 3 * k + 3), N_FAST + 2 * k, N_FAST + 2 * k + 1)
+            for k in range(len(self.slow))
+        )
 
     def _entries(
         self, streams: Streams, linearisation: Linearisation, to_child: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        n, size = len(streams) - 1, WHITE + sum(process.size for process in self.slow)
-        ahead, behind = np.zeros((n, 6, size)), np.zeros((n, 6, size))
-        ahead[:, :, :WHITE], behind[:, :, :WHITE] = np.eye(6), linearisation.adjoints
-        for process, group in zip(self.slow, self._groups(), strict=True):
-            if process.kind == "scale":
-                behind[:, :, group.states] = -linearisation.by_scale
-                continue
-            directions = slow_directions(process, streams, to_child)
-            ahead[:, :, group.states] = directions[1:]
-            behind[:, :, group.states] = linearisation.adjoints @ directions[:-1]
-        return ahead, behind
+        white = np.broadcast_to(np.eye(6), (len(streams), 6, 6))
+        lasting = [slow_directions(process, streams, to_child) for process in self.slow]
+        directions = np.concatenate([white, *lasting], axis=2)
+        return directions[1:], linearisation.adjoints @ directions[:-1]
 
     def _white_rotation(self, streams: Streams, to_child: FloatArray) -> FloatArray:
         if self.centre == "sensors":
@@ -224,21 +196,15 @@ class NoiseModel:
         lower[3:5] = np.maximum(lower[3:5], total + np.log(_LEAST_WALK))
         mean[JITTER], precision[JITTER] = np.log(_JITTER), _JITTER_PRECISION
         lower[JITTER] = _LOWEST_LEVEL
-        for process, group in zip(self.slow, self._groups(), strict=True):
+        for group in self._groups():
             precision[group.tau] = _TAU_PRECISION
             lower[group.tau] = np.log(extent.interval_s)
             upper[group.tau] = np.log(max(_LONGEST_SHARE * extent.duration_s, extent.interval_s))
-            if process.kind == "scale":
-                lower[group.tau] = min(np.log(_SLOWEST_SCALE * extent.duration_s), upper[group.tau])
-                mean[group.variance] = np.log(_SCALE_VARIANCE)
-                precision[group.variance] = _SCALE_PRECISION
         return Prior(mean, precision, lower, upper)
 
     def first_levels(self, white: FloatArray, walk: FloatArray) -> FloatArray:
         """Log levels to start at, from log variances (2,) of white noise and walk."""
-        levels = [*white, np.log(_JITTER), *walk]
-        levels += [np.log(_SCALE_VARIANCE), np.log(0.1 * self.extent.duration_s)]
-        return np.array(levels)
+        return np.array([*white, np.log(_JITTER), *walk])
 
     def raised(self, levels: FloatArray) -> FloatArray:
         """Log levels with no white noise and no walk so small that a search cannot hear it."""
@@ -258,24 +224,15 @@ class NoiseModel:
             white, walk = _fast_levels(process)
             whole = np.logaddexp(levels[white], levels[walk])
             slow_levels += [whole + np.log(_FAINT), np.log(tau_s)]
-        model = self.richer((*LASTING, *self.slow))
-        return model, np.concatenate([levels[:N_FAST], slow_levels, levels[N_FAST:]])
+        return self.richer(LASTING), np.concatenate([levels, slow_levels])
 
-    def fixed_to_body(self, levels: FloatArray) -> list[tuple[Slow, float]]:
-        """The slow processes that are fixed to the body, with their variances."""
-        return [
-            (process, float(np.exp(levels[group.variance])))
-            for process, group in zip(self.slow, self._groups(), strict=True)
-            if process.kind == "body"
-        ]
-
-    def with_longer(
-        self, process: Slow, levels: FloatArray, variance: float
-    ) -> tuple[NoiseModel, FloatArray]:
-        """The model and log levels with one more process, as long as a recording can show."""
-        longer = [np.log(variance), np.log(_LONGEST_SHARE * self.extent.duration_s)]
-        model = self.richer((process, *self.slow))
-        return model, np.concatenate([levels[:N_FAST], longer, levels[N_FAST:]])
+    def fixed_to_body(self, levels: FloatArray) -> FloatArray:
+        """Variances (6,) of the lasting errors that are fixed to the body."""
+        variances = np.zeros(6)
+        for process, group in zip(self.slow, self._groups(), strict=True):
+            if process.kind == "body":
+                variances[PARTS[process.part]] += np.exp(levels[group.variance])
+        return variances
 
     def taus_s(self) -> list[float]:
         """Time constants to look for lasting errors at."""
@@ -312,8 +269,7 @@ class NoiseModel:
                     np.log(scores[best][0]),
                 ]
                 total = max(total, gain)
-        start = np.concatenate([levels[:N_FAST], starts, levels[N_FAST:]])
-        return tuple(chosen), start, total
+        return tuple(chosen), np.concatenate([levels, starts]), total
 
     def reduced(self, fit: Levels) -> tuple[NoiseModel, FloatArray]:
         """The model and log levels without the slow processes that make no difference."""
@@ -336,20 +292,14 @@ class NoiseModel:
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         error = np.zeros((len(states), 6))
         for process, group in zip(self.slow, self._groups(), strict=True):
-            if process.kind != "scale":
-                directions = slow_directions(process, streams, to_child)
-                error += (directions @ states[:, group.states, None])[:, :, 0]
+            directions = slow_directions(process, streams, to_child)
+            error += (directions @ states[:, group.states, None])[:, :, 0]
         return error
-
-
-def states_of(part: str) -> slice:
-    """Where translation or rotation is in an error (6,)."""
-    return _PARTS[part]
 
 
 def slow_directions(process: Slow, streams: Streams, to_child: FloatArray) -> FloatArray:
     """Matrices (N, 6, 3) from a process to the error c."""
-    part = _PARTS[process.part]
+    part = PARTS[process.part]
     if process.kind == "body":
         return np.broadcast_to(np.eye(6)[:, part], (len(streams), 6, 3))
     return to_child[:, part] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)

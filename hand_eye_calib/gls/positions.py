@@ -8,9 +8,11 @@ to pose as the odometry says, up to its drift. So this is the state space of the
 rotations are updated from what the positions say of them, until they stay. The sensor's frame has
 the axes of the other one by convention: ``X = (I, l)``.
 
-Errors that act like a lever arm and that the data hardly tell from it are no part of the model;
-:func:`_systematic` says what they leave open. A drone tilts to accelerate, so that positions which
-answer to acceleration by kappa (s^2), as smoothed ones do, move the vertical lever arm by kappa g.
+Errors that act like a lever arm are parameters beside it, known beforehand to what sensors have: a
+scale and a direction of the odometry's path, a time offset and its rate. What the positions answer
+to acceleration is in the covariance alone: on recorded drones even its sign depends on the
+frequency. A drone tilts to accelerate, so that positions which answer by kappa (s^2), as smoothed
+ones do, move the vertical lever arm by kappa g.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.increments import (
+    BIAS,
     N_SYSTEMATIC,
     SCALE,
     TIME,
@@ -45,16 +48,21 @@ from hand_eye_calib.gls.noise_model import (
     NoiseModel,
     Slow,
 )
+from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
-from hand_eye_calib.gls.parts import part_products
-from hand_eye_calib.gls.problem import sample
+from hand_eye_calib.gls.problem import known_products, sample
 from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.gls.stages import rough_levels
-from hand_eye_calib.gls.state_space import Posterior, StateSpace
+from hand_eye_calib.gls.state_space import Posterior, StateSpace, part_products
 from hand_eye_calib.gls.windows import aligned, first_lever_arm
 
-# A rate of the clock, one more parameter than poses have.
-CLOCK = N_SYSTEMATIC
+# Parameters that poses do not have: a rate of the clock, and what the positions less the odometry
+# are per m/s^2 of acceleration (s^2). Those in the model.
+CLOCK, RESPONSE = N_SYSTEMATIC, N_SYSTEMATIC + 1
+_SHARED = [SCALE, 1, 2, 3, TIME]
+_COLUMNS = [*_SHARED, CLOCK, RESPONSE]
+# Columns of the lever arm and of the parameters that it is solved with: all but the last.
+_SOLVED = list(range(2 + len(_COLUMNS)))
 
 # Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
 _ANY_ROTATION = float(np.log(100.0))
@@ -66,11 +74,12 @@ _LEAST_WHITE_SHARE, _LEAST_WALK_SHARE = -14.0, -12.0
 _ROUNDS, _FITS, _LASTING, _OUTLIERS, _QUALITY = 10, (1, 2, 4, 6), 2, (3, 5), (2, 4, 5)
 _SETTLED = 0.1
 
-# Standard deviations before anything is known: of the lever arm (m), of the rate of the clock, of
-# the scale of the odometry, of its direction (rad), and of what the positions answer to
+# Standard deviations beforehand: of the lever arm (m), of the time offset (s) and its rate, of the
+# scale of the odometry, known or not, of its direction (rad), and of what the positions answer to
 # acceleration (s^2). Accelerations are those over this time (s).
-_LONG_M, _CLOCK_SIGMA = 10.0, 1e-4
-_SCALE_SIGMA, _DIRECTION_SIGMA, _RESPONSE_SIGMA = 0.01, float(np.radians(0.15)), 0.002
+_LONG_M, _TIME_SIGMA_S, _CLOCK_SIGMA = 10.0, 1.0, 1e-4
+_SCALE_SIGMA, _ANY_SCALE = 0.01, 1.0
+_DIRECTION_SIGMA, _RESPONSE_SIGMA = float(np.radians(0.15)), 0.002
 _ACCELERATING_S, _NEAR = 0.2, 2.5
 
 # An axis that is not known to this (m) need not settle: noise moves it on and on.
@@ -117,28 +126,28 @@ def solve(
             state = state.with_outliers(posterior)
         if number in _QUALITY:
             state = state.with_quality(posterior)
-        step = posterior.normal.step
-        sigmas = np.sqrt(np.diag(posterior.normal.covariance)[:3])
+        normal = NormalEquations(selected(posterior.products, _SOLVED))
+        step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
         is_settled = (np.abs(step[:3]) < _SETTLED * sigmas) | (sigmas > _UNKNOWN_M)
         converged = number > max(_FITS) and bool(is_settled.all())
         if converged:
             break
-        state = state.moved(posterior)
+        state = state.moved(posterior, step)
     return _solution(state, posterior, converged, scale)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _State:
     """Where the search stands. The child's poses are its ``positions`` (N, 3), bridged where they
-    are left out, with the orientations known so far. ``columns`` of ``parameters`` (9,) are in the
-    model. ``boost`` (n,) are factors of the walk's variance, above 1 at jumps; those around
-    positions that are ``worse`` (N,) are far less precise than the best.
+    are left out, with the orientations known so far. ``parameters`` are (10,), of which the scale
+    is known to ``scale_sigma`` beforehand. ``boost`` (n,) are factors of the walk's variance, above
+    1 at jumps; those around positions that are ``worse`` (N,) are far less precise than the best.
     """
 
     positions: FloatArray
     streams: Streams
     lever_arm: FloatArray
-    columns: list[int]
+    scale_sigma: float
     parameters: FloatArray
     model: NoiseModel
     levels: FloatArray
@@ -149,18 +158,15 @@ class _State:
     @classmethod
     def first(cls, streams: Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
         """Where it begins."""
-        stamps_s = streams.stamps_s
-        steps = np.linalg.norm(np.diff(streams.Ts_pw_p[:, :3, 3], axis=0), axis=1)
-        interval_s = float(np.median(np.diff(stamps_s)))
-        extent = Extent(interval_s, max(float(np.median(steps)), 1e-9), float(stamps_s[-1]))
-        n = len(steps)
+        stamps_s, n = streams.stamps_s, len(streams) - 1
+        extent = Extent(float(np.median(np.diff(stamps_s))), float(stamps_s[-1]))
         state = cls(
             positions=streams.Ts_cw_c[:, :3, 3],
             streams=streams,
             lever_arm=lever_arm,
-            columns=[SCALE, TIME, CLOCK] if with_scale else [TIME, CLOCK],
-            parameters=np.zeros(N_SYSTEMATIC + 1),
-            model=NoiseModel((), "time", "sensors", extent),
+            scale_sigma=_ANY_SCALE if with_scale else _SCALE_SIGMA,
+            parameters=np.zeros(RESPONSE + 1),
+            model=NoiseModel((), "sensors", extent),
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
             boost=np.ones(n),
@@ -172,7 +178,7 @@ class _State:
         worse = _worse(np.concatenate(around))
         white, walk = rough_levels(residuals, worse[1:] | worse[:-1])
         white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
-        levels = state.model.first_levels(white, walk)[:N_FAST]
+        levels = state.model.first_levels(white, walk)
         streams = bridged(streams, state.X, worse)
         return replace(state, streams=streams, levels=levels, worse=worse)
 
@@ -202,54 +208,52 @@ class _State:
         )
 
     def linearised(self) -> Linearisation:
-        """Increments between poses, with the columns of the model."""
+        """Increments between poses, with the columns of the lever arm and of the parameters."""
         streams, course = self.streams, self.course
         away_s = streams.stamps_s - 0.5 * self.model.extent.duration_s
         drifting = away_s[:, None] * course.twists
+        answering = _accelerations(streams, self.X)
         moved = streams.Ts_cw_c @ se3.exp(self.parameters[CLOCK] * drifting)
-        known = self.parameters[:CLOCK], [column for column in self.columns if column != CLOCK]
-        found = linearise(replace(streams, Ts_cw_c=moved), course, self.X, *known)
-        return found.with_columns(_by_motion(found, drifting))
+        poses = replace(streams, Ts_cw_c=moved)
+        found = linearise(poses, course, self.X, self.parameters[:CLOCK], _SHARED)
+        more = [_by_motion(found, each) for each in (drifting, answering)]
+        found = found.with_columns(np.concatenate(more, axis=2))
+        return replace(found, columns=np.delete(found.columns, [3, 4, 5], axis=2))
 
-    def space(
-        self, model: NoiseModel | None = None, linearisation: Linearisation | None = None
-    ) -> StateSpace:
+    def _known(self) -> FloatArray:
+        """Products (p + 1, p + 1) that say how large lever arm and parameters may be."""
+        sigmas = np.empty(RESPONSE + 1)
+        sigmas[SCALE], sigmas[BIAS], sigmas[TIME] = (
+            self.scale_sigma,
+            _DIRECTION_SIGMA,
+            _TIME_SIGMA_S,
+        )
+        sigmas[CLOCK], sigmas[RESPONSE] = _CLOCK_SIGMA, _RESPONSE_SIGMA
+        values = np.r_[self.lever_arm, self.parameters[_COLUMNS]]
+        weights = np.r_[np.full(3, _LONG_M), sigmas[_COLUMNS]] ** -2.0
+        return known_products(range(len(values)), values, weights, len(values) + 1)
+
+    def space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of all poses: without a rotation to estimate, with orientations that may be
         anything, and with a walk that is the odometry's.
         """
-        # The drift grows with the path of the odometry, not with that of the antenna.
-        path = np.linalg.norm(np.diff(self.streams.Ts_pw_p[:, :3, 3], axis=0), axis=1)
         space = (model or self.model).state_space(
             self.streams,
-            replace(linearisation or self.linearised(), metres=path),
+            self.linearised(),
             self.course.twists,
             self.X,
             np.where(self.left_out, 0.0, 1.0),
             np.zeros(len(self.boost), dtype=bool),
+            self._known(),
         )
         to_child = se3.adjoint(se3.inverse(self.X))
         translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
-        columns = np.delete(space.columns, [3, 4, 5], axis=2)
         return replace(
             space,
             relative=space.relative * self.boost,
-            columns=columns,
             white=(translation[None], rotation[None]),
             walk=(translation, to_child @ rotation @ to_child.T),
-            prior=self._known(columns.shape[2]),
         )
-
-    def _known(self, n_columns: int) -> FloatArray:
-        """Products (p + 1, p + 1) that say that no lever arm is kilometres long and no clock much
-        too fast.
-        """
-        known = np.zeros((n_columns, n_columns))
-        values, at = np.r_[self.lever_arm, self.parameters[CLOCK]], [0, 1, 2, 2 + len(self.columns)]
-        weights = np.r_[np.full(3, _LONG_M), _CLOCK_SIGMA] ** -2.0
-        known[at, at] = weights
-        known[at, -1] = known[-1, at] = weights * values
-        known[-1, -1] = weights @ values**2
-        return known
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of as many poses as noise levels need."""
@@ -270,11 +274,8 @@ class _State:
         return Posterior(self.space(), self.levels)
 
     def fitted(self) -> _State:
-        """With noise levels fitted, for a drift that grows with time or with the path, whichever is
-        more likely.
-        """
-        models = (replace(self.model, walk_by=walk_by) for walk_by in ("time", "distance"))
-        return self._likeliest([(model, self.levels) for model in models])[0]
+        """With noise levels fitted."""
+        return self._likeliest([(self.model, self.levels)])[0]
 
     def _likeliest(self, starts: list[tuple[NoiseModel, FloatArray]]) -> tuple[_State, float]:
         """With the likeliest of some models, fitted from log levels on, and its loss."""
@@ -320,17 +321,17 @@ class _State:
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
         return replace(self, streams=replace(self.streams, Ts_cw_c=Ts_cw_c), worse=worse)
 
-    def moved(self, posterior: Posterior) -> _State:
+    def moved(self, posterior: Posterior, step: FloatArray) -> _State:
         """After a step, with the orientations that the positions ask for."""
-        turns = posterior.states_after(posterior.normal.step)[:, 3:6]
+        turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
         parameters = self.parameters.copy()
-        parameters[self.columns] += posterior.normal.step[3:]
+        parameters[_COLUMNS[:-1]] += step[3:]
         return replace(
             self,
             streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
-            lever_arm=self.lever_arm + posterior.normal.step[:3],
+            lever_arm=self.lever_arm + step[:3],
             parameters=parameters,
         )
 
@@ -367,70 +368,37 @@ def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
 def _solution(
     state: _State, posterior: Posterior, converged: bool, first_scale: float
 ) -> LeverArmSolution:
-    normal = posterior.normal
+    normal = NormalEquations(selected(posterior.products, _SOLVED))
     n_evidence = len(state.boost) - int(state.left_out.sum())
-    misfit = normal.cost / max(3 * n_evidence - 3 - len(state.columns), 1)
-    covariance = max(misfit, 1.0) * normal.covariance
-    sigmas = np.zeros(CLOCK + 1)
-    sigmas[state.columns] = np.sqrt(np.diag(covariance)[3:])
-    parts = part_products(posterior)
-    common, by_response, response = _systematic(state, max(misfit, 1.0))
+    misfit = normal.cost / max(3 * n_evidence - len(_SOLVED), 1)
+    # With the answer to acceleration, and by what it would move the lever arm.
+    whole = posterior.normal
+    covariance, shift = max(misfit, 1.0) * whole.covariance, (whole.step[:-1] - normal.step)[:3]
+    sigmas = np.zeros(RESPONSE + 1)
+    sigmas[_COLUMNS] = np.sqrt(np.diag(covariance)[3:])
     # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
     lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
-    known = posterior.space.prior
-    assert known is not None
+    parameters = state.parameters.copy()
+    parameters[_COLUMNS] += np.r_[normal.step[3:], whole.step[-1]]
     return LeverArmSolution(
         lever_arm=state.lever_arm + normal.step[:3],
-        covariance=covariance[:3, :3],
-        beyond=by_response + lasting * np.eye(3),
-        common=common,
-        response=response,
-        time_offset_s=-float(state.parameters[TIME]),
-        time_offset_sigma_s=float(sigmas[TIME]),
-        clock_rate=-float(state.parameters[CLOCK]),
+        covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
+        response=(float(-parameters[RESPONSE]), float(sigmas[RESPONSE])),
+        parameters=parameters,
+        parameter_sigmas=sigmas,
+        unit=first_scale,
+        clock_rate=-float(parameters[CLOCK]),
         clock_rate_sigma=float(sigmas[CLOCK]),
-        scale=first_scale * (1.0 + float(state.parameters[SCALE])),
-        scale_sigma=first_scale * float(sigmas[SCALE]),
         model=state.model,
         levels=state.levels,
         worse=state.worse,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
-        part_products=parts + known / len(parts),
+        part_products=selected(part_products(posterior), _SOLVED),
         misfit=misfit,
         objective=0.5 * (posterior.precision.log_determinant + normal.cost),
         converged=converged,
     )
-
-
-def _systematic(state: _State, misfit: float) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
-    """Covariance (3, 3) of the lever arm by a scale and a direction of the odometry that are the
-    same all the time; that by what the positions answer to acceleration; and this, with its sigma.
-
-    The answer is not moved by them, but what it would move by is in the covariances, as is what the
-    data leave open: on recorded drones even the sign of the response depends on the frequency.
-    """
-    streams, found = state.streams, state.linearised()
-    metres = np.linalg.norm(streams.steps[0].cleaned(np.inf), axis=1)
-    sideways = np.zeros((len(metres), 6, 3))
-    sideways[:, :3] = -np.swapaxes(streams.motions_p[:, :3, :3], 1, 2) * metres[:, None, None]
-    response = _by_motion(found, _accelerations(streams, state.X))
-    by_scale = found.by_scale[:, :, :0] if SCALE in state.columns else found.by_scale
-    columns = np.concatenate([response, sideways, by_scale], axis=2)
-    space = state.space(linearisation=found.with_columns(columns))
-    products = Posterior(space, state.levels).products
-    known, rest = slice(3 + len(state.columns)), slice(3 + len(state.columns), None)
-    by = -np.linalg.pinv(products[known, known], hermitian=True) @ products[known, rest]
-    # Of what is left out, and last of the residuals, after a step of what is in the model.
-    left = (products[rest, rest] + products[rest, known] @ by) / misfit
-    sigmas = np.r_[_RESPONSE_SIGMA, np.full(3, _DIRECTION_SIGMA), _SCALE_SIGMA][: len(left) - 1]
-    spread = np.linalg.inv(left[:-1, :-1] + np.diag(sigmas**-2.0))
-    values = -spread @ left[:-1, -1]
-    shifts = by[:3, :-1]
-    squares = spread + np.outer(values, values)
-    by_response = squares[0, 0] * np.outer(shifts[:, 0], shifts[:, 0])
-    common = shifts[:, 1:] @ squares[1:, 1:] @ shifts[:, 1:].T
-    return common, by_response, (-float(values[0]), float(np.sqrt(spread[0, 0])))
 
 
 def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ A stage of the search (:mod:`~hand_eye_calib.gls.stages`) takes a :class:`Proble
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,8 +15,8 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,
+    PARAMETERS,
     Course,
-    Linearisation,
     Streams,
     freed,
     linearise,
@@ -35,13 +36,12 @@ class Problem:
     ----------
     streams : Streams
     systematic : tuple of str
-        Systematic errors to choose from, the plainest first; the choice if there is only one.
+        Systematic errors in the model.
     is_clock_free : bool
-        Whether a time offset is in the model if the motion tells it from X.
+        Whether the time offset is not known beforehand.
     without : frozenset of str
         Names of the stages to leave out.
     tuning : Tuning
-    workspace : Workspace
     """
 
     streams: Streams
@@ -49,68 +49,50 @@ class Problem:
     is_clock_free: bool = False
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
-    workspace: Workspace = field(default_factory=lambda: Workspace())
+    # The fit whose posterior of all poses was asked for last, and that posterior. It is large.
+    _last: list[tuple[Fit, Posterior]] = field(default_factory=list)
+
+    @property
+    def columns(self) -> list[int]:
+        """Parameters of systematic errors in the model."""
+        return [column for name in self.systematic for column in PARAMETERS[name]]
+
+    def known(self, fit: Fit) -> FloatArray:
+        """Products (p + 1, p + 1) that what is known of the parameters beforehand adds."""
+        values, weights = fit.parameters[self.columns], fit.sigmas[self.columns] ** -2.0
+        return known_products(range(6, 6 + len(values)), values, weights, 7 + len(values))
 
     def space(
-        self,
-        fit: Fit,
-        kept: IntArray | None = None,
-        model: NoiseModel | None = None,
-        columns: list[int] | None = None,
+        self, fit: Fit, kept: IntArray | None = None, model: NoiseModel | None = None
     ) -> StateSpace:
-        """State space of all or some of the poses, with a model and systematic errors other than
-        those of the fit.
-        """
+        """State space of all or some of the poses, with a model other than that of the fit."""
         poses, course, error, weights = fit.poses, fit.course, fit.error, fit.weights
         outliers = fit.outliers
         if kept is not None:
             poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
             outliers = outliers.across(kept, LONGEST_GAP)
+        known = error if error.any() else None
         return (model or fit.model).state_space(
             poses,
-            fit.linearised(poses, course, error, fit.columns if columns is None else columns),
+            linearise(poses, course, fit.T, fit.parameters, self.columns, known),
             course.twists,
             fit.T,
             np.where(outliers.spikes, 0.0, weights),
             outliers.jumps,
+            self.known(fit),
         )
 
-    def posterior(self, fit: Fit, columns: list[int] | None = None) -> Posterior:
-        """Of all poses; with systematic errors other than those of the fit."""
-        return self.workspace.posterior(self, fit, fit.columns if columns is None else columns)
+    def posterior(self, fit: Fit) -> Posterior:
+        """Of all poses."""
+        if not self._last or self._last[0][0] is not fit:
+            self._last.clear()
+            self._last.append((fit, Posterior(self.space(fit), fit.levels)))
+        return self._last[0][1]
 
     def is_noisy(self, fit: Fit) -> bool:
         """Whether the rotation between poses is not large beside its noise."""
         noise = np.exp(0.5 * fit.levels[ROTATION])
         return bool(noise > self.tuning.noisy * self.streams.typical_turn)
-
-
-class Workspace:
-    """The posterior of all poses that was asked for last. It is large, so that there is one."""
-
-    def __init__(self) -> None:
-        self._fit: Fit | None = None
-        self._posterior: Posterior | None = None
-        self._columns: list[int] = []
-
-    def posterior(self, problem: Problem, fit: Fit, columns: list[int]) -> Posterior:
-        """Of a fit with these systematic errors. What does not depend on them is kept."""
-        if self._posterior is None or fit is not self._fit:
-            self._fit = self._posterior = None
-            self._posterior = Posterior(problem.space(fit, columns=columns), fit.levels)
-            self._fit, self._columns = fit, columns
-        if columns != self._columns:
-            found = fit.linearised(fit.poses, fit.course, fit.error, columns)
-            self._posterior = self._posterior.with_columns(found.columns)
-            self._columns = columns
-        return self._posterior
-
-    def settled(self, fit: Fit, converged: bool) -> Fit:
-        """A fit that is known to have converged, or not: its posterior stays the same."""
-        found = replace(fit, converged=converged)
-        if self._fit is fit:
-            self._fit = found
-        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,20 +113,13 @@ class Fit:
     outliers : Outliers
     weights : (N,) array
         Of white errors; other than 1 where tails are heavy.
+    sigmas : (8,) array
+        What systematic errors are known to beforehand.
     has_heavy_tails : bool
-    systematic : str
-    columns : list of int
-        Parameters of systematic errors in the model.
     parameters : (8,) array
-        Their values.
-    other_sigmas : (8,) array
-        Standard deviations of parameters that are not in the model.
-    cov_beyond : (6, 6) array
-        Of X, by what is not in the model: errors that last too long to be found, and systematic
-        errors that may be there.
+        Of systematic errors.
     n_evaluations : int
         Of the likelihood.
-    converged : bool
     """
 
     poses: Streams
@@ -155,26 +130,15 @@ class Fit:
     levels: FloatArray
     outliers: Outliers
     weights: FloatArray
+    sigmas: FloatArray
     has_heavy_tails: bool = False
-    systematic: str = "none"
-    columns: list[int] = field(default_factory=list)
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
-    other_sigmas: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
-    cov_beyond: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     n_evaluations: int = 0
-    converged: bool = False
 
-    def linearised(
-        self, poses: Streams, course: Course, error: FloatArray, columns: list[int]
-    ) -> Linearisation:
-        """Increments between poses, the errors that these were freed of put back."""
-        known = error if error.any() else None
-        return linearise(poses, course, self.T, self.parameters, columns, known)
-
-    def moved(self, step: FloatArray) -> Fit:
+    def moved(self, step: FloatArray, columns: list[int]) -> Fit:
         """After a step of xi and of the parameters in the model."""
         parameters = self.parameters.copy()
-        parameters[self.columns[: len(step) - 6]] += step[6:]
+        parameters[columns] += step[6:]
         return replace(self, T=after(self.T, step[:6]), parameters=parameters)
 
     def bridged(self, streams: Streams, outliers: Outliers) -> Fit:
@@ -191,6 +155,19 @@ class Fit:
         given = bridged(streams, self.T, spikes)
         poses = freed(given, white_error, error - white_error, self.T, white)
         return replace(self, poses=poses, error=error)
+
+
+def known_products(
+    at: Sequence[int], values: FloatArray, weights: FloatArray, size: int
+) -> FloatArray:
+    """Products (size, size) of what is known beforehand: that parameters at these places, which
+    have these values, are zero, with these precisions.
+    """
+    known, at = np.zeros((size, size)), list(at)
+    known[at, at] = weights
+    known[at, -1] = known[-1, at] = weights * values
+    known[-1, -1] = weights @ values**2
+    return known
 
 
 def after(T: FloatArray, step: FloatArray) -> FloatArray:

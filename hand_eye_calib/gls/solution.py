@@ -4,13 +4,13 @@ found.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.gls.increments import BIAS, RATE, SCALE, SYSTEMATIC, TIME
+from hand_eye_calib.gls.increments import BIAS, PARAMETERS, RATE, SCALE, TIME
 from hand_eye_calib.gls.noise_model import (
     JITTER,
     N_FAST,
@@ -23,93 +23,79 @@ from hand_eye_calib.gls.noise_model import (
 from hand_eye_calib.results.records import CorrelatedError, Noise
 from hand_eye_calib.text import angle, length
 
-_TURNING = {
-    "sensors": "",
-    "child": (
-        ", its rotation about the origin of the child's world, as of a camera that sees a target"
-    ),
-    "parent": (
-        ", its rotation about the origin of the parent's world, as of a camera that sees a target"
-    ),
-}
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 # Stamps that jitter by less are not worth a sentence (s).
 _NOTABLE_JITTER_S = 1e-4
 
-# An answer to acceleration is, beyond so many standard deviations.
+# What is beyond so many standard deviations is there.
 _PLAIN = 3.0
 
 
-@dataclass(frozen=True)
-class NoiseLevels:
-    """Standard deviations per axis, of both sensors' trajectories together.
+@dataclass(frozen=True, kw_only=True)
+class ModelSolution:
+    """What the answers for poses and for positions have in common.
 
     Attributes
     ----------
-    rotation_white, translation_white : float
-        Independent error of each pose, rad and m.
-    rotation_drift, translation_drift : float
-        What an error that stays grows by in a typical interval between poses, rad and m.
-    jitter_s : float
-        Of the stamps.
-    walk_by : {"time", "distance"}
-        What the errors that stay grow with.
-    centre : {"sensors", "child", "parent"}
-        What white rotation noise turns the trajectories about: the sensors, or the origin of the
-        child's or the parent's world.
-    slow : tuple of CorrelatedError
-    interval_s : float
-        Typical interval between poses.
+    model : NoiseModel
+    levels : (m,) array
+        Log levels of the model.
+    parameters, parameter_sigmas : (8 or more,) arrays
+        Parameters of all systematic errors, see :attr:`scale`, :attr:`time_offset_s` and
+        :mod:`~hand_eye_calib.gls.increments`, and their standard deviations; zero for those that
+        are not there.
+    unit : float
+        Factor of the child's lengths that was taken out before.
+    jumps : (n,) bool array
+        Increments (from pose i to i + 1) across which a trajectory jumped for good.
+    spikes : (n + 1,) bool array
+        Poses that are wrong by themselves, and left out.
+    misfit : float
+        Weighted squared residual over its degrees of freedom. The covariance has this factor in it.
+    part_products : (K, p + 1, p + 1) array
+        What each part of the recording adds, see
+        :func:`~hand_eye_calib.gls.state_space.part_products`.
+    objective : float
+        Negative log likelihood.
+    converged : bool
     """
 
-    rotation_white: float
-    translation_white: float
-    rotation_drift: float
-    translation_drift: float
-    jitter_s: float
-    walk_by: str
-    centre: str
-    slow: tuple[CorrelatedError, ...]
-    interval_s: float
+    model: NoiseModel
+    levels: FloatArray
+    parameters: FloatArray
+    parameter_sigmas: FloatArray
+    unit: float = 1.0
+    jumps: BoolArray
+    spikes: BoolArray
+    misfit: float
+    part_products: FloatArray
+    objective: float
+    converged: bool
 
-    @classmethod
-    def of(cls, model: NoiseModel, levels: FloatArray) -> NoiseLevels:
-        """From log levels."""
-        sigmas = np.exp(0.5 * levels)
-        slow = tuple(
-            CorrelatedError(
-                kind=process.kind,
-                part=process.part,
-                sigma=float(sigmas[at]),
-                tau_s=float(np.exp(levels[at + 1])),
-            )
-            for process, at in zip(model.slow, range(N_FAST, len(levels), 2), strict=True)
-        )
-        return cls(
-            rotation_white=float(sigmas[ROTATION]),
-            translation_white=float(sigmas[TRANSLATION]),
-            rotation_drift=float(sigmas[WALK_ROTATION]),
-            translation_drift=float(sigmas[WALK_TRANSLATION]),
-            jitter_s=float(sigmas[JITTER]),
-            walk_by=model.walk_by,
-            centre=model.centre,
-            slow=slow,
-            interval_s=model.extent.interval_s,
-        )
+    @property
+    def scale(self) -> float:
+        """Factor from the child's lengths to the parent's."""
+        return self.unit * (1.0 + float(self.parameters[SCALE]))
 
-    def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
-        """Variance (rad^2) per axis of the rotation over so many typical intervals."""
-        variance = 2 * self.rotation_white**2 + n_intervals * self.rotation_drift**2
-        for slow in self.slow:
-            if slow.part == "rotation":
-                ratio = n_intervals * self.interval_s / slow.tau_s
-                variance = variance - 2 * slow.sigma**2 * np.expm1(-ratio)
-        return np.asarray(variance)
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale."""
+        return self.unit * float(self.parameter_sigmas[SCALE])
+
+    @property
+    def time_offset_s(self) -> float:
+        """Seconds to add to the child's stamps."""
+        return -float(self.parameters[TIME])
+
+    @property
+    def time_offset_sigma_s(self) -> float:
+        """Standard deviation of the time offset."""
+        return float(self.parameter_sigmas[TIME])
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptiveSolution:
+class AdaptiveSolution(ModelSolution):
     """Answer of the adaptive estimator.
 
     Attributes
@@ -120,39 +106,14 @@ class AdaptiveSolution:
         accounted for.
     unseen : (6, U) array
         Directions of xi that no increment says anything about.
-    model : NoiseModel
-    levels : (m,) array
-        Log levels of the model.
     weights : (n + 1,) array
         Of the poses' white errors; other than 1 where tails are heavy.
-    systematic : str
-        Which systematic errors the data asks for, one of ``increments.SYSTEMATIC``.
-    parameters : (8,) array
-        Parameters of all systematic errors, see :attr:`scale`, :attr:`biases` and
-        :attr:`time_offset_s`; zero for those that are not assumed.
-    parameter_sigmas : (8,) array
-        Their standard deviations: for those not assumed, what they would be known to.
-    jumps : (n,) bool array
-        Increments (from pose i to i + 1) across which a trajectory jumped for good.
-    spikes : (n + 1,) bool array
-        Poses that are wrong by themselves, and left out.
     is_drowned : bool
         Whether single poses are noisier than the rotation between them: only some were used.
     heavy_tails : bool
         Whether white errors are weighed as of Student's t distribution.
-    misfit : float
-        Weighted squared residual over its degrees of freedom. The covariance has this factor in it.
     metres_per_pose : float
         Path of the parent from pose to pose.
-    part_products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see :mod:`~hand_eye_calib.gls.parts`.
-    by_scale : (6,) array
-        Derivative of xi by the logarithm of the scale of the child's path.
-    scale_variance : float
-        Of that scale, by the data; zero if it is in the model.
-    objective : float
-        Negative log likelihood.
-    converged : bool
     iterations : int
         Evaluations of the likelihood.
     """
@@ -160,39 +121,17 @@ class AdaptiveSolution:
     T_parent_child: FloatArray
     cov_parent_child_in_child: FloatArray
     unseen: FloatArray
-    model: NoiseModel
-    levels: FloatArray
     weights: FloatArray
-    systematic: str
-    parameters: FloatArray
-    parameter_sigmas: FloatArray
-    jumps: BoolArray
-    spikes: BoolArray
     heavy_tails: bool
-    misfit: float
     metres_per_pose: float
-    part_products: FloatArray
-    by_scale: FloatArray
-    scale_variance: float
-    objective: float
-    converged: bool
     iterations: int
     is_drowned: bool = False
 
-    @cached_property
-    def noise(self) -> NoiseLevels:
-        """Noise levels in plain units."""
-        return NoiseLevels.of(self.model, self.levels)
-
     @property
-    def scale(self) -> float:
-        """Factor from the child's lengths to the parent's."""
-        return 1.0 + float(self.parameters[SCALE])
-
-    @property
-    def scale_sigma(self) -> float:
-        """Standard deviation of the scale."""
-        return float(self.parameter_sigmas[SCALE])
+    def systematic(self) -> str:
+        """Systematic errors that the data show beyond doubt, joined by ``+``; ``none``."""
+        shown = np.abs(self.parameters) > _PLAIN * self.parameter_sigmas
+        return "+".join(name for name, at in PARAMETERS.items() if shown[at].any()) or "none"
 
     @property
     def bias(self) -> FloatArray:
@@ -207,43 +146,46 @@ class AdaptiveSolution:
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
     @property
-    def time_offset_s(self) -> float:
-        """Seconds to add to the child's stamps."""
-        return -float(self.parameters[TIME])
-
-    @property
-    def time_offset_sigma_s(self) -> float:
-        """Standard deviation of the time offset."""
-        return float(self.parameter_sigmas[TIME])
-
-    @property
     def left_out(self) -> BoolArray:
         """(n,) bool array: increments that are no evidence, across a jump or at a spike."""
         return self.jumps | self.spikes[1:] | self.spikes[:-1]
 
-    @property
-    def _after_a_metre(self) -> float:
-        """How many times larger a random walk is after a metre than after the path between two
-        poses.
-        """
-        return float((1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5)
+    def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
+        """Variance (rad^2) per axis of the rotation over so many typical intervals."""
+        white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
+        variance = 2 * white + n_intervals * walk
+        for slow in self.noise.lasting:
+            if slow.part == "rotation":
+                ratio = n_intervals * self.model.extent.interval_s / slow.tau_s
+                variance = variance - 2 * slow.sigma**2 * np.expm1(-ratio)
+        return np.asarray(variance)
 
-    def describe(self, stamps_ns: IntArray) -> Noise:
-        """The noise in plain numbers and strings: levels per axis, systematic errors, when
-        trajectories went wrong (ns), all of it in words.
-        """
-        noise = self.noise
+    @cached_property
+    def noise(self) -> Noise:
+        """The noise in plain numbers: standard deviations per axis, systematic errors."""
+        sigmas = np.exp(0.5 * self.levels)
+        lasting = tuple(
+            CorrelatedError(
+                kind=process.kind,
+                part=process.part,
+                sigma=float(sigmas[at]),
+                tau_s=float(np.exp(self.levels[at + 1])),
+            )
+            for process, at in zip(self.model.slow, range(N_FAST, len(sigmas), 2), strict=True)
+        )
+        # A random walk is so many times larger after a metre than from pose to pose.
+        after_a_metre = float((1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5)
         return Noise(
-            rotation_white_rad=noise.rotation_white,
-            translation_white_m=noise.translation_white,
-            rotation_drift_rad_per_pose=noise.rotation_drift,
-            translation_drift_m_per_pose=noise.translation_drift,
-            rotation_drift_rad_after_a_metre=noise.rotation_drift * self._after_a_metre,
-            translation_drift_m_after_a_metre=noise.translation_drift * self._after_a_metre,
-            drift_grows_with=noise.walk_by,
-            stamp_jitter_s=noise.jitter_s,
-            lasting=noise.slow,
-            rotation_turns_about=noise.centre,
+            in_words=(),
+            rotation_white_rad=float(sigmas[ROTATION]),
+            translation_white_m=float(sigmas[TRANSLATION]),
+            rotation_drift_rad_per_pose=float(sigmas[WALK_ROTATION]),
+            translation_drift_m_per_pose=float(sigmas[WALK_TRANSLATION]),
+            rotation_drift_rad_after_a_metre=float(sigmas[WALK_ROTATION]) * after_a_metre,
+            translation_drift_m_after_a_metre=float(sigmas[WALK_TRANSLATION]) * after_a_metre,
+            stamp_jitter_s=float(sigmas[JITTER]),
+            lasting=lasting,
+            rotation_turns_about=self.model.centre,
             heavy_tails=self.heavy_tails,
             systematic=self.systematic,
             systematic_parameters=tuple(self.parameters.tolist()),
@@ -251,47 +193,46 @@ class AdaptiveSolution:
             scale_sigma=self.scale_sigma,
             time_offset_s=self.time_offset_s,
             time_offset_sigma_s=self.time_offset_sigma_s,
-            jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
-            spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
             misfit=self.misfit,
-            in_words=tuple(self._in_words(stamps_ns)),
         )
 
-    def _in_words(self, stamps_ns: IntArray) -> list[str]:
-        return [
-            *self._noise_in_words(),
-            *self._systematic_in_words(),
-            *_when(
-                "jump of a trajectory, just before",
-                "jumps of a trajectory, just before",
-                stamps_ns[1:][self.jumps],
-            ),
-            *_when(
-                "pose wrong by itself and left out, at",
-                "poses wrong by themselves and left out, at",
-                stamps_ns[self.spikes],
-            ),
-        ]
+    def describe(self, stamps_ns: IntArray) -> Noise:
+        """The noise in plain numbers and in words, with the stamps (ns) of jumps and outliers."""
+        jumps, spikes = stamps_ns[1:][self.jumps], stamps_ns[self.spikes]
+        said = [*self._noise_in_words(), *self._systematic_in_words()]
+        said += _when("jump", "jumps", "of a trajectory, just before", jumps)
+        said += _when("pose", "poses", "wrong by {} and left out, at", spikes)
+        return replace(
+            self.noise,
+            jumps_before_stamp_ns=tuple(jumps.tolist()),
+            spikes_at_stamp_ns=tuple(spikes.tolist()),
+            in_words=tuple(said),
+        )
 
     def _noise_in_words(self) -> list[str]:
-        noise, per_metre = self.noise, self._after_a_metre
+        sigmas = np.exp(0.5 * self.levels)
         if not self.metres_per_pose:
             return [
-                f"Noise: {angle(noise.rotation_white)} per axis of each pose (both sensors "
-                f"together). Drift: {angle(noise.rotation_drift)} from pose to pose.",
-                *map(_slow_in_words, (slow for slow in noise.slow if slow.part == "rotation")),
+                f"Noise: {angle(sigmas[ROTATION])} per axis of each pose (both sensors "
+                f"together). Drift: {angle(sigmas[WALK_ROTATION])} from pose to pose.",
+                *(_slow_in_words(slow) for slow in self.noise.lasting if slow.part == "rotation"),
             ]
+        drift_m, drift_rad = sigmas[[WALK_TRANSLATION, WALK_ROTATION]] / self.metres_per_pose**0.5
+        about = ""
+        if self.model.centre != "sensors":
+            about = (
+                f", its rotation about the origin of the {self.model.centre}'s world, as of a "
+                "camera that sees a target"
+            )
         said = [
-            f"Noise: {length(noise.translation_white)} and {angle(noise.rotation_white)} per axis "
-            f"of each pose (both sensors together){_TURNING[noise.centre]}.",
-            f"Drift: {length(noise.translation_drift * per_metre)} and "
-            f"{angle(noise.rotation_drift * per_metre)} after 1 m, "
-            f"{length(10 * noise.translation_drift * per_metre)} and "
-            f"{angle(10 * noise.rotation_drift * per_metre)} after 100 m.",
+            f"Noise: {length(sigmas[TRANSLATION])} and {angle(sigmas[ROTATION])} per axis "
+            f"of each pose (both sensors together){about}.",
+            f"Drift: {length(drift_m)} and {angle(drift_rad)} after 1 m, "
+            f"{length(10 * drift_m)} and {angle(10 * drift_rad)} after 100 m.",
+            *map(_slow_in_words, self.noise.lasting),
         ]
-        said += [_slow_in_words(slow) for slow in noise.slow]
-        if noise.jitter_s > _NOTABLE_JITTER_S:
-            said.append(f"stamps jitter by {1000 * noise.jitter_s:.2g} ms")
+        if sigmas[JITTER] > _NOTABLE_JITTER_S:
+            said.append(f"stamps jitter by {1000 * sigmas[JITTER]:.2g} ms")
         if self.heavy_tails:
             said.append("Some poses are outliers and get less weight.")
         return said
@@ -319,7 +260,7 @@ class AdaptiveSolution:
                 for axis, value, sigma in zip("xyz", bias, sigmas, strict=True)
             )
             said.append(f"bias of the angular rates, along the child's axes: {told} deg/s")
-        if "time" in systematic and self.systematic in SYSTEMATIC:
+        if "time" in systematic and "rate" not in systematic:
             offset_ms = 1000 * self.time_offset_s
             said.append(
                 f"the child's stamps are {abs(offset_ms):.1f} +/- "
@@ -329,7 +270,7 @@ class AdaptiveSolution:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeverArmSolution:
+class LeverArmSolution(ModelSolution):
     """A lever arm and what it rests on.
 
     Attributes
@@ -338,48 +279,20 @@ class LeverArmSolution:
         m, in the axes of the sensor with poses.
     covariance : (3, 3) array
         Under the model, misfit accounted for.
-    beyond : (3, 3) array
-        Covariance by what is not in the model and differs from recording to recording: what the
-        positions answer to acceleration, and errors that last.
-    common : (3, 3) array
-        Covariance by a scale and a direction of the odometry that are the same all the time.
     response : (float, float)
         What positions less odometry are per m/s^2 of acceleration, s^2, and its sigma.
     clock_rate, clock_rate_sigma : float
         By how much the time offset grows each second.
-    time_offset_s, time_offset_sigma_s, scale, scale_sigma : float
-        As of an AdaptiveSolution.
-    model, levels
-        Noise model and its log levels.
     worse : (N,) bool array
         Positions that are left out, for those around are far less precise than the best.
-    jumps : (n,) bool array
-    spikes : (N,) bool array
-    part_products : (K, p + 1, p + 1) array
-    misfit, objective : float
-    converged : bool
     """
 
     lever_arm: FloatArray
     covariance: FloatArray
-    beyond: FloatArray
-    common: FloatArray
     response: tuple[float, float]
     clock_rate: float
     clock_rate_sigma: float
-    time_offset_s: float
-    time_offset_sigma_s: float
-    scale: float
-    scale_sigma: float
-    model: NoiseModel
-    levels: FloatArray
     worse: BoolArray
-    jumps: BoolArray
-    spikes: BoolArray
-    part_products: FloatArray
-    misfit: float
-    objective: float
-    converged: bool
 
     @property
     def rotation_walk(self) -> float:
@@ -413,7 +326,6 @@ class LeverArmSolution:
             translation_white_m=white,
             translation_drift_m_per_pose=walk,
             rotation_drift_rad_per_pose=turned,
-            drift_grows_with=self.model.walk_by,
             share_of_worse_positions=worse,
             jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
             spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
@@ -423,18 +335,16 @@ class LeverArmSolution:
 
 
 def _slow_in_words(slow: CorrelatedError) -> str:
-    if slow.kind == "scale":
-        return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
     size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
     return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
 
 
-def _when(one: str, several: str, stamps_ns: IntArray) -> list[str]:
+def _when(one: str, several: str, what: str, stamps_ns: IntArray) -> list[str]:
     """A line, or none, about what happened at these times."""
     if not len(stamps_ns):
         return []
+    is_one = len(stamps_ns) == 1
     shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in stamps_ns[:5].tolist())
-    return [
-        f"{len(stamps_ns)} {one if len(stamps_ns) == 1 else several} "
-        f"{shown}{' ...' if len(stamps_ns) > 5 else ''} s"
-    ]
+    what = what.format("itself" if is_one else "themselves")
+    more = " ..." if len(stamps_ns) > 5 else ""
+    return [f"{len(stamps_ns)} {one if is_one else several} {what} {shown}{more} s"]

@@ -7,14 +7,24 @@ are looked for once outliers are out; systematic errors are chosen under the noi
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls import noise_model, reml
-from hand_eye_calib.gls.increments import N_SYSTEMATIC, Streams, course_of, linearise, parameters_of
-from hand_eye_calib.gls.noise_model import CENTRES, SCALE_DRIFT, Extent, NoiseModel
+from hand_eye_calib.gls import reml
+from hand_eye_calib.gls.increments import (
+    BIAS,
+    N_SYSTEMATIC,
+    RATE,
+    SCALE,
+    TIME,
+    Streams,
+    course_of,
+    linearise,
+)
+from hand_eye_calib.gls.noise_model import CENTRES, LOWEST_VARIANCE, Extent, NoiseModel
 from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.outliers import (
     Outliers,
@@ -28,13 +38,9 @@ from hand_eye_calib.gls.outliers import (
 )
 from hand_eye_calib.gls.problem import Fit, Problem, after, sample
 from hand_eye_calib.gls.state_space import Posterior
-from hand_eye_calib.gls.systematic import systematic
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.stats import median
-
-# In the model while levels are fitted: scale, one bias, time. Two would differ by noise alone.
-_WHILE_FITTING = ("scale", "bias", "time")
 
 
 def start(problem: Problem) -> Fit:
@@ -44,15 +50,15 @@ def start(problem: Problem) -> Fit:
     T = Method("dnlo").solve(pairs).T_parent_child
     course, none = course_of(streams, T), np.zeros(N_SYSTEMATIC)
     linearisation = linearise(streams, course, T, none, ())
-    residuals, metres = linearisation.residuals, max(median(linearisation.metres), 1e-9)
-    extent = Extent(median(np.diff(streams.stamps_s)), metres, float(streams.stamps_s[-1]))
+    residuals = linearisation.residuals
+    extent = Extent(median(np.diff(streams.stamps_s)), float(streams.stamps_s[-1]))
     outliers = first_outliers(residuals)
     poses = bridged(streams, T, outliers.spikes)
     if outliers.spikes.any():
         bridging = linearise(poses, course, T, none, ()).residuals
         outliers = with_jumps_across_spikes(outliers, residuals, bridging)
     centre = _centre(streams, T, residuals, tuning.decisive_centre)
-    model = NoiseModel((SCALE_DRIFT,), "time", centre, extent)
+    model = NoiseModel((), centre, extent)
     beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
         poses=poses,
@@ -63,16 +69,8 @@ def start(problem: Problem) -> Fit:
         levels=model.first_levels(*rough_levels(residuals, beside)),
         outliers=outliers,
         weights=np.ones(len(streams)),
-        columns=_while_fitting(problem.systematic),
+        sigmas=np.array(tuning.sizes),
     )
-
-
-def _while_fitting(names: tuple[str, ...]) -> list[int]:
-    """Parameters of systematic errors that are in the model while the noise levels are fitted."""
-    if len(names) == 1:
-        return parameters_of(names[0])
-    chosen = {part for name in names for part in name.split("+")}
-    return [column for part in _WHILE_FITTING if part in chosen for column in parameters_of(part)]
 
 
 def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: float) -> str:
@@ -98,8 +96,8 @@ def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArra
     white, walk = np.empty((2, 2))
     for index, part in enumerate((slice(0, 3), slice(3, 6))):
         of_part = residuals[:, part]
-        total = np.mean(of_part[kept] ** 2) if kept.any() else noise_model.LOWEST_VARIANCE
-        total = max(float(total), 100 * noise_model.LOWEST_VARIANCE)
+        total = np.mean(of_part[kept] ** 2) if kept.any() else LOWEST_VARIANCE
+        total = max(float(total), 100 * LOWEST_VARIANCE)
         products = of_part[1:][together] * of_part[:-1][together]
         neighbours = np.mean(products) if together.any() else -total / 2
         white[index] = np.clip(-neighbours, 0.05 * total, 0.5 * total)
@@ -108,26 +106,17 @@ def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArra
 
 
 def noise(problem: Problem, fit: Fit) -> Fit:
-    """Noise levels of white noise, walk and drifting scale, and one step of X; first for a walk by
-    time or by distance, whichever is more likely, if the sensors are not as fast at all times.
-    """
-    is_open = fit.n_evaluations == 0 and fit.course.is_uneven
+    """Noise levels of white noise and walk, and one step of X."""
     kept = sample(len(problem.streams), problem.tuning.most_poses)
-    levels, fits = fit.levels, []
-    for walk_by in ("time", "distance") if is_open else (fit.model.walk_by,):
-        model = replace(fit.model, walk_by=walk_by)
-        fits.append((model, reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))))
-        levels = model.raised(fits[0][1].levels)
-    model, found = min(fits, key=lambda each: each[1].loss)
+    found = reml.fit(problem.space(fit, kept), fit.levels, fit.model.prior(fit.levels))
     step = NormalEquations(selected(found.posterior.products, list(range(6)))).step
     T = after(fit.T, step)
     return replace(
         fit,
-        model=model,
         levels=found.levels,
         T=T,
-        course=course_of(problem.streams, T, model.step_noise(found.levels)),
-        n_evaluations=fit.n_evaluations + sum(each.n_evaluations for _, each in fits),
+        course=course_of(problem.streams, T, fit.model.step_noise(found.levels)),
+        n_evaluations=fit.n_evaluations + found.n_evaluations,
     )
 
 
@@ -193,42 +182,52 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     if before.loss - found.loss < tuning.least_gain:
         return fit
     reduced, levels = richer.reduced(found)
-    fit = replace(fit, model=reduced, levels=levels)
-    return replace(fit, cov_beyond=np.diag(_mean_variances(problem, fit, kept)))
+    return replace(fit, model=reduced, levels=levels)
 
 
-def _mean_variances(problem: Problem, fit: Fit, kept: IntArray | None) -> FloatArray:
-    """Variances (6,) of the mean of errors fixed to the body that last too long to be found.
-
-    Errors that last often do so on all scales (flicker). A recording hardly shows those about as
-    long as itself, and X takes their mean. So beside each process that was found, there is the
-    longest that is modelled with half the variance, as flicker has, or none, both weighted by
-    likelihood.
-    """
-    tuning, variances = problem.tuning, np.zeros(6)
-    none = Posterior(problem.space(fit, kept), fit.levels).loss
-    for process, size in fit.model.fixed_to_body(fit.levels):
-        longer = tuning.longer_share * size
-        model, levels = fit.model.with_longer(process, fit.levels, longer)
-        loss = Posterior(problem.space(fit, kept, model), levels).loss
-        probability = 1.0 / (1.0 + np.exp(min(loss - none, tuning.no_chance)))
-        part = noise_model.states_of(process.part)
-        variances[part] = noise_model.LONGEST_IN_THE_MEAN * probability * longer
-    return variances
+def systematic(problem: Problem, fit: Fit) -> Fit:
+    """The likeliest systematic errors; and a step of X and of these, at poses freed of errors."""
+    posterior, tuning = problem.posterior(fit), problem.tuning
+    without = posterior.products - problem.known(fit)
+    log_odds = np.full(N_SYSTEMATIC, np.log(tuning.odds))
+    if problem.is_clock_free:
+        log_odds[TIME] = tuning.certain
+    choices = [
+        [tuning.none, size] if column in problem.columns and column < RATE.start else [size]
+        for column, size in enumerate(tuning.sizes)
+    ]
+    best, plainest = np.inf, None
+    for sigmas in map(np.array, product(*choices)):
+        is_there = (sigmas > tuning.none) & [len(both) > 1 for both in choices]
+        if is_there[SCALE] and is_there[BIAS].any():
+            continue  # along the direction of travel both say the same
+        rival = replace(fit, sigmas=sigmas)
+        normal = NormalEquations(without + problem.known(rival))
+        loss = normal.cost + normal.log_determinant + 2.0 * float(np.log(sigmas).sum())
+        loss -= 2.0 * float(log_odds[is_there].sum())
+        if plainest is None:
+            plainest = np.linalg.pinv(normal.covariance[:6, :6], hermitian=True)
+        elif loss < best:
+            growth = np.linalg.eigvals(plainest @ normal.covariance[:6, :6]).real.max()
+            loss = loss if growth < tuning.most_growth**2 else np.inf
+        if loss < best:
+            best, chosen, step = loss, rival, normal.step
+    states = posterior.states_after(step)
+    return chosen.moved(step, problem.columns).freed(problem.streams, states)
 
 
 def polish(problem: Problem, fit: Fit) -> Fit:
     """X followed to the end, derivatives taken from poses freed of their errors."""
     for _ in range(problem.tuning.max_rounds - 1):
         posterior = problem.posterior(fit)
-        if _is_settled(posterior.normal, problem):
+        if is_settled(problem, fit):
             break
         if fit.has_heavy_tails and "tails" not in problem.without:
             fit = replace(fit, weights=tail_weights(posterior))
         step = posterior.normal.step
-        fit = replace(fit.moved(step), n_evaluations=fit.n_evaluations + 1)
+        fit = replace(fit.moved(step, problem.columns), n_evaluations=fit.n_evaluations + 1)
         fit = fit.freed(problem.streams, posterior.states_after(step))
-    return problem.workspace.settled(fit, _is_settled(problem.posterior(fit).normal, problem))
+    return fit
 
 
 def _freed(problem: Problem, fit: Fit) -> Fit:
@@ -237,11 +236,11 @@ def _freed(problem: Problem, fit: Fit) -> Fit:
     return fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
 
 
-def _is_settled(normal: NormalEquations, problem: Problem) -> bool:
-    """Whether the step is small beside its sigmas, but for a translation that the rotations hardly
-    reveal: noise moves it on and on.
+def is_settled(problem: Problem, fit: Fit) -> bool:
+    """Whether the next step is small beside its sigmas, but for a translation that the rotations
+    hardly reveal: noise moves it on and on.
     """
-    tuning = problem.tuning
+    tuning, normal = problem.tuning, problem.posterior(fit).normal
     variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
     known = axes if variances[2] < tuning.most_uneven * variances[1] else axes[:, :2]
     steps = np.concatenate([known.T @ normal.step[:3], normal.step[3:]])

@@ -31,6 +31,9 @@ WHITE = 6
 # Precision (1/m^2, 1/rad^2) of poses that may be anywhere.
 FREE = 1.0
 
+# Parts of a recording.
+_N_PARTS = 20
+
 # Diagonals are raised by this share, so that rounding cannot make them negative.
 _ROUNDING = 1e-13
 
@@ -79,7 +82,7 @@ class StateSpace:
         Factors of the precision of each pose's white error; zero for poses that may be anywhere.
     cut : (n,) bool array
         Increments that are no evidence.
-    prior : (p + 1, p + 1) array or None
+    prior : (p + 1, p + 1) array
         Products that what is known of the parameters beforehand adds.
     """
 
@@ -94,7 +97,7 @@ class StateSpace:
     groups: tuple[Group, ...]
     weights: FloatArray
     cut: BoolArray
-    prior: FloatArray | None = None
+    prior: FloatArray
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -308,8 +311,6 @@ class Posterior:
     space : StateSpace
     levels : (m,) array
         See :class:`Precision`.
-    precision : Precision, optional
-        Of the same increments with other columns.
 
     Raises
     ------
@@ -317,11 +318,9 @@ class Posterior:
         If the levels make a matrix that is not positive definite to rounding.
     """
 
-    def __init__(
-        self, space: StateSpace, levels: FloatArray, precision: Precision | None = None
-    ) -> None:
+    def __init__(self, space: StateSpace, levels: FloatArray) -> None:
         self.space, self.levels = space, levels
-        self.precision = precision or Precision(space, levels)
+        self.precision = Precision(space, levels)
 
     def halves(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""
@@ -356,8 +355,7 @@ class Posterior:
     def products(self) -> FloatArray:
         """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
         products = self._halves[0] - multiplied(self.whitened, self.whitened)
-        products = 0.5 * (products + products.T)
-        return products if self.space.prior is None else products + self.space.prior
+        return 0.5 * (products + products.T) + self.space.prior
 
     @cached_property
     def normal(self) -> NormalEquations:
@@ -372,19 +370,13 @@ class Posterior:
         determinants = self.precision.log_determinant + self.normal.log_determinant
         return 0.5 * (determinants + self.normal.cost)
 
-    def with_columns(self, columns: FloatArray) -> Posterior:
-        """The posterior of the same increments with other columns (n, 6, k)."""
-        return Posterior(replace(self.space, columns=columns), self.levels, self.precision)
-
     def with_weights(self, weights: FloatArray) -> Posterior:
         """The posterior at other weights (N,) of the white errors."""
         return Posterior(replace(self.space, weights=weights), self.levels)
 
-    def states_after(self, step: FloatArray, columns: list[int] | None = None) -> FloatArray:
-        """States (N, d) expected after a step of the parameters, or of some of them."""
-        mixing = np.zeros((self.whitened.shape[2], 1))
-        mixing[slice(-1) if columns is None else columns, 0] = step
-        mixing[-1] = 1.0
+    def states_after(self, step: FloatArray) -> FloatArray:
+        """States (N, d) expected after a step of the parameters."""
+        mixing = np.r_[step, 1.0][:, None]
         return self.precision.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
 
     def restricted(self) -> FloatArray:
@@ -410,3 +402,60 @@ def _combined(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
     for level, basis in zip(levels[1:], bases[1:], strict=False):
         total = total + np.exp(level) * basis
     return total
+
+
+def part_products(posterior: Posterior) -> FloatArray:
+    """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20.
+
+    Leaving increments out as such would cut the trajectory there, and with white noise most is
+    known across the gap: answers without a part would scatter more than the error does. What a part
+    adds, its innovations, is independent of the other parts if the model is right.
+
+    Each part is a quadratic form of the states at its two ends and of the columns: all states
+    between are eliminated. The forms are added in order of time.
+    """
+    n, size = len(posterior.space), posterior.space.n_states
+    ends = np.linspace(0, n, min(_N_PARTS, n) + 1).astype(int).tolist()
+    of_start = posterior.precision.prior_block()
+    n_columns = posterior.space.columns.shape[2]
+    known = np.zeros((size + n_columns, size + n_columns))
+    known[:size, :size] = of_start
+    totals = [np.zeros((n_columns, n_columns))]
+    for start, end in zip(ends[:-1], ends[1:], strict=True):
+        form = _form_of_part(posterior, start, end)
+        # States at the start, at the end, columns; what is known of the start so far is added.
+        here = np.r_[np.arange(size), np.arange(2 * size, len(form))]
+        form[np.ix_(here, here)] += known
+        known = _eliminated(form, size)
+        totals.append(_eliminated(known, size))
+    # What is known beforehand counts in equal shares.
+    return np.diff(np.array(totals), axis=0) + posterior.space.prior / (len(ends) - 1)
+
+
+def _form_of_part(posterior: Posterior, start: int, end: int) -> FloatArray:
+    """Quadratic form of the states (d) at pose ``start`` and at ``end`` and of k columns, (2 d + k,
+    2 d + k), of the increments between; of the states before the start nothing is known in it.
+    """
+    diagonal, below, forces, products = posterior.part(start, end)
+    size, n_columns = diagonal.shape[1], products.shape[0]
+    form = np.zeros((2 * size + n_columns, 2 * size + n_columns))
+    first, last, columns = slice(size), slice(size, 2 * size), slice(2 * size, None)
+    form[first, first], form[last, last] = diagonal[0], diagonal[-1]
+    form[first, columns], form[last, columns] = forces[0], forces[-1]
+    form[columns, first], form[columns, last] = forces[0].T, forces[-1].T
+    form[columns, columns] = products
+    if len(diagonal) == 2:
+        form[last, first], form[first, last] = below[0], below[0].T
+        return form
+    right = np.zeros((len(diagonal) - 2, size, len(form)))
+    right[:, :, columns] = forces[1:-1]
+    right[0, :, first] += below[0]
+    right[-1, :, last] += below[-1].T
+    whitened = Factor(diagonal[1:-1], below[1:-1]).whiten(right)
+    return np.asarray(form - multiplied(whitened, whitened))
+
+
+def _eliminated(form: FloatArray, size: int) -> FloatArray:
+    """A quadratic form without its first variables, at their best values."""
+    root = np.linalg.solve(np.linalg.cholesky(form[:size, :size]), form[:size, size:])
+    return np.asarray(form[size:, size:] - root.T @ root)

@@ -38,36 +38,27 @@ class Tuning:
     # part of the model if it is so much lower in the end: two levels each, by Akaike and more.
     least_promise: float = 2.0
     least_gain: float = 4.0
-    # Size of errors that last longer than those found, as a share of their variance, if there are
-    # any: flicker. A loss larger by so much leaves no chance.
-    longer_share: float = 0.5
-    no_chance: float = 100.0
+    # Errors that are fixed to the body last on all scales (flicker). A recording hardly shows those
+    # about as long as itself, and X takes their mean: this share of the variance of those found.
+    unseen_share: float = 0.1
     # X is followed until it moves by less than this share of its sigma, or by so little (m, rad).
     max_rounds: int = 6
     settled_sigmas: float = 0.1
     settled_step: float = 1e-9
     # A translation whose variance is this many times that of the next one need not settle.
     most_uneven: float = 9.0
-    # What chi-square with the degrees of freedom of the jackknife, nine, exceeds per degree once in
-    # ten times.
-    chance_of_jackknife: float = 1.63
-
-    # Systematic errors larger than this are none: a wrong unit, a clock that was not aligned, or
-    # noise. Of lengths, of a bias (m/m), s, rad/s.
-    largest: tuple[float, ...] = (0.5, 0.2, 0.2, 0.2, 0.5, 1.0, 1.0, 1.0)
-    # Nor is one assumed that can hardly be told from X, whose standard deviations would grow by
-    # this factor: on a road a child that slips sideways looks like one that is mounted askew.
+    # Standard deviations of systematic errors beforehand: of a scale, of a bias along each axis
+    # (m/m), of a time offset (s), of a bias of rates (rad/s), if they are there, at these odds;
+    # and the one that stands for none. A time offset that is not known beforehand is all but
+    # certain (log odds).
+    sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
+    odds: float = 0.03
+    none: float = 1e-6
+    certain: float = 50.0
+    # None is assumed that can hardly be told from X, whose standard deviations would grow by this
+    # factor: on a road a child that slips sideways looks like one that is mounted askew.
     # There such biases grow them by 4 or more, biases of the published simulations by 2 or less.
     most_growth: float = 3.0
-    # Each parameter of a systematic error must lower the weighted squared residual by so much: one
-    # that is not there is chosen once in forty to five hundred recordings. Schwarz's criterion
-    # would ask for 7 to 10, as if every increment were evidence of errors that add up over all.
-    penalty: float = 5.0
-    # A bias along each of the three axes of the child is there, at these odds, or not: on platforms
-    # that nobody chose a likely one does harm, and drifts of 1 % and more are found all the same.
-    # Its size is Cauchy's, with the scale (m/m) that odometry has.
-    bias_scale: float = 0.01
-    bias_odds: float = 0.01
 
 
 TUNING = Tuning()

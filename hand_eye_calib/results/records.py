@@ -94,7 +94,6 @@ class Noise:
     rotation_drift_rad_per_pose: float | None = None
     translation_drift_m_after_a_metre: float | None = None
     rotation_drift_rad_after_a_metre: float | None = None
-    drift_grows_with: str = ""
     stamp_jitter_s: float | None = None
     lasting: tuple[CorrelatedError, ...] = ()
     rotation_turns_about: str | None = None

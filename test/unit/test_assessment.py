@@ -96,7 +96,7 @@ def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_
             else drifting(child_of(parent), run)
         )
         stamps_ns = np.arange(len(parent)) * 100_000_000
-        solution = estimator.solve(stamps_ns, parent, child, systematic=("none",))
+        solution = estimator.solve(stamps_ns, parent, child, systematic=())
         model = solution.cov_parent_child_in_child / solution.misfit
         deviations = answers_without(solution.part_products, 10)[:, :6]
         deviations -= deviations.mean(axis=0)

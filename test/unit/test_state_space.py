@@ -7,11 +7,11 @@ from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.block_tridiagonal import Factor
 from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.gls.outliers import surprises
-from hand_eye_calib.gls.parts import part_products
 from hand_eye_calib.gls.state_space import (
     Group,
     Posterior,
     StateSpace,
+    part_products,
 )
 
 N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
@@ -50,6 +50,7 @@ def space_of(seed=1, cut=(4,)):
         groups=tuple(Group(slice(ends[k], ends[k + 1]), 5 + 2 * k, 6 + 2 * k) for k in range(4)),
         weights=random.uniform(0.3, 2.0, N_POSES),
         cut=flags,
+        prior=np.zeros((N_PARAMETERS + 1, N_PARAMETERS + 1)),
     )
 
 

@@ -1,7 +1,5 @@
 """Which systematic errors the adaptive estimator assumes."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import real_data
@@ -11,7 +9,6 @@ from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
-from hand_eye_calib.gls.systematic import Model, spread_about
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.simulation.drive import add_noise, simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
@@ -31,17 +28,10 @@ def test_a_drift_that_a_mount_askew_nearly_explains_is_found(number):
     # without.
     poses, truth = mixture(number)
     solution = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c)
-    assert solution.systematic == "bias"
+    assert "bias" in solution.systematic
     covariance = assess_adaptive(poses, solution).cov_parent_child_in_child
     xi = se3.log(se3.inverse(solution.T_parent_child) @ truth)
     assert xi @ np.linalg.solve(covariance, xi) < 16.8  # chi-square (6), once in a hundred
-
-
-def test_a_bias_is_along_the_axes_that_the_data_ask_for():
-    poses, _ = mixture(2)
-    solution = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c)
-    assert solution.bias[0] == pytest.approx(0.025, abs=0.008)
-    np.testing.assert_array_equal(solution.bias[1:], 0.0)
 
 
 def test_on_a_road_no_bias_is_assumed_that_a_mount_askew_looks_like():
@@ -52,12 +42,3 @@ def test_on_a_road_no_bias_is_assumed_that_a_mount_askew_looks_like():
     assert np.hypot(off[0], off[2]) < 0.11  # y points down: the plane is x, z
     assert np.degrees(np.linalg.norm(off[3:])) < 0.30
     assert "bias" not in result.noise.systematic
-
-
-@pytest.mark.parametrize(("lead", "variance"), [(0.0, 0.5), (2.0, 0.2689), (60.0, 0.0)])
-def test_a_model_about_as_good_as_the_chosen_one_widens_the_covariance(lead, variance):
-    askew = np.eye(6)[5]
-    none = Model([], SimpleNamespace(step=0.0 * askew), 5.0)
-    bias = Model([], SimpleNamespace(step=askew), 5.0 + lead)
-    found = spread_about(none, [none, bias])
-    np.testing.assert_allclose(found, np.diag(variance * askew), atol=1e-4)
