@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.goal import Goal
 from reproduction.coverage.classes import CLASSES, simulate
-from reproduction.recordings import Rig
+from reproduction.recordings import Recording, Rig, Truth
 from reproduction.writing import markdown_table
 
 # Class, and duration (s): five kinds of motion with two kinds of errors each.
@@ -39,23 +39,17 @@ FACTORS = (0.5, 1.0, 2.0)
 _STEPS = 24
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recorded:
-    """A recording with a known answer."""
+class Recorded(NamedTuple):
+    """A recording with a known answer, and what a user would give."""
 
     name: str
     kind: str
-    parent: Trajectory
-    child: Trajectory
-    truth: FloatArray
-    # How well it is known (6,), m and rad.
-    truth_sigmas: FloatArray = field(default_factory=lambda: np.zeros(6))
-    # What a user would give.
-    options: Mapping[str, Any] = field(default_factory=dict)
+    recording: Recording
+    truth: Truth
+    options: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """A part of a recording: its end (s), the error (6,) along and about the parent's axes, and
     what the session is told.
     """
@@ -90,29 +84,18 @@ def simulated(seeds: int) -> Iterator[Recorded]:
             for seed in range(seeds * 2 // len(classes)):
                 key = (7, seed, sorted(CLASSES).index(name))
                 made = simulate(dataclasses.replace(CLASSES[name], duration_s=duration_s), key)
+                truth = Truth.within(made.T_parent_child, 0.0, 0.0)
                 yield Recorded(
-                    name=f"{name} {seed}",
-                    kind=kind,
-                    parent=made.parent,
-                    child=made.child,
-                    truth=made.T_parent_child,
+                    f"{name} {seed}", kind, Recording(made.parent, made.child), truth, {}
                 )
 
 
 def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
     """The recordings of rigs whose answer is known."""
     for rig in rigs:
-        for name, recording in rig.recordings.items() if rig.truth else ():
-            assert rig.truth is not None
-            yield Recorded(
-                name=f"{rig.name} {name}",
-                kind=rig.name,
-                parent=recording.parent,
-                child=recording.child,
-                truth=rig.truth.T_parent_child,
-                truth_sigmas=rig.truth.sigmas,
-                options=rig.options,
-            )
+        if rig.truth is not None:
+            for name, recording in rig.recordings.items():
+                yield Recorded(f"{rig.name} {name}", rig.name, recording, rig.truth, rig.options)
 
 
 def stops(recorded: Recorded) -> list[dict[str, Any]]:
@@ -126,17 +109,16 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
     options: dict[str, Any] = dict(recorded.options)
     options |= prior_fields(options.pop("prior", {}))
     config = CalibratorConfig(**options)
-    of_parent, of_child = (each.stamps_ns[[0, -1]] for each in (recorded.parent, recorded.child))
+    streams = recorded.recording.parent, recorded.recording.child
+    of_parent, of_child = (each.stamps_ns[[0, -1]] for each in streams)
     # Clocks of their own: the child's part is the same share of its recording.
     if abs(of_child[0] - of_parent[0]) < 10 * 10**9:
         of_child = of_parent
     for share in np.arange(1, _STEPS + 1) / _STEPS:
         parts = [
             _until(stream, start_ns + round(share * (end_ns - start_ns)))
-            for stream, (start_ns, end_ns) in (
-                (recorded.parent, of_parent), (recorded.child, of_child)
-            )
-        ]  # fmt: skip
+            for stream, (start_ns, end_ns) in zip(streams, (of_parent, of_child), strict=True)
+        ]
         try:
             snapshot = whole_snapshot(config, *parts).resolved()
             calibration = snapshot.estimate()
@@ -144,7 +126,7 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
         except (HandEyeCalibError, np.linalg.LinAlgError):
             continue
         end_s = float(share * np.ptp(of_parent) * 1e-9)
-        error = deviation(calibration.T_parent_child, recorded.truth)
+        error = deviation(calibration.T_parent_child, recorded.truth.T_parent_child)
         yield Step(end_s, error, calibration, seen)
 
 
@@ -159,7 +141,7 @@ def _stopped(recorded: Recorded, steps: Sequence[Step], factor: float) -> Stop:
     for step in steps:
         progress = goal.add(step.calibration, step.seen)
         is_stuck |= progress.will_not_get_there
-        worst.append(_worst(step.error, recorded.truth_sigmas, factor))
+        worst.append(_worst(step.error, recorded.truth.sigmas, factor))
         if progress.done:
             # From here on all errors stay within their targets.
             first = max((i + 1 for i, each in enumerate(worst) if each > 1.0), default=0)
