@@ -58,11 +58,6 @@ class Cell:
     level: float | None
     method: str
 
-    @property
-    def name(self) -> str:
-        """Such as noise_0.002_dnlo."""
-        return "_".join([*path_to(self.dataset, self.level), self.method])
-
 
 def cells(datasets: Sequence[str], methods: Sequence[str]) -> list[Cell]:
     """Cells of data sets at all levels, by method in turn."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,20 +17,18 @@ from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail,
 _START_NS = 1_700_000_000_000_000_000
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RecordingClass:
     """How the recordings of a class are made."""
 
-    # ``motion(rng, duration_s)``.
-    motion: Callable[[np.random.Generator, float], motions.Motion]
     duration_s: float
     rate_hz: float
     parent: SensorErrors
     child: SensorErrors
+    # ``motion(rng, duration_s)``.
+    motion: Callable[[np.random.Generator, float], motions.Motion]
     # Length of the extrinsic's translation; its direction is drawn.
     lever_m: float = 0.4
-    # What the bound rests on.
-    bound_from: str = "Gaussian noise, exact"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,32 +125,12 @@ LIDAR_ODOMETRY = replace(_white(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
 VIO = replace(_white(0.0008, 0.03), walk=sigmas(0.004, 0.06))
 _FLICKER = tuple(GaussMarkov(tau, sigmas(0.002, 0.12)) for tau in (0.1, 0.4, 1.6, 6.4, 25.6))
 
-_Kind = Callable[..., RecordingClass]
-
-
-def _recorded_with(
-    motion: Callable[[np.random.Generator, float], motions.Motion], lever_m: float
-) -> _Kind:
-    """``kind(duration_s, rate_hz, parent, child, **more)`` of a motion."""
-
-    def kind(
-        duration_s: float, rate_hz: float, parent: SensorErrors, child: SensorErrors, **more: object
-    ) -> RecordingClass:
-        given = {"lever_m": lever_m, **more}
-        return RecordingClass(
-            motion=motion, duration_s=duration_s, rate_hz=rate_hz, parent=parent, child=child,
-            **given,  # type: ignore[arg-type]
-        )  # fmt: skip
-
-    return kind
-
-
-_hand = _recorded_with(motions.hand_held, 0.4)
-_car = _recorded_with(motions.car, 1.5)
-_agv = _recorded_with(motions.agv, 0.8)
-_flat_agv = _recorded_with(motions.flat_agv, 0.8)
-_drone = _recorded_with(motions.drone, 0.3)
-_arm = _recorded_with(motions.arm, 0.15)
+_hand = partial(RecordingClass, motion=motions.hand_held, lever_m=0.4)
+_car = partial(RecordingClass, motion=motions.car, lever_m=1.5)
+_agv = partial(RecordingClass, motion=motions.agv, lever_m=0.8)
+_flat_agv = partial(RecordingClass, motion=motions.flat_agv, lever_m=0.8)
+_drone = partial(RecordingClass, motion=motions.drone, lever_m=0.3)
+_arm = partial(RecordingClass, motion=motions.arm, lever_m=0.15)
 
 CLASSES = {
     "hand_white": _hand(60.0, 20.0, _HAND, _white(0.004, 0.3)),
@@ -222,21 +201,18 @@ CLASSES = {
         20.0,
         _STEADY,
         replace(_white(0.003, 0.2), tail=Tail("student", factor=3.0)),
-        bound_from="Fisher information of the multivariate t",
     ),
     "hand_spikes": _hand(
         60.0,
         20.0,
         _STEADY,
         replace(_white(0.003, 0.2), tail=Tail("spikes", 0.05, 20.0)),
-        bound_from="Fisher information of the mixture",
     ),
     "hand_bursts": _hand(
         90.0,
         20.0,
         replace(_STEADY, walk=sigmas(0.001, 0.02)),
         replace(_white(0.002, 0.15), tail=Tail("bursts", 0.15, 10.0)),
-        bound_from="Gaussian noise, instants of bursts known",
     ),
     "drone_anisotropic": _drone(
         120.0,
@@ -254,7 +230,6 @@ CLASSES = {
         _slow(
             replace(_white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2), 2.0, 0.002, 0.1
         ),
-        bound_from="Gaussian noise, instants of jumps known",
     ),
     "drone_two_vios": _drone(
         140.0,
@@ -268,7 +243,6 @@ CLASSES = {
         10.0,
         replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
         replace(_white(0.005, 0.05), walk_by_metre=sigmas(0.003, 0.03)),
-        bound_from="none: z is unobservable and must be refused",
     ),
 }
 

@@ -142,7 +142,7 @@ def test_comparison_counts_lists_and_explains(tmp_path):
 
 
 def tasks_of(cells):
-    return {cell.name: (SOURCE, cell) for cell in cells}
+    return {cell.method: (SOURCE, cell) for cell in cells}
 
 
 def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(tmp_path, rows):
@@ -154,7 +154,7 @@ def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(tmp_path, 
     path.write_text(f"\n{first.replace('run_01', 'kept')}\n{second[:-5]}")
     found = runner.kept(path, solve_cell, tasks_of(CELLS), 1)
     marked = {name for name, some in found.items() if any(row["run"] == "kept" for row in some)}
-    assert marked == {CELLS[0].name}
+    assert marked == {CELLS[0].method}
     assert len(found) == len(CELLS)
 
 
