@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -109,7 +109,7 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
 
 def in_m_and_deg(errors: Errors) -> tuple[float, ...]:
     """The four metrics, rotations in degrees."""
-    return tuple((np.array(astuple(errors)) * [1, 180 / np.pi, 1, 180 / np.pi]).tolist())
+    return tuple((np.array(errors) * [1, 180 / np.pi, 1, 180 / np.pi]).tolist())
 
 
 def published_name(method: str) -> str:

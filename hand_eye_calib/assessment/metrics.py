@@ -1,6 +1,6 @@
 """Error metrics of Välimäki et al. 2023, section 3.3. Metres and radians."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,17 +9,10 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 
 
-@dataclass(frozen=True)
-class Errors:
-    """The four metrics of one calibration.
-
-    Attributes
-    ----------
-    e_rt, e_rR : float
-        Mean relative translation (m) and rotation error (rad) over the motion pairs. They need no
-        ground truth, and do not tell which of two calibrations is nearer to it.
-    e_at, e_aR : float
-        Absolute translation (m) and rotation error (rad) against the ground truth.
+class Errors(NamedTuple):
+    """Mean relative translation (m) and rotation errors (rad) over the motion pairs, which need no
+    ground truth and do not tell which of two calibrations is nearer to it; and absolute ones
+    against the ground truth.
     """
 
     e_rt: float

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.mount_change import SIGNIFICANT, MountChange, find_change
+from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.checks.response import (
     LITTLE,

@@ -57,11 +57,6 @@ _ROWS = {
         "sensor moves",
         "find out why its source stopped, and cut that part out",
     ),
-    "repeated": _Row(
-        "the {stream} stream has each position {times} times in a row under new stamps: its source "
-        "is slower than the stream",
-        "keep the first of each, with the stamp of its measurement",
-    ),
     "stamp_unit": _Row(
         "{whose} stamps are {unit} instead of nanoseconds: they are {factor:g} times nearer to "
         "1970 than the {other}'s",

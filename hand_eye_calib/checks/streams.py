@@ -157,8 +157,6 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         return findings
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
-    if not trajectory.has_rotations and (times := _repeated(trajectory)) > 1:
-        return [*findings, finding("repeated", stream, times=times)]
     step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
     if step_m >= _COARSE_NOTE_M:
         severity = Severity.WARNING if step_m > _COARSE_WARNING_M else Severity.NOTE
@@ -167,13 +165,6 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
             severity = Severity.ERROR
         findings.append(finding("coarse_positions", stream, severity, step_m=step_m))
     return findings
-
-
-def _repeated(trajectory: Trajectory) -> int:
-    """How often in a row positions are the same to the last digits: the median."""
-    same = np.abs(np.diff(trajectory.poses[:, :3, 3], axis=0)).max(axis=1) < _SAME_POSE
-    edges = np.r_[0, np.flatnonzero(~same) + 1, len(trajectory)]
-    return int(np.median(np.diff(edges)))
 
 
 def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:

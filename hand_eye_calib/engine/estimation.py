@@ -14,7 +14,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes
 from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs
-from hand_eye_calib.assessment.mount_change import PossibleShift, possible_shift
+from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.config import CalibratorConfig

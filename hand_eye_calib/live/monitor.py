@@ -1,7 +1,7 @@
 """``monitor: true``: has the child sensor moved against the installed extrinsic?
 
 For days on end, in constant memory. Every second of motion adds its information about a shift from
-the installed extrinsic (:mod:`hand_eye_calib.assessment.mount_change`). The likelihood ratio of a
+the installed extrinsic (:mod:`hand_eye_calib.assessment.moved`). The likelihood ratio of a
 shift is taken over the last three seconds of motion, the last four, ... up to twenty minutes, and
 over all of them; the largest tells. It is measured by what the scores really scatter over time.
 
@@ -20,10 +20,11 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.floor import floor_of_pairs
-from hand_eye_calib.assessment.mount_change import noise_covariance, residuals_and_jacobians
 from hand_eye_calib.assessment.moved import (
     log_ratio,
     most_likely,
+    noise_covariance,
+    residuals_and_jacobians,
     shift_covariance,
     squared_shift,
 )

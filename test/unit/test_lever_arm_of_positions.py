@@ -264,8 +264,6 @@ class TestLeverArm:
         two = child.poses[:, :3, 3] + [0.5, 0.0, 0.0] * (np.arange(80) % 2)[:, None]
         both = Trajectory.from_positions(child.stamps_ns, two)
         assert codes(parent, both) == ["interleaved"]
-        held = Trajectory.from_positions(child.stamps_ns, child.poses[:, :3, 3].repeat(4, 0)[:80])
-        assert codes(parent, held) == ["repeated"]
         north_east = Trajectory.from_positions(child.stamps_ns, child.poses[:, [1, 0, 2], 3])
         assert codes(parent, north_east) == ["coordinates"]
         flat = recorded(drift_rad=0.0, poses=planar_poses(200, seed=3))

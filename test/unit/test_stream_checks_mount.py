@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hand_eye_calib.assessment.mount_change import SIGNIFICANT, find_change, possible_shift
+from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change, possible_shift
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import synchronise
