@@ -1,5 +1,6 @@
 """Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,23 +9,34 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import (
+    FARTHEST_M,
+    QUATERNION_NORM_TOLERANCE,
+    far_position,
+)
 
 # Edges that are listed in a message.
 _MOST_LISTED = 50
 
 
-def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
-    """Pose (4, 4) of a transform as it comes from outside.
-
-    Raises
-    ------
-    InputError
-        If it is not finite, or the quaternion is not of unit length.
+def check_pose(*values: float) -> None:
+    """Raise InputError for x, y, z, qx, qy, qz, qw that are not finite, too far away, or have a
+    quaternion that is not of unit length.
     """
-    stamps_ns = np.zeros(1, dtype=np.int64)
-    poses = Trajectory.from_quat_xyzw(stamps_ns, position, quat_xyzw).poses
-    return np.asarray(poses[0])
+    length = math.hypot(*values[3:])
+    if not math.isfinite(sum(values)):
+        raise InputError("the pose has a value that is not finite")
+    if abs(length - 1.0) > QUATERNION_NORM_TOLERANCE:
+        raise InputError(f"the pose has a quaternion of length {length:.4g}, expected 1")
+    if max(map(abs, values[:3])) > FARTHEST_M:
+        raise InputError(far_position(*values[:3]))
+
+
+def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
+    """Pose (4, 4) of a transform as it comes from outside. Raises as :func:`check_pose`."""
+    t, quat_xyzw = np.asarray(position, dtype=float), np.asarray(quat_xyzw, dtype=float)
+    check_pose(*t.tolist(), *quat_xyzw.tolist())
+    return se3.from_quat_xyzw(t, quat_xyzw)
 
 
 @dataclass

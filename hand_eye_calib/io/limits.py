@@ -14,8 +14,6 @@ _MIB = 1 << 20
 
 #: Bytes of memory that reading a bag may take, in a command
 LARGEST_GROWTH = 512 * _MIB
-#: Storage files of one bag in a store.
-MOST_BAG_FILES = 1_000
 #: Bytes that a compressed file may unpack to: this much ...
 SMALLEST_UNPACKED = 64 * _MIB
 #: ... plus this many times its own size.

@@ -1,21 +1,29 @@
-"""Trajectories from the transform tree: from the edges on ``/tf`` and ``/tf_static`` to the pose of
-one frame in another.
-"""
+"""Poses of one frame in another from transforms, as they arrive live or are read from a bag."""
 
-from array import array
-from collections import defaultdict
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import FrameTree
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.frames import FrameTree, check_pose
 from hand_eye_calib.io.limits import MOST_FRAMES
 from hand_eye_calib.text import split_frames
+
+# An edge's stamps that jump back by more begin a new session (ns).
+_JUMP_BACK_NS = 1_000_000_000
+
+# Transforms of each moving edge from which its rate is taken, and most that are kept.
+_RATE_FROM, _MOST_KEPT = 5, 2000
+
+# x y z qx qy qz qw of a frame in its parent.
+_Row = tuple[float, ...]
+# The newest stamps and poses of a moving edge, in order.
+_MovingEdge = deque[tuple[int, _Row]]
 
 
 class TfSource(NamedTuple):
@@ -61,140 +69,146 @@ class PoseFields(NamedTuple):
     quat_xyzw: Sequence[float]
 
 
-class _Kept:
-    """The poses of a frame in its parent: N bag times, stamps and rows of seven."""
+class TfStream:
+    """Composes the poses of a sensor from the edges of a transform tree as they arrive.
 
-    def __init__(self) -> None:
-        self.log_ns, self.stamps_ns, self.values = array("q"), array("q"), array("d")
+    There is one pose for each transform of the moving edge with the lowest rate. The other moving
+    edges are interpolated there, never extrapolated and never across more than ``max_gap_s``.
 
-
-class TransformTree(FrameTree):
-    """The frames of a bag and the edges between them.
-
-    Edges are noted with :meth:`note` in a first pass over the messages. Poses are kept with
-    :meth:`keep` in a second one, when it is known which edges are needed.
-
-    Attributes
+    Parameters
     ----------
-    static : dict of str to PoseFields
-        The last static transform of each frame.
+    source : TfSource
+    max_gap_s : float
+        May be changed.
+    tree : FrameTree, optional
+        Edges that are known before.
     """
 
-    def __init__(self) -> None:
-        super().__init__("the bag's transforms")
-        self.static: dict[str, PoseFields] = {}
-        self._kept: defaultdict[str, _Kept] = defaultdict(_Kept)
+    def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
+        self.source, self.max_gap_s = source, max_gap_s
+        self._tree = tree or FrameTree("/tf and /tf_static")
+        self._up: list[str] = []
+        self._down: list[str] = []
+        self._moving: dict[str, _MovingEdge] = {}
+        self._find_chain()
 
-    def note(self, transform: PoseFields, is_static: bool) -> None:
-        """Add an edge; of a static one the last transform is kept.
+    def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
+        """Take a transform; yields the poses that are known with it. Raises as :meth:`edges_at`."""
+        for stamp_ns, rows in self.edges_at(transform, is_static):
+            T_world_sensor = self.composed({name: np.array(row) for name, row in rows.items()})
+            x, y, z = T_world_sensor[:3, 3].tolist()
+            qx, qy, qz, qw = se3.to_quat_xyzw(T_world_sensor).tolist()
+            yield PoseFields(stamp_ns, *self.source, (x, y, z), (qx, qy, qz, qw))
 
-        Raises
-        ------
-        InputError
-            If the frame has another parent already, or there are too many frames.
-        """
-        frame = transform.sensor_frame or ""
-        self.add(transform.world_frame, frame, is_static=is_static)
-        if is_static:
-            self.static[frame] = transform
-        if len(self.edges) > MOST_FRAMES:
-            raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
-
-    def keep(self, transform: PoseFields, is_static: bool, log_ns: int) -> None:
-        """Keep the pose of a transform that is needed; static ones of a moving edge are ignored."""
-        frame = transform.sensor_frame or ""
-        if self.edges[frame].is_static or not is_static:
-            kept = self._kept[frame]
-            kept.log_ns.append(log_ns)
-            kept.stamps_ns.append(transform.stamp_ns)
-            kept.values.extend((*transform.position, *transform.quat_xyzw))
-
-    def chain(self, source: TfSource) -> tuple[list[str], list[str]]:
-        """Frames whose edges lead up from the world frame, and down to the sensor's.
+    def edges_at(
+        self, transform: PoseFields, is_static: bool
+    ) -> Iterator[tuple[int, dict[str, _Row]]]:
+        """Take a transform; yields stamps (ns) at which the pose is known with it, and the poses
+        x y z qx qy qz qw of the moving edges there.
 
         Raises
         ------
         InputError
-            If a frame is not there, or nothing moves between the two.
+            If it is no pose, its frame has another parent already, or there are too many frames.
         """
-        up, down = self.route(*source)
-        if all(self.edges[frame].is_static for frame in up + down):
-            raise InputError(
-                f"{source} does not move: all of its transforms are static; {self.listing()}"
-            )
-        return up, down
-
-    def trajectory(self, source: TfSource, max_gap_s: float) -> tuple[Trajectory, IntArray, int]:
-        """Poses of the sensor's frame in the world frame, at the stamps of the moving edge with the
-        lowest rate.
-
-        The other moving edges are interpolated there, never extrapolated and never across more than
-        ``max_gap_s``.
-
-        Returns
-        -------
-        Trajectory
-        log_ns : (N,) int64 array
-            Bag time of each pose.
-        n_left_out : int
-            Stamps at which another edge was not known.
-
-        Raises
-        ------
-        InputError
-            If a transform is not a pose.
-        """
-        up, down = self.chain(source)
-        found = {frame: self._edge(frame) for frame in up + down}
-        moving = {frame for frame in found if not self.edges[frame].is_static}
-        slowest = max(moving, key=lambda frame: _interval(found[frame][0]))
-        base, log_ns = found[slowest]
-        known = np.ones(len(base), dtype=bool)
-        for frame in moving - {slowest}:
-            known &= _is_known(found[frame][0].stamps_ns, base.stamps_ns, max_gap_s)
-        base = base[known]
-
-        def at(frame: str) -> FloatArray:
-            edge = base if frame == slowest else found[frame][0]
-            # As tf2 and the node have them; of a single pose it is that.
-            return edge.at(base.stamps_ns, straight=True) if len(edge) > 1 else edge.poses
-
-        Ts_world_sensor = np.broadcast_to(np.eye(4), (len(base), 4, 4))
-        for frame in up:
-            Ts_world_sensor = Ts_world_sensor @ se3.inverse(at(frame))
-        for frame in down:
-            Ts_world_sensor = Ts_world_sensor @ at(frame)
-        trajectory = Trajectory(base.stamps_ns, Ts_world_sensor, *source[::-1])
-        return trajectory, log_ns[known], int((~known).sum())
-
-    def _edge(self, frame: str) -> tuple[Trajectory, IntArray]:
-        """Trajectory and bag times of an edge: of repeated transforms the first counts, of static
-        ones only the last.
-        """
-        kept = self._kept[frame]
-        stamps_ns, rows = np.unique(np.array(kept.stamps_ns), return_index=True)
-        if self.edges[frame].is_static:
-            stamps_ns, rows = np.zeros(1, dtype=np.int64), np.array([-1])
-        poses = np.reshape(kept.values, (-1, 7))[rows]
+        frame, edges = transform.sensor_frame or "", self._tree.edges
+        before = edges[frame].is_static if frame in edges else None
+        row = (*transform.position, *transform.quat_xyzw)
         try:
-            trajectory = Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
+            check_pose(*row)
         except InputError as error:
-            raise InputError(f"transform {self.edges[frame].parent}:{frame}: {error}") from None
-        return trajectory, np.array(kept.log_ns)[rows]
+            raise InputError(f"transform {transform.world_frame}:{frame}: {error}") from None
+        pose = _matrices(row) if is_static else None
+        is_fixed = self._tree.add(transform.world_frame, frame, pose, is_static).is_static
+        if len(edges) > MOST_FRAMES:
+            raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
+        if before != is_fixed:
+            self._find_chain()
+        if frame in self._moving and not is_static:
+            yield from self._move(frame, transform.stamp_ns, row)
+
+    def composed(self, moving: Mapping[str, FloatArray]) -> FloatArray:
+        """Poses of the sensor (..., 4, 4) from those of the moving edges (..., 7)."""
+        T_world_sensor = np.eye(4)
+        for frame in self._up + self._down:
+            T = _matrices(moving[frame]) if frame in moving else self._tree.edges[frame].pose
+            assert T is not None
+            T_world_sensor = T_world_sensor @ (se3.inverse(T) if frame in self._up else T)
+        return T_world_sensor
+
+    def describe_missing(self) -> str:
+        """Why there is no pose yet."""
+        try:
+            up, down = self._tree.route(*self.source)
+        except InputError as error:
+            return str(error)
+        if all(self._tree.edges[frame].is_static for frame in up + down):
+            return f"it does not move: all of its transforms are static; {self._tree.listing()}"
+        return "its transforms do not come at the same times"
+
+    def _find_chain(self) -> None:
+        self._slowest = ""
+        try:
+            self._up, self._down = self._tree.route(*self.source)
+        except InputError:
+            self._up = self._down = []
+        frames = [each for each in self._up + self._down if not self._tree.edges[each].is_static]
+        self._moving = {each: self._moving.get(each, deque(maxlen=_MOST_KEPT)) for each in frames}
+
+    def _move(self, frame: str, stamp_ns: int, row: _Row) -> Iterator[tuple[int, dict[str, _Row]]]:
+        edge = self._moving[frame]
+        if len(self._moving) == 1:  # the usual case, for which nothing has to wait
+            if not edge or edge[-1][0] != stamp_ns:
+                edge.append((stamp_ns, row))
+                yield stamp_ns, {frame: row}
+            return
+        if edge and stamp_ns < edge[-1][0] - _JUMP_BACK_NS:
+            self._slowest = ""
+            for each in self._moving.values():  # their stamps begin anew
+                each.clear()
+        # Of repeated ones the first counts, and late ones are left out.
+        if not edge or stamp_ns > edge[-1][0]:
+            edge.append((stamp_ns, row))
+        if not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
+            self._slowest = max(self._moving, key=lambda name: _interval_ns(self._moving[name]))
+        if not self._slowest:
+            return
+        # The poses at the waiting stamps of the slowest edge that no other edge keeps waiting.
+        base = self._moving[self._slowest]
+        others = {name: each for name, each in self._moving.items() if each is not base}
+        while base and all(each and each[-1][0] >= base[0][0] for each in others.values()):
+            at_ns, row = base.popleft()
+            rows = {name: _at(each, at_ns, self.max_gap_s) for name, each in others.items()}
+            known = {name: each for name, each in rows.items() if each is not None}
+            if len(known) == len(rows):
+                yield at_ns, {self._slowest: row, **known}
 
 
-def _interval(trajectory: Trajectory) -> float:
-    return trajectory.interval_s if len(trajectory) > 1 else np.inf
+def _interval_ns(edge: _MovingEdge) -> float:
+    """Median time between transforms."""
+    return float(np.median(np.diff([stamp_ns for stamp_ns, _ in edge])))
 
 
-def _is_known(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float) -> BoolArray:
-    """Mask of the stamps at which an edge has a transform or lies between two that are not too far
-    apart.
+def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
+    """The pose at a stamp that is not after the last one; None if it is not known. What is asked
+    for next is later.
     """
-    after = np.searchsorted(available_ns, wanted_ns)
-    inside = after < len(available_ns)
-    after = np.minimum(after, len(available_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    gap_ns = available_ns[after] - available_ns[before]
-    is_near = (after > 0) & (gap_ns <= max_gap_s * 1e9)
-    return inside & ((available_ns[after] == wanted_ns) | is_near)
+    while len(edge) > 1 and edge[1][0] <= stamp_ns:
+        edge.popleft()
+    start_ns, row = edge[0]
+    if start_ns == stamp_ns:
+        return row
+    if start_ns > stamp_ns:
+        return None
+    end_ns, end = edge[1]
+    if end_ns - start_ns > max_gap_s * 1e9:
+        return None
+    fraction = np.array([float(stamp_ns - start_ns) / float(end_ns - start_ns)])
+    (T,) = se3.interpolate(_matrices([row]), _matrices([end]), fraction)
+    return *T[:3, 3].tolist(), *se3.to_quat_xyzw(T).tolist()
+
+
+def _matrices(rows: ArrayLike) -> FloatArray:
+    """(..., 4, 4) of x y z qx qy qz qw (..., 7)."""
+    rows = np.asarray(rows)
+    return se3.from_quat_xyzw(rows[..., :3], rows[..., 3:])

@@ -14,11 +14,10 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from hand_eye_calib.config import CalibratorConfig, other_names
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, unpack_stamp_ns
-from hand_eye_calib.io.transforms import PoseFields, TfSource
+from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.live.input import PoseInput, with_stamp
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.tf_stream import TfStream
 from hand_eye_calib.ros.conversions import LISTENING, MESSAGES, from_transform
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
 from hand_eye_calib.text import counted

@@ -215,7 +215,7 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     backwards = hec.read_trajectory(path, tf="lidar:odom")
     assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
     said = (
-        r"transform lidar:rear does not move: all of its transforms are static; it has "
+        r"transform lidar:rear: it does not move: all of its transforms are static; it has "
         r"base:lidar \(static\), base:rear \(static\), map:odom"
     )
     with pytest.raises(InputError, match=said):
@@ -252,9 +252,7 @@ def test_a_gap_in_a_chain_is_not_bridged(tmp_path):
     steady = Trajectory(PARENT.stamps_ns[::2], np.repeat(np.eye(4)[None], 60, axis=0))
     moving = [("base", "odom", holey), ("odom", "map", steady)]
     path = write_messages(tmp_path / "bag", transforms(moving))
-    said = r"transform map:base: 10 of 60 poses were left out, .* not known within 0\.5 s"
-    with pytest.warns(UserWarning, match=said):
-        assert len(hec.read_trajectory(path, tf="map:base")) == 50
+    assert len(hec.read_trajectory(path, tf="map:base")) == 50
 
 
 @pytest.mark.parametrize(

@@ -52,15 +52,6 @@ def test_the_help_of_calibrate_has_every_option_with_its_default():
     assert "OPTIONS" not in text
 
 
-def test_what_is_read_may_be_rows_or_a_table(names):
-    pandas = pytest.importorskip("pandas")
-    rows = np.loadtxt("camera.tum")
-    table = pandas.DataFrame(rows, columns=["t", "x", "y", "z", "qx", "qy", "qz", "qw"])
-    for child in (rows, table):
-        found = hec.calibrate("lidar.tum", child, checks=False)
-        np.testing.assert_allclose(found.T_parent_child, names["result"].T_parent_child, atol=0.005)
-
-
 def test_the_roles_may_be_exchanged(names):
     there = names["result"]
     back = hec.calibrate("camera.tum", "lidar.tum")

@@ -105,9 +105,9 @@ class TestBag:
         with pytest.raises(InputError, match="no frame 'radar' in the bag's transforms"):
             read_installed(str(bag), "lidar", "radar")
 
-    def test_a_transform_that_is_none_is_an_error_in_one_line(self, tmp_path):
+    def test_a_transform_that_is_none_is_left_out(self, tmp_path):
         T = np.eye(4)
         T[0, 3] = np.nan
         bag = self.bag(tmp_path, ("base", "lidar", T))
-        with pytest.raises(InputError, match="not finite"):
+        with pytest.raises(InputError, match="no frame 'base'"):
             read_installed(str(bag), "base", "lidar")

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import Counter
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from itertools import chain, pairwise
 from operator import itemgetter
@@ -36,7 +36,7 @@ from hand_eye_calib.io.bags.messages import (
 from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, are_believable
 from hand_eye_calib.io.bags.storage import BLOCK_SIZE, message_blocks, open_bags
 from hand_eye_calib.io.bags.topics import Source, Topics, joined_parts
-from hand_eye_calib.io.transforms import PoseFields, TfSource, TransformTree
+from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 
 T = TypeVar("T")
 
@@ -358,55 +358,55 @@ class PoseBag:
 
     def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
         """A PoseBlock for each stream whose poses come from the transform tree."""
-        tree = self._tree()
-        chains = [side for source in sources.values() for side in tree.chain(source)]
-        for transform, is_static, bag_ns in self._transforms(set(chain.from_iterable(chains))):
-            tree.keep(transform, is_static, bag_ns)
-        found = []
-        for stream, source in sources.items():
-            trajectory, log_ns, n_left_out = tree.trajectory(source, max_gap_s)
-            if n_left_out:
-                self._notes.append(
-                    f"{source}: {n_left_out} of {n_left_out + len(trajectory)} poses were left "
-                    "out, because another transform of the chain was not known within "
-                    f"{max_gap_s:g} s"
-                )
-            poses = np.c_[trajectory.poses[:, :3, 3], se3.to_quat_xyzw(trajectory.poses)]
-            columns = PoseColumns.of_frames(trajectory.stamps_ns, poses, *source)
-            found.append(self._whole(stream, columns, log_ns))
-        return found
+        tree, blocks = self.static_frames(), []
+        streams = {name: TfStream(source, max_gap_s, tree) for name, source in sources.items()}
+        found: dict[str, list[Any]] = {name: [] for name in streams}
+        for source in sources.values():
+            tree.route(*source)
+        for transform, is_static, bag_ns in self._transforms():
+            for name, stream in streams.items() if not is_static else ():
+                found[name] += ((bag_ns, *each) for each in stream.edges_at(transform, False))
+        for name, stream in streams.items():
+            if not found[name]:
+                raise InputError(f"{sources[name]}: {stream.describe_missing()}")
+            bag_times_ns, stamps_ns, rows = zip(*found[name], strict=True)
+            Ts = stream.composed(
+                {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
+            )
+            values = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
+            columns = PoseColumns.of_frames(np.array(stamps_ns), values, *sources[name])
+            blocks.append(self._whole(name, columns, bag_times_ns))
+        return blocks
 
     def static_frames(self) -> FrameTree:
-        """The frames of the bag and their static transforms; of repeated ones the last.
+        """The frames of the bag and their static transforms; of repeated ones the last. As in tf2,
+        one that is no pose is left out.
 
         Raises
         ------
         InputError
             If the transforms form no tree or are damaged.
         """
-        tree = self._tree()
-        for frame, last in tree.static.items():
-            if tree.edges[frame].is_static:
-                tree.edges[frame].pose = checked_pose(last.position, last.quat_xyzw)
-        return tree
-
-    def _tree(self) -> TransformTree:
-        """All edges without the poses of those that move."""
-        tree = TransformTree()
+        tree, notes = FrameTree("the bag's transforms"), {}
         for transform, is_static, _ in self._transforms():
-            tree.note(transform, is_static)
+            parent, frame, pose = transform.world_frame, transform.sensor_frame or "", None
+            if is_static:
+                try:
+                    pose = checked_pose(transform.position, transform.quat_xyzw)
+                except InputError as error:
+                    notes[frame] = f"transform {parent}:{frame} was left out: {error}"
+                    continue
+            tree.add(parent, frame, pose, is_static)
+        self._notes += notes.values()
         return tree
 
-    def _transforms(
-        self, frames: Container[str] | None = None
-    ) -> Iterator[tuple[PoseFields, bool, int]]:
-        """Transforms, whether each is static, and its bag time; of some frames, or of all."""
+    def _transforms(self) -> Iterator[tuple[PoseFields, bool, int]]:
+        """Transforms, whether each is static, and its bag time."""
         messages = self._messages(self._of_transforms())
         unpacked = _decoded(messages, lambda kind, data: unpack_transforms(data, _is_ros1(kind)))
         for kind, bag_ns, transforms in unpacked:
             for transform in transforms:
-                if frames is None or transform.sensor_frame in frames:
-                    yield transform, kind.topic.endswith("tf_static"), bag_ns
+                yield transform, kind.topic.endswith("tf_static"), bag_ns
 
     # ---- messages
 
