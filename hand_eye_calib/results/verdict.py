@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.results.finding import Severity
@@ -208,7 +208,7 @@ def _contradicted(result: Result) -> Iterator[_Found]:
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
-    if len(_unobservable(result)) == _n_within_reach(result):
+    if all(axis.is_hidden for axis in _axes(result)):
         text = "nothing about the mounting can be determined from this motion"
         yield text, "record motion with rotations about all axes", (), {}
 
@@ -263,8 +263,8 @@ def _far(result: Result, kind: str) -> dict[str, float]:
 
 
 def _hidden(result: Result) -> Iterator[_Found]:
-    axes = _unobservable(result)
-    if axes and len(axes) < _n_within_reach(result):
+    axes = tuple(axis.name for axis in _axes(result) if axis.is_hidden)
+    if 0 < len(axes) < len(_axes(result)):
         priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
         it = "it" if len(axes) == 1 else "them"
         text = f"{axes_in_words(axes)} cannot be determined from this motion"
@@ -280,36 +280,31 @@ def _few_inliers(result: Result) -> Iterator[_Found]:
 
 
 def _worse_than_target(result: Result) -> Iterator[_Found]:
-    rough = [
-        dof
-        for dof in result.observability
-        if math.isfinite(dof.sigma) and dof.sigma > target_of(dof.name, result)
-    ]
+    rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
     if rough:
-        names = [dof.name for dof in result.observability]
-        total = dict(zip(names, result.sigmas_with_floor.tolist(), strict=True))
-        told = listing([f"{dof.name} {amount(dof.name, total[dof.name])}" for dof in rough])
-        targets = {amount(dof.name, target_of(dof.name, result)): None for dof in rough}
-        text = f"standard deviations above the target of {listing(list(targets))}: {told}"
-        axes = tuple(dof.name for dof in rough)
-        yield text, f"record longer, with {_motion_for(axes)}", axes, {}
+        told = listing([f"{axis.name} {amount(axis.name, axis.total)}" for axis in rough])
+        names = tuple(axis.name for axis in rough)
+        text = f"standard deviations above the target of {_targets_of(rough)}: {told}"
+        more = "more rotation about other axes" if {*names} & {*TRANSLATIONS} else "more rotation"
+        yield text, f"record longer, with {more}", names, {}
 
 
 def _floor(result: Result) -> Iterator[_Found]:
-    rough = {}
-    for dof, floor in zip(result.observability, result.sigmas_of_floor, strict=True):
-        target = target_of(dof.name, result)
-        if dof.sigma <= target < (total := math.hypot(dof.sigma, float(floor))):
-            rough[dof.name] = total
+    rough = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
     if rough:
-        told = [f"{axes_in_words([axis])} to {amount(axis, far)}" for axis, far in rough.items()]
-        targets = dict.fromkeys(amount(axis, target_of(axis, result)) for axis in rough)
+        told = [
+            f"{axes_in_words([each.name])} to {amount(each.name, each.total)}" for each in rough
+        ]
         text = (
             "constant odometry errors, which no recording can show, limit the knowledge of "
-            f"{listing(told)}: more than the target of {listing(list(targets))}"
+            f"{listing(told)}: more than the target of {_targets_of(rough)}"
         )
         advice = "compare several recordings; give parent_kind or child_kind exact if one is"
-        yield text, advice, tuple(rough), {}
+        yield text, advice, tuple(axis.name for axis in rough), {}
+
+
+def _targets_of(axes: "Sequence[_Axis]") -> str:
+    return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
 
 
 _OF_RECORDINGS = {
@@ -331,46 +326,43 @@ def _recordings(*kinds: str) -> Callable[[Result], Iterator[_Found]]:
     return find
 
 
-def _unobservable(result: Result) -> tuple[str, ...]:
-    """Axes that this motion does not determine, of those that the streams can determine."""
-    return tuple(
-        dof.name
-        for dof in result.observability
-        if dof.verdict is DofVerdict.UNOBSERVABLE and dof.name not in result.out_of_reach
-    )
+class _Axis(NamedTuple):
+    """An axis within reach of the streams, its standard deviation without and with the floor."""
+
+    name: str
+    sigma: float
+    total: float
+    target: float
+    is_hidden: bool
 
 
-def _n_within_reach(result: Result) -> int:
-    return len(result.observability) - len(result.out_of_reach)
-
-
-def _motion_for(axes: Sequence[str]) -> str:
-    return "more rotation about other axes" if set(axes) & {*TRANSLATIONS} else "more rotation"
+def _axes(result: Result) -> list[_Axis]:
+    return [
+        _Axis(
+            dof.name,
+            dof.sigma,
+            total,
+            target_of(dof.name, result),
+            dof.verdict is DofVerdict.UNOBSERVABLE,
+        )
+        for dof, total in zip(result.observability, result.sigmas_with_floor.tolist(), strict=True)
+        if dof.name not in result.out_of_reach
+    ]
 
 
 def _known(result: Result) -> str:
     """The largest standard deviations of a translation and of a rotation, with the floor."""
-    texts = []
-    names_of_axes = [dof.name for dof in result.observability]
-    total = dict(zip(names_of_axes, result.sigmas_with_floor.tolist(), strict=True))
+    axes, texts = _axes(result), []
     for names in (TRANSLATIONS, ROTATIONS):
-        known = [
-            dof
-            for dof in result.observability
-            if dof.name in names and dof.name not in result.out_of_reach
-        ]
-        if known:
-            worst = max(known, key=lambda dof: total[dof.name])
-            texts.append(amount(worst.name, total[worst.name]))
-    if result.out_of_reach:
-        known_axes = [
-            dof.name for dof in result.observability if dof.name not in result.out_of_reach
-        ]
-        return (
-            f"{listing(known_axes)} are known to {listing(texts)} or better, one standard "
-            f"deviation; {listing(result.out_of_reach)} are out of reach of these streams"
-        )
-    return f"all six axes are known to {texts[0]} and {texts[1]} or better, one standard deviation"
+        if known := [axis for axis in axes if axis.name in names]:
+            worst = max(known, key=lambda axis: axis.total)
+            texts.append(amount(worst.name, worst.total))
+    if not result.out_of_reach:
+        return f"all six axes are known to {listing(texts)} or better, one standard deviation"
+    return (
+        f"{listing([axis.name for axis in axes])} are known to {listing(texts)} or better, one "
+        f"standard deviation; {listing(result.out_of_reach)} are out of reach of these streams"
+    )
 
 
 def _condition(kind: str) -> str:
