@@ -347,9 +347,8 @@ class TestMessages:
 
     def test_a_latitude_beyond_the_pole_is_refused_and_named(self):
         reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
-        with pytest.raises(InputError, match="latitude 139.7 and longitude 25.*swapped") as caught:
+        with pytest.raises(InputError, match="latitude 139.7 and longitude 25.*swapped"):
             reader.columns([fix(0), fix(0, latitude=139.7)], is_ros1=False)
-        assert caught.value.index == 1
         read = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
         with pytest.raises(InputError, match="^found latitude 139.7"):
             read(fix(0, latitude=139.7))

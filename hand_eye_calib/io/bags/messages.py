@@ -351,7 +351,7 @@ class MessageReader:
         MalformedMessage
             At the first that cannot be unpacked.
         InputError
-            At the first latitude beyond 90 deg; its attribute ``index`` has the row.
+            At a latitude beyond 90 deg.
         """
         columns = unpack_poses(messages, self._row.name, is_ros1)
         if self._are_poses:
@@ -376,11 +376,9 @@ class MessageReader:
             return self._rates.quats_xyzw(stamps_ns[rows], values[rows])
         if self._row.unpack is not _fix:
             return values[rows]
-        beyond = np.flatnonzero(rows & (np.abs(values[:, 0]) > POLE_DEG))
+        beyond = values[np.abs(values[:, 0]) > POLE_DEG]
         if len(beyond):
-            error = InputError(wrong_latitude(*values[beyond[0], :2]))
-            error.index = int(beyond[0])  # type: ignore[attr-defined]
-            raise error
+            raise InputError(wrong_latitude(*beyond[0, :2]))
         lat, lon = np.radians(values[rows, :2]).T
         return self._origin.local(lat, lon, values[rows, 2])
 

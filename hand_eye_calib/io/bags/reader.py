@@ -246,8 +246,7 @@ class PoseBag:
                 except MalformedMessage as error:
                     raise _unreadable(kind, numbers[error.index], error) from error
                 except InputError as error:
-                    number = numbers[getattr(error, "index", 0)]
-                    raise InputError(f"{name}, message {number}: {error}") from None
+                    raise InputError(f"{name}: {error}") from None
                 is_right = are_believable(columns.stamps_ns, bag_ns)
                 self._n_wrong_stamps[name] += int((~is_right).sum())
                 poses = PoseBlock.of_columns(streams[name], numbers, columns, bag_ns)

@@ -40,18 +40,8 @@ _PIECE_BYTES = 1 << 20
 
 
 class Storage:
-    """A storage file opened for reading.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Its name, for a person.
-    file : pathlib.Path
-        Where it is, unpacked.
-    memory : ReadingMemory
-        Of the whole bag.
-    bag : int
-        Number of the bag, of those that are read together.
+    """A storage file opened for reading: ``path`` is its name for a person, ``file`` where it is,
+    unpacked, ``memory`` that of all that are read together, and ``bag`` the number of its bag.
 
     Attributes
     ----------

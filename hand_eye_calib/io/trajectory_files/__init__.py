@@ -22,7 +22,6 @@ are recognised from their size. The order of a quaternion's coefficients is the 
 named. Only with ``auto`` is it judged by the motion, and what was found is said.
 """
 
-from hand_eye_calib.config import TRAJECTORY_FORMATS as FORMATS
 from hand_eye_calib.io.trajectory_files.reading import (
     FileReading,
     read_trajectory,
@@ -34,7 +33,6 @@ from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 __all__ = [
     "AUTO",
-    "FORMATS",
     "FileOptions",
     "FileReading",
     "read_trajectory",
