@@ -97,8 +97,6 @@ def recovered_messages(path: Path, bag: int, lose: Callable[[str], None]) -> Ite
     """
     try:
         from mcap import records as mcap
-        from mcap.data_stream import ReadDataStream
-        from mcap.opcode import Opcode
         from mcap.stream_reader import StreamReader, get_chunk_data_stream
     except ImportError as error:
         raise MissingDependencyError(
@@ -142,12 +140,20 @@ def recovered_messages(path: Path, bag: int, lose: Callable[[str], None]) -> Ite
                 f"({reason_of(error)}), what came later is lost"
             )
             file.seek(position)
-            if file.read(1) == bytes([Opcode.CHUNK]):  # of one cut off, the first messages
-                file.seek(8, 1)
-                chunk = mcap.Chunk.read(ReadDataStream(file))
-                is_cut = file.read(1) == b""
-                if is_cut and not chunk.compression:
-                    yield from inside(chunk, is_whole=False)
+            chunk = _chunk_cut_off(file)
+            if chunk is not None and not chunk.compression:  # its first messages
+                yield from inside(chunk, is_whole=False)
+
+
+def _chunk_cut_off(file: BinaryIO) -> Any:
+    """The chunk at the end of a file; None if there is something else."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.opcode import Opcode
+    from mcap.records import Chunk
+
+    opcode = file.read(_RECORD.size)[:1]
+    chunk = Chunk.read(ReadDataStream(file)) if opcode == bytes([Opcode.CHUNK]) else None
+    return chunk if file.read(1) == b"" else None
 
 
 def reason_of(error: BaseException) -> str:

@@ -196,12 +196,7 @@ class PoseBag:
         max_gap_s : float
             Longest time that is interpolated between two transforms of a chain.
         measures : mapping, optional
-            "parent" and "child" to what their topics are read as, if that is not what their types
-            are for; see :meth:`measured`.
-
-        Yields
-        ------
-        PoseBlock
+            "parent" and "child" to what their topics are read as, see :meth:`measured`.
 
         Raises
         ------

@@ -6,7 +6,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.arrays import IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -48,28 +48,8 @@ def trajectory_from_object(
         if times is not None or stamp_unit:
             raise ConfigError("a Trajectory has stamps and poses already: give no other option")
         return source, []
-    names = [*_POSE] if times is not None else ["t", *_POSE]
-    if hasattr(source, "columns"):
-        cells = {str(key): np.asarray(source[key]) for key in source.columns}
-        if missing := {*names} - cells.keys():
-            raise InputError(
-                f"expected {_KINDS}; the columns lack {', '.join(sorted(missing))} of "
-                f"{', '.join(names)}; give the stamps with `times` if they are elsewhere"
-            )
-        values = np.stack([cells[name] for name in _POSE], axis=1).astype(float)
-        times = cells["t"] if times is None else times
-    else:
-        try:
-            values = np.asarray(source, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
-        is_of_rows = values.ndim == 2 and values.shape[1] == len(names)
-        if not is_of_rows and values.shape[1:] != (4, 4):
-            raise InputError(
-                f"expected {_KINDS}: rows are of {', '.join(names)}; found an array {values.shape}"
-            )
-        if is_of_rows and times is None:
-            times, values = values[:, 0], values[:, 1:]
+    values, own_times = _numbers(source, ["t", *_POSE] if times is None else [*_POSE])
+    times = own_times if times is None else times
     if times is None:
         raise InputError("the poses have no stamps: give them with `times`, in seconds")
     stamps_ns, notes = to_nanoseconds(times, stamp_unit), list[str]()
@@ -86,6 +66,31 @@ def trajectory_from_object(
     if values.ndim == 3:
         return Trajectory(stamps_ns, values), notes
     return Trajectory.from_quat_xyzw(stamps_ns, values[:, :3], values[:, 3:]), notes
+
+
+def _numbers(source: Any, names: list[str]) -> tuple[FloatArray, Any]:
+    """Matrices (N, 4, 4), or rows (N, 7) of position and quaternion, and the stamps that stand
+    beside them in a column t.
+    """
+    if hasattr(source, "columns"):
+        cells = {str(key): np.asarray(source[key]) for key in source.columns}
+        if missing := {*names} - cells.keys():
+            raise InputError(
+                f"expected {_KINDS}; the columns lack {', '.join(sorted(missing))} of "
+                f"{', '.join(names)}; give the stamps with `times` if they are elsewhere"
+            )
+        return np.stack([cells[name] for name in _POSE], axis=1).astype(float), cells.get("t")
+    try:
+        values = np.asarray(source, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
+    if values.ndim == 2 and values.shape[1] == len(names):
+        return values[:, -len(_POSE) :], values[:, 0] if "t" in names else None
+    if values.shape[1:] != (4, 4):
+        raise InputError(
+            f"expected {_KINDS}: rows are of {', '.join(names)}; found an array {values.shape}"
+        )
+    return values, None
 
 
 def to_nanoseconds(times: Any, stamp_unit: str | None = None) -> IntArray:

@@ -340,17 +340,21 @@ def read_table(path: _Path, options: FileOptions) -> Table:
         table = _read_csv(path, lines, columns, options)
     elif format == "kitti":
         table = _read_kitti(path, lines, times)
-    elif format == "euroc":
+    else:
+        table = _read_poses(path, lines, format, is_named)
+    table.guesses[:0] = guesses
+    return table
+
+
+def _read_poses(path: _Path, lines: Lines, format: str, is_named: bool) -> Table:
+    """A stamp, a position and a quaternion, in the order of tum or of euroc."""
+    if format == "euroc":
         expected = "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz"
         places = Columns.in_order(*POSITION, "qw", "qx", "qy", "qz", stamp_unit="ns")
         table = Table(path, expected, places)
-        table.fill(lines.data(), lambda text: [*map(str.strip, text.split(","))], 8, True)
-    else:
-        places = Columns.in_order(*POSITION, *(QUATERNION if is_named else UNNAMED))
-        table = Table(path, f"8 numbers, {TUM_COLUMNS}", places)
-        table.fill(lines.data(), str.split, 8)
-    table.guesses[:0] = guesses
-    return table
+        return table.fill(lines.data(), lambda text: [*map(str.strip, text.split(","))], 8, True)
+    places = Columns.in_order(*POSITION, *(QUATERNION if is_named else UNNAMED))
+    return Table(path, f"8 numbers, {TUM_COLUMNS}", places).fill(lines.data(), str.split, 8)
 
 
 def _read_kitti(path: _Path, lines: Lines, times: _Path | None) -> Table:
