@@ -6,7 +6,7 @@ import fcntl
 import os
 import queue
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from hand_eye_calib.io.journal import (
     has_session,
     keep_aside,
 )
+from hand_eye_calib.live.log import NodeLog
 
 # How often what came in is handed to the disk: what a crash can cost.
 FLUSH_PERIOD_S = 0.25
@@ -108,6 +109,8 @@ class SessionJournal:
     directory : path
     about : callable
         Gives what is known of each stream: options, topic, frame, origin.
+    log : NodeLog
+        Written to from that thread, too.
     resumed : Journal, optional
         The session in the directory goes on; otherwise it is kept aside.
 
@@ -123,12 +126,15 @@ class SessionJournal:
     """
 
     def __init__(
-        self, directory: Path, about: Callable[[], About], resumed: Journal | None = None
+        self,
+        directory: Path,
+        about: Callable[[], About],
+        log: NodeLog,
+        resumed: Journal | None = None,
     ) -> None:
-        self.directory, self.error = directory, ""
+        self.directory, self.error, self._log = directory, "", log
         self._lock = DirectoryLock(directory.parent)
         self._make_about, self._about = about, about()
-        self._notes: queue.SimpleQueue[tuple[bool, str]] = queue.SimpleQueue()
         self._events: list[_Event] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
@@ -158,11 +164,6 @@ class SessionJournal:
         self._jobs.put(self._close)
         self._jobs.put(partial(self._open, self._about))
 
-    def notes(self) -> Iterator[tuple[bool, str]]:
-        """Lines for the log since the last call, each with whether it is a warning."""
-        while not self._notes.empty():
-            yield self._notes.get()
-
     def stop(self, timeout_s: float) -> None:
         """Write what is left and end the thread, unless the disk keeps it busy."""
         self.flush()
@@ -174,8 +175,10 @@ class SessionJournal:
     def _give_up(self, reason: str) -> None:
         """Leave the files as they are."""
         self.error = reason
-        text = f"cannot write the session journal in {self.directory}: {reason}; going on without "
-        self._notes.put((True, f"{text}it until ~/reset: a crash would lose this session"))
+        self._log.warning(
+            f"cannot write the session journal in {self.directory}: {reason}; going on without it "
+            "until ~/reset: a crash would lose this session"
+        )
 
     # ------------------------------------------------------------ in the thread
 
@@ -195,12 +198,11 @@ class SessionJournal:
                 what = "a session that cannot be read"
                 if poses is not None:
                     what = f"the session before this one ({poses} poses)"
-                text = (
+                self._log.info(
                     f"{what} is kept in {keep_aside(self.directory)}; to go on with it, stop the "
                     f"node, rename that folder to {self.directory.name} and start with the "
                     "parameter journal at resume"
                 )
-                self._notes.put((False, text))
         self._writer = JournalWriter(self.directory, about, resumed=resumed)
 
     def _write(self, events: list[_Event], about: About) -> None:

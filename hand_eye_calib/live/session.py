@@ -157,19 +157,17 @@ class LiveSession:
         if options.output_directory and options.journal != "off" and not options.monitor:
             directory = output_path(options.output_directory) / "journal"
             resumed = self._resume(directory) if is_resuming else None
-            self._journal = SessionJournal(directory, self._about, resumed)
+            self._journal = SessionJournal(directory, self._about, self._log, resumed)
 
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
         if self._journal is not None:
             self._journal.flush()
-            self._log_notes(self._journal)
 
     def stop_journal(self) -> None:
         """Write what is left, and leave the directory to others."""
         if self._journal is not None:
             self._journal.stop(_GRACE_S)
-            self._log_notes(self._journal)
             self._journal = None
 
     def journal_state(self, options: NodeConfig) -> JournalState:
@@ -219,10 +217,6 @@ class LiveSession:
             known = {name: each for name, each in known.items() if each}
             about[stream] = {"topic": self.topics.get(stream, ""), **of_all, **known}
         return about
-
-    def _log_notes(self, journal: SessionJournal) -> None:
-        for is_warning, text in journal.notes():
-            (self._log.warning if is_warning else self._log.info)(text)
 
 
 def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
