@@ -28,19 +28,9 @@ _FOUND_BY_SOLVE_S = 0.25
 
 
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
-    """Check the streams of a snapshot.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-    calibration : Calibration, optional
-        Result from them. Its time offset and scale count as known; without one, those of the
-        options, if they are given in numbers.
-
-    Returns
-    -------
-    CheckResult
-        Of streams that are no poses, their sampling, and what the solve itself found.
+    """Check the streams of a snapshot; of streams that are no poses, their sampling, and what the
+    solve itself found. Time offset and scale of the result from them count as known; without one,
+    those of the options, if they are given in numbers.
     """
     if snapshot.config.measured != "poses":
         return CheckResult(gravest_first(_check_parts(snapshot, calibration)))

@@ -185,9 +185,9 @@ def solve_poses(
     config : CalibratorConfig
         With a time offset in seconds, which the poses already have.
     time_offset : TimeOffset, optional
-        The offset that the poses already have, if it was estimated.
+        That offset, if it was estimated.
     is_beside : bool
-        It is only to be compared with a result.
+        The answer is only to be compared with a result.
 
     Raises
     ------

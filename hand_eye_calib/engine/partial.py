@@ -88,19 +88,9 @@ def _calibration(
 
 
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
-    """Solve and assess synchronised poses and positions.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-        On one clock. Of the sensor that measures positions, orientations are not looked at.
-    config : CalibratorConfig
-        With a time offset in seconds, which the poses already have.
-
-    Returns
-    -------
-    Calibration
-        Without frame names. Its rotation is the identity, and unknown.
+    """Solve and assess synchronised poses and positions, on one clock: a result without frame names
+    whose rotation is the identity, and unknown. Of the sensor that measures positions, orientations
+    are not looked at. The poses already have the time offset of the options, in seconds.
     """
     stamps_ns, is_child = pose_pairs.stamps_ns, config.child_measures == "positions"
     given = 1.0 if isinstance(config.scale, str) else config.scale
@@ -234,24 +224,9 @@ def _of_path(
 
 
 def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
-    """Solve and assess synchronised rotations.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-        On one clock. Positions are not looked at.
-    config : CalibratorConfig
-        With a time offset in seconds, which the poses already have.
-
-    Returns
-    -------
-    Calibration
-        Without frame names. Its translation is zero and unknown.
-
-    Raises
-    ------
-    ConfigError
-        If a scale is given or to be estimated: rotations have none.
+    """Solve and assess synchronised rotations, on one clock: a result without frame names whose
+    translation is zero, and unknown. Positions are not looked at. The poses already have the time
+    offset of the options, in seconds; a scale there is a ConfigError, as rotations have none.
     """
     if config.scale not in ("none", "auto"):
         config.require_poses(f"scale {config.scale}")

@@ -135,19 +135,10 @@ def review(
     *,
     may_solve: bool = True,
 ) -> Run:
-    """Check the streams of a result. If a check is certain of the time offset or of the scale, and
-    the user did not set it, solve once more with it, and keep that if there is less to say against
+    """Check the streams of a result, from the poses and options that gave it. If a check is certain
+    of the time offset or of the scale, and neither the user nor an earlier check has ``settled``
+    it, solve once more with it if that is allowed, and keep that if there is less to say against
     it.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    snapshot : Snapshot
-        The poses and options that gave it.
-    settled : collection of str
-        Options that an earlier check has set.
-    may_solve : bool
-        False: nothing is solved again.
     """
     first = _checked(calibration, snapshot)
     if not may_solve:

@@ -90,12 +90,8 @@ class Snapshot:
 
     def resolved(self) -> "Snapshot":
         """The snapshot with its time offset in seconds, estimated if the options ask for that: from
-        the buffered poses, unless pairs were made with an estimate before.
-
-        Raises
-        ------
-        NotEnoughDataError
-            If the offset cannot be estimated.
+        the buffered poses, unless pairs were made with an estimate before. NotEnoughDataError if it
+        cannot be estimated.
         """
         return self._resolved
 
@@ -122,12 +118,8 @@ class Snapshot:
         return max(self.config.max_gap, GAP_INTERVALS * self.streams[0].interval_s)
 
     def pose_pairs(self) -> PosePairs:
-        """Synchronised pose pairs: the kept ones, and those of the buffered poses.
-
-        Raises
-        ------
-        NotEnoughDataError
-            If the time offset cannot be estimated.
+        """Synchronised pose pairs: the kept ones, and those of the buffered poses; errors as of
+        :meth:`resolved`.
         """
         return self.resolved()._pose_pairs
 
@@ -151,10 +143,6 @@ class Snapshot:
         cross_check : bool, optional
             Whether to compare the result with other references and with both halves; by default
             unless the user set the reference.
-
-        Returns
-        -------
-        Calibration
 
         Raises
         ------
@@ -273,13 +261,7 @@ def name_frames(
     config: CalibratorConfig, known: Mapping[str, str]
 ) -> tuple[str, str, tuple[str, ...]]:
     """Names of the parent's and the child's sensor frame, and a warning for each without a name.
-
-    Parameters
-    ----------
-    config : CalibratorConfig
-        Its names override those of the streams.
-    known : mapping
-        "parent" and "child" to the name that the stream gives; empty if it gives none.
+    Those of the options override those that the streams give, which are empty if unknown.
     """
     parent, child = (getattr(config, f"{stream}_frame") or known[stream] for stream in STREAMS)
     warnings = tuple(

@@ -1,7 +1,6 @@
 """From stops of an arm to a calibration: ``A X = Z B`` solved, judged, and named by its frames."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,26 +18,10 @@ from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
 _CLEARLY = 3.0
 
 
-@dataclass(frozen=True)
-class StopFrames:
-    """Names of the frames: X is of ``child`` in ``parent``, Z of ``child_world`` in
-    ``parent_world``.
-    """
-
-    parent: str = "parent"
-    child: str = "child"
-    parent_world: str = "parent_world"
-    child_world: str = "child_world"
-
-
-_UNNAMED = StopFrames()
-
-
 def calibrate_stops(
     Ts_world_parent: FloatArray,
     Ts_world_child: FloatArray,
     config: CalibratorConfig | None = None,
-    frames: StopFrames = _UNNAMED,
 ) -> Calibration:
     """Solve and assess stops, which are poses without an order.
 
@@ -49,7 +32,6 @@ def calibrate_stops(
         camera in the hand in the frame of a target.
     config : CalibratorConfig, optional
         Its priors, targets and names of frames count.
-    frames : StopFrames, optional
 
     Returns
     -------
@@ -72,6 +54,7 @@ def calibrate_stops(
     other = solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
     is_smaller = max(other.level_m / fit.level_m, other.level_rad / fit.level_rad) < 1.0 / _CLEARLY
     findings = [finding("inverse", "child")] if is_smaller and other.converged else []
+    frames = "parent", "child", "parent_world", "child_world"
     return _assessed(fit, Ts_world_parent, Ts_world_child, config, frames, findings)
 
 
@@ -114,7 +97,7 @@ def calibrate_arm(
         for poses, parent, world in ((robot, "hand", "base"), (se3.inverse(robot), "base", "hand"))
     ]
     fit, poses, parent, world = max(fits, key=lambda each: each[0].log_likelihood)
-    frames = StopFrames(named[parent], named["camera"], named[world], named["target"])
+    frames = named[parent], named["camera"], named[world], named["target"]
     return _assessed(fit, poses, Ts_target_camera, config or CalibratorConfig(), frames, [])
 
 
@@ -123,10 +106,11 @@ def _assessed(
     Ts_world_parent: FloatArray,
     Ts_world_child: FloatArray,
     config: CalibratorConfig,
-    frames: StopFrames,
+    frames: tuple[str, str, str, str],
     findings: list[Finding],
 ) -> Calibration:
     X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
+    parent, child, parent_world, child_world = frames
     fused = fuse(X, combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
     errors = se3.log(se3.inverse(Z @ Ts_world_child) @ Ts_world_parent @ X)
     rows = np.arange(len(errors))
@@ -149,11 +133,11 @@ def _assessed(
         backend="fast",
         n_poses=len(residuals),
         findings=tuple(findings),
-        parent_frame=config.parent_frame or frames.parent,
-        child_frame=config.child_frame or frames.child,
+        parent_frame=config.parent_frame or parent,
+        child_frame=config.child_frame or child,
         T_world_world=Z,
         cov_world_world=fit.covariance[6:, 6:],
-        parent_world_frame=frames.parent_world,
-        child_world_frame=frames.child_world,
+        parent_world_frame=parent_world,
+        child_world_frame=child_world,
         warnings=tuple(fused.warnings),
     )

@@ -57,10 +57,8 @@ class PosePairs:
 
 
 def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
-    """Choose the stream at whose stamps to pair: "parent" or "child".
-
-    The slower one; the child if both are about equally fast. The typical interval is the median, so
-    that a gap or a late start does not make a stream slow.
+    """The stream at whose stamps to pair, "parent" or "child": the slower one by the median
+    interval; the child if both are about equally fast.
     """
     if len(parent_stamps_ns) < 2 or len(child_stamps_ns) < 2:
         return "child"
@@ -122,17 +120,8 @@ def select_keyframes(
     sensor has since moved ``min_translation`` or rotated by ``min_rotation``. A threshold of zero
     switches that criterion off.
 
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-    min_translation, min_rotation, min_interval_s : float
-        In m, rad and s.
-    previous : PosePairs, optional
-        The last one kept before these, of length 1 (0 for none).
-
-    Returns
-    -------
-    (M,) int array
+    Thresholds are in m, rad and s; ``previous`` is the last one kept before these, of length 1 (0
+    for none).
     """
     n_poses = len(pose_pairs)
     if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:

@@ -116,12 +116,7 @@ class RigCalibration:
         return replace(found, calibrations=calibrations)
 
     def __repr__(self) -> str:
-        lines = [
-            f" {each.child_frame}: {each.headline}, translation "
-            f"{each.T_parent_child[:3, 3].round(4).tolist()}"
-            for each in self.calibrations
-        ]
-        return "\n".join([f"<RigCalibration in {self.sensors[0]}", *lines]) + ">"
+        return "\n".join(self.tree())
 
     @property
     def verdict(self) -> Verdict:

@@ -83,7 +83,6 @@ def compare(
     results: Sequence[Calibration | Extrinsic],
     installed: Calibration | Extrinsic | None = None,
     names: Sequence[str] | None = None,
-    targets: Sequence[float] | None = None,
 ) -> Comparison:
     """Compare results with what is installed, or with each other.
 
@@ -95,8 +94,6 @@ def compare(
         compared: which one has moved?
     names : sequence of str, optional
         What to call the results; numbered by default.
-    targets : (6,) sequence of float, optional
-        Accuracy that matters along (m) and about (rad) each axis; by default that of the results.
 
     Returns
     -------
@@ -118,8 +115,7 @@ def compare(
     calibrations = [each for each in results if isinstance(each, Calibration)]
     given = [installed] if isinstance(installed, Calibration) else []
     require_same_frames([*calibrations, *given])
-    if targets is None:
-        targets = [target_of(axis, each) for each in calibrations[:1] for axis in AXES]
+    targets = [target_of(axis, each) for each in calibrations[:1] for axis in AXES]
     limits = _TARGETS * np.array(targets or CalibratorConfig().targets)
     stated = [_stated(result, name) for result, name in zip(results, called, strict=True)]
     if len(stated) < (2 if installed is None else 1):

@@ -1,12 +1,9 @@
 """Several recordings: of one rig, for one result together, or of many, for a row each."""
 
 import math
-import multiprocessing
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +30,6 @@ TAKEN = (
     *("method", "reference", "n_poses", "n_pairs", "n_inliers"),
     *("time_offset_s", "time_offset_sigma_s", "scale", "scale_sigma"),
 )
-_LENGTHS, _ANGLES = AXES[:3], AXES[3:]
 
 
 def calibrate_together(
@@ -75,9 +71,9 @@ def calibrate_together(
     2
     """
     results: dict[str, Calibration] = {}
-    for name, (parent, child) in zip(_named(names), recordings, strict=False):
+    for name, pair in zip(_named(names), recordings, strict=False):
         try:
-            results[name] = calibrate(parent, child, **options)
+            results[name] = calibrate(*pair, **options)
         except HandEyeCalibError as error:
             raise type(error)(f"{name}: {error}") from None
     return together(results)
@@ -86,18 +82,14 @@ def calibrate_together(
 def calibrate_many(
     recordings: Iterable[tuple[Trajectory, Trajectory]],
     names: Sequence[str] | None = None,
-    *,
-    jobs: int = 1,
     **options: Any,
 ) -> "pd.DataFrame":
-    """Calibrate many recordings, each by itself.
+    """Calibrate many recordings, each by itself, one after the other.
 
     Parameters
     ----------
     recordings, names, **options
         As of :func:`calibrate_together`.
-    jobs : int
-        Number of processes.
 
     Returns
     -------
@@ -116,15 +108,14 @@ def calibrate_many(
     >>> "headline" in table.columns
     True
     """
-    work = partial(_row_of_pair, options=options)
-    if jobs == 1:
-        rows = list(map(work, recordings))
-    else:
-        spawning = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, spawning) as processes:
-            rows = list(processes.map(work, recordings))
-    named = zip(_named(names), rows, strict=False)
-    return data_frame([{"name": name, **row} for name, row in named], "name")
+    rows = []
+    for name, pair in zip(_named(names), recordings, strict=False):
+        try:
+            row = row_of_result(calibrate(*pair, **options).to_dict()) | {"error": None}
+        except HandEyeCalibError as error:
+            row = {"error": str(error)}
+        rows.append({"name": name, **row})
+    return data_frame(rows, "name")
 
 
 def _named(names: Sequence[str] | None) -> Iterator[str]:
@@ -133,25 +124,17 @@ def _named(names: Sequence[str] | None) -> Iterator[str]:
     return iter(names) if names is not None else map(str, count(1))
 
 
-def _row_of_pair(pair: tuple[Trajectory, Trajectory], options: Mapping[str, Any]) -> dict[str, Any]:
-    try:
-        return row_of_result(calibrate(*pair, **options).to_dict()) | {"error": None}
-    except HandEyeCalibError as error:
-        return {"error": str(error)}
-
-
 def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
     """The row of a result, from what its ``to_dict`` gave; what is not known is None."""
     transform = calibration["T_parent_child"]
     row: dict[str, Any] = {name: calibration[name] for name in TAKEN[:5]}
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
-    for names, values, sigmas, unit in (
-        (_LENGTHS, transform["translation"], transform["sigma_translation"], "m"),
-        (_ANGLES, transform["rpy_deg"], transform["sigma_rpy_deg"], "deg"),
-    ):
-        for name, value, sigma in zip(names, values, sigmas, strict=True):
-            is_known = sigma is not None and math.isfinite(sigma)
-            row |= {f"{name}_{unit}": value, f"sigma_{name}_{unit}": sigma if is_known else None}
+    columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
+    values = [*transform["translation"], *transform["rpy_deg"]]
+    sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
+    for column, value, sigma in zip(columns, values, sigmas, strict=True):
+        is_known = sigma is not None and math.isfinite(sigma)
+        row |= {column: value, f"sigma_{column}": sigma if is_known else None}
     row |= {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
     return row | {name: calibration[name] for name in TAKEN[5:]}
 

@@ -156,23 +156,9 @@ def solve_without(
 
 
 def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatArray, FloatArray]:
-    """Find the best weights for given costs, and their objective.
-
-    Parameters
-    ----------
-    costs : (..., K) array
-        Costs of the pairs, for one X or several.
-    threshold : float
-        c, in the unit of the costs.
-    floor : float
-        d: the weights add up to at least this. Pairs of equal cost share what those of smaller cost
-        leave of it.
-
-    Returns
-    -------
-    weights : (..., K) array
-    objective : (...) array
-        Eq. (5).
+    """The best weights (..., K) for costs (..., K) of the pairs at one X or several, and their
+    objectives (...), eq. (5). The threshold is c, in the unit of the costs; the weights add up to
+    at least d, the floor. Pairs of equal cost share what those of smaller cost leave of it.
     """
     counted = costs < threshold
     too_few = counted.sum(axis=-1) < floor

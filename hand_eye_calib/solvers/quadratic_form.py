@@ -167,9 +167,7 @@ class Minimum:
         return self.T_parent_child[best], bool(self.converged[best]), self.iterations
 
 
-def minimise(
-    Q: FloatArray, rotation_start: FloatArray, max_steps: int = _MAX_NEWTON_STEPS
-) -> Minimum:
+def minimise(Q: FloatArray, rotation_start: FloatArray) -> Minimum:
     """Minimise ``x^T Q x`` over SE(3), from several rotations or for several forms at once.
 
     The translation is eliminated exactly. The rest is a quadratic function of the nine entries of
@@ -179,11 +177,6 @@ def minimise(
     ----------
     Q : (13, 13) or (B, 13, 13) array
     rotation_start : (B, 3, 3) array
-    max_steps : int
-
-    Returns
-    -------
-    Minimum
     """
     rotation = np.array(rotation_start, dtype=float)
     reduced, to_translation = without_translation(
@@ -194,7 +187,7 @@ def minimise(
     damping = np.zeros(len(rotation))
     converged = np.zeros(len(rotation), dtype=bool)
     iterations = 0
-    while iterations < max_steps and not converged.all():
+    while iterations < _MAX_NEWTON_STEPS and not converged.all():
         iterations += 1
         step, length, scale = _newton_step(gradient, hessian, damping)
         trial = rotation @ se3.rotation_exp(step)
