@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "paper. hilly: two minutes at 1.5 m/s, 10 and 20 Hz, no common stamps. Default: published",
     )
     poses = "poses of the parent sensor. Default: 100 (published), 1200 (hilly)"
-    group.add_argument("--poses", type=int, metavar="N", help=poses)
+    group.add_argument("--poses", type=at_least(2), metavar="N", help=poses)
     group = parser.add_argument_group("noise")
     fields = {field.name: field for field in dataclasses.fields(NoiseConfig)}
     for option, name in _NOISE_OPTIONS.items():
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
             write_bag(folder / name, streams, arguments.bag)
     if arguments.json:
         document = {"runs": [str(folder) for folder in folders], "seed": arguments.seed}
-        document |= {"drive": config.to_options(), "noise": noise.to_options()}
+        document |= {"drive": dataclasses.asdict(config), "noise": noise.to_options()}
         print(json.dumps(document, indent=2))
     else:
         print(f"{counted(len(folders), 'recording')} written to {arguments.out}")

@@ -330,15 +330,9 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
 
 
 def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
-    """Poses (N, 4, 4) that were written in another convention than they were read in.
-
-    Parameters
-    ----------
-    Ts : (N, 4, 4) array
-    invert : {"none", "poses", "orientations"}
-        What was written the other way round: of the world in the sensor.
-    quaternion : {"xyzw", "wxyz"}
-        Order in which quaternions were written that were read as x y z w.
+    """Poses (N, 4, 4) that were written in another convention than they were read in: ``invert``
+    ("none", "poses" or "orientations") says what was of the world in the sensor, ``quaternion``
+    ("xyzw" or "wxyz") the order of quaternions that were read as x y z w.
     """
     if quaternion == "wxyz":
         quats = np.roll(to_quat_xyzw(Ts), -1, axis=-1)

@@ -34,14 +34,9 @@ _CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
 
 
 def integrated(stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-    """Orientations (N, 3, 3) of a body in its own first axes, from its angular rates.
-
-    Parameters
-    ----------
-    stamps_ns : (N,) int64 array
-        In any order; a step back in time is a rotation back.
-    rates : (N, 3) array
-        rad/s, about the axes of the body. Between two stamps the mean of both counts.
+    """Orientations (N, 3, 3) of a body in its own first axes, from its angular rates (N, 3), rad/s,
+    about its axes at stamps (N,). Between two stamps the mean of both counts; a step back in time
+    is a rotation back.
     """
     intervals_s = np.diff(stamps_ns) * 1e-9
     steps = 0.5 * (rates[1:] + rates[:-1]) * intervals_s[:, None]
@@ -359,20 +354,9 @@ def corners(
     well are alike. The share of motion follows from the poses nearby. What is left of white noise
     halfway between two poses is between 0.71 (a constant twist) and 0.80 of it.
 
-    Parameters
-    ----------
-    stamps_ns : (N,) int64 array
-    poses : (N, 4, 4) array
-        ``Ts_world_sensor``.
-    start : (M,) int array
-        Index of the pose before each wanted one.
-    fraction : (M,) array
-        Of the interval to the next pose, in [0, 1].
-
-    Returns
-    -------
-    (M, 6) array
-        xi in ``T_world_sensor exp(xi)``.
+    Of poses (N, 4, 4) at stamps (N,), ``start`` (M,) are the indices of those before each wanted
+    one, ``fraction`` (M,) is of the interval to the next. Returns xi (M, 6) in
+    ``T_world_sensor exp(xi)``.
     """
     spans_s = np.diff(stamps_ns) * 1e-9
     # Intervals that tell what happens in the wanted ones; the twists of others count as zero.

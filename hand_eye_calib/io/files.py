@@ -47,18 +47,11 @@ def read_bytes(path: str | Path, largest: int) -> bytes:
 def read_text(path: str | Path, expected: str, largest: int) -> str:
     """Read a whole text file in UTF-8, with or without a byte order mark.
 
-    Parameters
-    ----------
-    path : str or path-like
-    expected : str
-        What the file should be, for the message of an error.
-    largest : int
-        Bytes that it may have.
-
     Raises
     ------
     InputError
-        If it cannot be read; one line that names the file.
+        If it cannot be read, or is larger than ``largest`` bytes; one line that names the file, and
+        what was expected.
     """
     try:
         return read_bytes(path, largest).decode("utf-8-sig")

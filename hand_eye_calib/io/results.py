@@ -77,28 +77,10 @@ def save_rig(
     inputs: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write ``rig.yaml``, ``static_transform.launch.py`` with all transforms that may be used, and
-    a directory for each sensor with the files of :func:`save_result`.
+    a directory for each sensor with the files of :func:`save_result`; returns the first.
 
-    Parameters
-    ----------
-    document : mapping
-        The rig in plain values.
-    calibrations : sequence of Calibration
-        All in the frame of one sensor.
-    directory : str or path-like
-        Made if it is missing.
-    inputs : mapping, optional
-        Where the data came from, in plain values.
-
-    Returns
-    -------
-    pathlib.Path
-        ``rig.yaml``.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
+    ``document`` is the rig in plain values, ``calibrations`` are all in the frame of one sensor;
+    the rest is as of :func:`save_result`.
     """
     folders: set[str] = set()
     for calibration in calibrations:

@@ -118,18 +118,9 @@ def test_hilly_drive_reveals_every_direction():
     assert not set(drive.parent.stamps_ns) & set(drive.child.stamps_ns)
 
 
-@pytest.mark.parametrize(
-    ("kind", "options"),
-    [
-        (DriveConfig, {"poses": 1}),
-        (DriveConfig, {"attitude": "sideways"}),
-        (DriveConfig, {"child_rate": float("nan")}),
-        (NoiseConfig, {"outliers": 1.5}),
-    ],
-)
-def test_impossible_options_are_refused(kind, options):
-    with pytest.raises(ConfigError, match=next(iter(options))):
-        kind(**options)
+def test_impossible_options_are_refused():
+    with pytest.raises(ConfigError, match="outliers"):
+        NoiseConfig(outliers=1.5)
 
 
 # --- noise ----------------------------------------------------------------------------
