@@ -326,13 +326,11 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
     limit_rad = min(_AGREE_RAD, min(rough_p, rough_c) / _BELOW_ROUGHNESS)
     if min(white_p, white_c) > _WHITE:
         limit_rad = max(limit_rad, min(_AGREE_NOISE_RAD, min(rough_p, rough_c) / _BELOW_NOISE))
-    for moved in (child, aligned):
-        # Programs interpolate at the stamps of the new stream, most of them along a straight line.
-        for slow, fast in ((moved, parent), (parent, moved)):
-            for straight in (True, False):
-                residual_rad = _disagreement(slow, fast, straight)
-                if residual_rad < limit_rad:
-                    return [finding("not_independent", residual_rad=residual_rad)]
+    # Programs interpolate at the stamps of the new stream.
+    for slow, fast in ((child, parent), (parent, child), (aligned, parent), (parent, aligned)):
+        residual_rad = _disagreement(slow, fast)
+        if residual_rad < limit_rad:
+            return [finding("not_independent", residual_rad=residual_rad)]
     return []
 
 
@@ -344,9 +342,9 @@ def _roughness(trajectory: Trajectory) -> tuple[float, float]:
     return third, fourth / max(third, 1e-300)
 
 
-def _disagreement(slow: Trajectory, fast: Trajectory, straight: bool) -> float:
-    """Angle (rad) that remains between the rotations of two streams, one of them interpolated at
-    stamps of the other; infinite if they have too few in common.
+def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
+    """Angle (rad) that remains between the rotations of two streams, one of them interpolated
+    along a straight line at stamps of the other; infinite if they have too few in common.
     """
     inside = (slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])
     indices = np.flatnonzero(inside)
@@ -357,7 +355,7 @@ def _disagreement(slow: Trajectory, fast: Trajectory, straight: bool) -> float:
     n_nearest = min(max(_FEWEST_NEAR, round(_NEAREST * len(indices))), len(indices))
     indices = indices[around <= np.partition(around, n_nearest - 1)[n_nearest - 1]]
     indices = indices[:: -(-len(indices) // _MOST_NEAR)]
-    between = fast.at(slow.stamps_ns[indices], straight=straight)
+    between = fast.at(slow.stamps_ns[indices], straight=True)
     start = np.arange(len(indices) - 1)
     pairs = pairs_between(between, slow.poses[indices], start, start + 1)
     pairs = pairs[se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3]) < MAX_ROTATION]

@@ -119,8 +119,7 @@ class Regression:
         """Fit groups beside the base, or beside what is left of it."""
         known, total = self._indices(groups, without), self.blocks.sum(axis=0)
         start = len(self._indices((), without))
-        values = _solved(total, known)
-        left_out = np.stack([_solved(total - block, known) for block in self.blocks])
+        values, left_out = _solved(total, known), _solved(total - self.blocks, known)
         spread = left_out - left_out.mean(axis=0)
         sigmas = np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0))
         costs = [_cost(total, indices) for indices in (known[:start], known)]
@@ -146,10 +145,11 @@ def _of_noise(gram: FloatArray, amount: float) -> FloatArray:
 
 
 def _solved(products: FloatArray, columns: IntArray) -> FloatArray:
-    normal = products[np.ix_(columns, columns)]
-    units = 1.0 / np.sqrt(np.diag(normal) + 1e-300)
-    balanced = normal * np.outer(units, units) + 1e-9 * np.eye(len(columns))
-    return np.asarray(units * np.linalg.solve(balanced, units * products[columns, -1]))
+    normal = products[..., columns[:, None], columns]
+    units = 1.0 / np.sqrt(np.diagonal(normal, axis1=-2, axis2=-1) + 1e-300)
+    balanced = normal * units[..., :, None] * units[..., None, :] + 1e-9 * np.eye(len(columns))
+    pushed = (units * products[..., columns, -1])[..., None]
+    return np.asarray(units * np.linalg.solve(balanced, pushed)[..., 0])
 
 
 def _cost(products: FloatArray, columns: IntArray) -> float:

@@ -110,6 +110,11 @@ class TestBoreas:
         assert (finding.code, finding.stream) == ("stamp_unit", "parent")
         assert "microseconds" in finding.what
 
+    def test_two_streams_from_one_ins_are_not_independent(self):
+        recording = real_data.boreas()
+        findings = check_streams(recording.parent, recording.child).findings
+        assert [finding.code for finding in findings] == ["not_independent"]
+
 
 @pytest.mark.parametrize(
     "recording",

@@ -102,32 +102,26 @@ def test_an_axis_is_the_same_by_its_own_target():
     assert compare([strict], drawing).differences[0].axes(Change.CANNOT_TELL) == ["y"]
 
 
-class TestWhichOneMoved:
-    def names(self, *shifts):
-        found = compare(
-            [result(each, seed=i) for i, each in enumerate(shifts)],
-            names=[f"drive {i}" for i in range(1, len(shifts) + 1)],
-        )
-        return found.moved, found.sentence
-
-    NOT, MOVED = np.zeros(6), shift("pitch", np.radians(0.6))
-
-    def test_the_one_without_which_the_others_agree(self):
-        moved, sentence = self.names(self.NOT, self.MOVED, self.NOT)
-        assert moved == ("drive 2",)
-        assert sentence == "moved: drive 2 differs, the others agree"
-
-    def test_all_from_one_on(self):
-        moved, sentence = self.names(self.NOT, self.NOT, self.MOVED, self.MOVED)
-        assert moved == ("drive 3", "drive 4")
-        assert sentence == "moved between drive 2 and drive 3: drive 3 and drive 4"
-
-    def test_of_two_nobody_can_tell(self):
-        moved, sentence = self.names(self.NOT, self.MOVED)
-        assert moved == ()
-        assert sentence.endswith(
-            "drive 1 and drive 2 differ; which of them has moved, they do not tell"
-        )
+@pytest.mark.parametrize(
+    ("have_moved", "named", "sentence"),
+    [
+        ("010", ("drive 2",), "moved: drive 2 differs, the others agree"),
+        (
+            "0011",
+            ("drive 3", "drive 4"),
+            "moved between drive 2 and drive 3: drive 3 and drive 4",
+        ),
+        ("01", (), "drive 1 and drive 2 differ; which of them has moved, they do not tell"),
+    ],
+)
+def test_which_one_moved(have_moved, named, sentence):
+    moved = shift("pitch", np.radians(0.6))
+    found = compare(
+        [result(int(each) * moved, seed=i) for i, each in enumerate(have_moved)],
+        names=[f"drive {i + 1}" for i in range(len(have_moved))],
+    )
+    assert found.moved == named
+    assert found.sentence.endswith(sentence)
 
 
 def test_files_and_python_speak_of_the_same(tmp_path):
