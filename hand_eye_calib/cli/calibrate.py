@@ -40,7 +40,8 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
-_HEADINGS = ("topic", "type", "count", "rate", "frames", "poses")
+# Of the table of topics.
+_ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -164,8 +165,9 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         calibration, inputs = stops.solved(arguments)
         return deliver(calibration, arguments, inputs)
     if arguments.pairs:
-        return _together(arguments, list(zip(paths[::2], paths[1::2], strict=True)), True)
-    if len(paths) > 1 and any(reading.journal_in([path]) for path in paths):
+        pairs = list(zip(paths[::2], paths[1::2], strict=True))
+        return _together(arguments, pairs, are_files=True)
+    if len(paths) > 1 and any(map(reading.journal_in, paths)):
         return _together(arguments, [[path] for path in paths])
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
     if len(paths) > 2 and not are_bags:
@@ -202,50 +204,31 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     from hand_eye_calib.io.bags import PoseBag
     from hand_eye_calib.io.bags.messages import SENSOR_TYPES
 
+    topics: list[dict[str, Any]] = []
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
-        topics = [
-            {
-                **topic._asdict(),
-                "rate_hz": (topic.count - 1) / bag.duration_s
-                if topic.count > 1 and bag.duration_s > 0
-                else None,
-                "frames": bag.frames_on(topic.name),
-                "is_usable": topic.type in SENSOR_TYPES,
-            }
-            for topic in bag.topics.values()
-        ]
-        document: dict[str, Any] = {
-            "bag": as_given(str(bag)),
-            "start_ns": bag.start_ns,
-            "end_ns": bag.end_ns,
-            "duration_s": bag.duration_s,
-            "topics": topics,
-            "warnings": as_given(bag.warnings),
-        }
+        for each in bag.topics.values():
+            is_sampled = each.count > 1 and bag.duration_s > 0
+            topics.append(dict(each._asdict()))
+            topics[-1]["rate_hz"] = (each.count - 1) / bag.duration_s if is_sampled else None
+            topics[-1]["frames"] = bag.frames_on(each.name)
+            topics[-1]["is_usable"] = each.type in SENSOR_TYPES
+        document = {"bag": as_given(str(bag)), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
+        document |= {"duration_s": bag.duration_s, "topics": topics}
+        document["warnings"] = as_given(bag.warnings)
     for text in document["warnings"]:
         note(text)
     if arguments.json:
         print(json.dumps(document, indent=2))
         return 0
     print(f"{document['bag']}, {document['duration_s']:.1f} s")
-    rows = [_HEADINGS, *map(_cells, topics)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        print("  ".join(cells).rstrip())
+    print(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
+    for topic in topics:
+        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
+        usable = "yes" if topic["is_usable"] else ""
+        cells = (printable(topic["name"]), topic["type"] or "several types", topic["count"], rate)
+        print(_ROW.format(*cells, usable, " ".join(map(printable, topic["frames"]))).rstrip())
     print(
         "--parent-topic and --child-topic take the topics with poses, --parent-tf and --child-tf "
         "frames of /tf: odom:lidar"
     )
     return 0
-
-
-def _cells(topic: dict[str, Any]) -> tuple[str, ...]:
-    return (
-        printable(topic["name"]),
-        topic["type"] or "several types",
-        str(topic["count"]),
-        "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz",
-        " ".join(map(printable, topic["frames"])),
-        "yes" if topic["is_usable"] else "",
-    )

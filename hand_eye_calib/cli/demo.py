@@ -23,7 +23,6 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
-    from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.results.calibration import Calibration
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
@@ -87,7 +86,6 @@ def run(arguments: argparse.Namespace) -> int:
         online = player.wait_for_extrinsic(offline.stamp_ns)
     note("3/4 calibrated live; the report follows")
     document = _document(drive, offline, online) | {"bag": str(bag_path)}
-
     if arguments.json:
         print(json_text(document), flush=True)
     else:
@@ -132,7 +130,9 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 
 def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> dict[str, Any]:
     """The truth, both results, and how far they are from it and from each other."""
-    truth = drive.T_parent_child
+    from hand_eye_calib.assessment.metrics import absolute_errors
+    from hand_eye_calib.geometry import se3
+
     document: dict[str, Any] = {
         "parent_frame": offline.parent_frame,
         "child_frame": offline.child_frame,
@@ -141,29 +141,16 @@ def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> d
         "headline": offline.headline,
         "status": offline.status.value,
         "reference": offline.reference,
-        "truth": _both_directions(truth),
-        "agreement": _difference(online.T_parent_child, offline.T_parent_child),
     }
-    for name, each in (("offline", offline), ("online", online)):
-        document[name] = _both_directions(each.T_parent_child) | {"stamp_ns": each.stamp_ns}
-        document[name]["error"] = _difference(each.T_parent_child, truth)
-    return document
-
-
-def _both_directions(T_parent_child: "FloatArray") -> dict[str, Any]:
-    from hand_eye_calib.geometry import se3
-
-    inverse = se3.inverse(T_parent_child)
-    return {"T_parent_child": T_parent_child.tolist(), "T_child_parent": inverse.tolist()}
-
-
-def _difference(T_parent_child: "FloatArray", other: "FloatArray") -> dict[str, float]:
-    """Distance between the translations and angle between the rotations."""
-    from hand_eye_calib.geometry import se3
-
-    angle = se3.rotation_angle(T_parent_child[:3, :3].T @ other[:3, :3])
-    distance = math.dist(T_parent_child[:3, 3], other[:3, 3])
-    return {"translation_m": distance, "rotation_rad": float(angle)}
+    units = ("translation_m", "rotation_rad")
+    for name, each in (("truth", drive), ("offline", offline), ("online", online)):
+        T, errors = each.T_parent_child, absolute_errors(each.T_parent_child, drive.T_parent_child)
+        document[name] = {"T_parent_child": T.tolist(), "T_child_parent": se3.inverse(T).tolist()}
+        document[name]["error"] = dict(zip(units, errors, strict=True))
+    for name, result in (("offline", offline), ("online", online)):
+        document[name]["stamp_ns"] = result.stamp_ns
+    apart = absolute_errors(online.T_parent_child, offline.T_parent_child)
+    return document | {"agreement": dict(zip(units, apart, strict=True))}
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:

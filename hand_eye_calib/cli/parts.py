@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -90,10 +89,10 @@ def _difference(
     nothing.
     """
     for source, (poses, is_fixed) in parts[path].items():
-        before = [each for each in group if source in parts[each]]
+        before = {each: parts[each][source] for each in group if source in parts[each]}
         if before:
-            latest = max(before, key=lambda each: int(parts[each][source][0].stamps_ns[-1]))
-            earlier, was_fixed = parts[latest][source]
+            latest = max(before, key=lambda each: int(before[each][0].stamps_ns[-1]))
+            earlier, was_fixed = before[latest]
             if told := _break(earlier, poses, max_gap_s, is_fixed and was_fixed):
                 both = f"{latest} and {path} are two recordings, not parts of one"
                 return f"{both}: {source} {told}"
@@ -104,32 +103,21 @@ def _break(one: Trajectory, two: Trajectory, max_gap_s: float, is_fixed: bool) -
     """What tells that two parts neither repeat nor continue each other; empty for nothing."""
     one, two = sorted((one, two), key=lambda each: int(each.stamps_ns[0]))
     begin_ns, end_ns = two.stamps_ns[0], min(one.stamps_ns[-1], two.stamps_ns[-1])
-    pause_s = float(two.stamps_ns[0] - one.stamps_ns[-1]) * 1e-9
+    pause_s, overlap_s = ((begin_ns - one.stamps_ns[-1]) * 1e-9, (end_ns - begin_ns) * 1e-9)
     if pause_s > _LONGEST_PAUSE_S:
         return f"pauses for {pause_s:.0f} s between them"
-    overlap_s = float(end_ns - begin_ns) * 1e-9
     if overlap_s > max_gap_s:
-        shared, rows, others = np.intersect1d(one.stamps_ns, two.stamps_ns, return_indices=True)
-        is_same = np.ones(len(shared), dtype=bool)
-        if is_fixed:
-            is_same = (one.poses[rows] == two.poses[others]).all(axis=(1, 2))
-        inside = [
-            (poses.stamps_ns >= begin_ns) & (poses.stamps_ns <= end_ns) for poses in (one, two)
-        ]
-        if is_same.sum() < min(each.sum() for each in inside) / 2:
+        _, rows, others = np.intersect1d(one.stamps_ns, two.stamps_ns, return_indices=True)
+        is_same = (one.poses[rows] == two.poses[others]).all(axis=(1, 2)) | (not is_fixed)
+        inside = (each.stamps_ns[each.stamps_ns >= begin_ns] for each in (one, two))
+        if is_same.sum() < min((stamps_ns <= end_ns).sum() for stamps_ns in inside) / 2:
             return f"has different poses in both for {overlap_s:.1f} s of the same time"
-    steps = [_steps(part) for part in (one, two) if len(part) > 1]
-    if pause_s >= 0 and is_fixed and steps:
+    if pause_s >= 0 and is_fixed and len(one) + len(two) > 2:
+        pairs = [np.diff(each.poses[:, :3, 3], axis=0) for each in (one, two)]
+        lengths = np.linalg.norm(np.concatenate(pairs), axis=1)
+        times_s = np.concatenate([np.diff(each.stamps_ns) for each in (one, two)]) * 1e-9
         distance = float(np.linalg.norm(two.poses[0, :3, 3] - one.poses[-1, :3, 3]))
-        lengths, times_s = np.concatenate(steps, axis=1)
         if distance > _FASTER * (lengths / times_s).max() * max(pause_s, np.median(times_s)):
-            return (
-                f"goes on {distance:.1f} m away after {pause_s:.1f} s, as if it had started again"
-            )
+            away = f"goes on {distance:.1f} m away after {pause_s:.1f} s"
+            return f"{away}, as if it had started again"
     return ""
-
-
-def _steps(trajectory: Trajectory) -> FloatArray:
-    """Lengths (m) and times (s) from pose to pose, (2, N - 1)."""
-    lengths = np.linalg.norm(np.diff(trajectory.poses[:, :3, 3], axis=0), axis=1)
-    return np.stack([lengths, np.diff(trajectory.stamps_ns) * 1e-9])

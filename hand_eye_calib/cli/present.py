@@ -199,12 +199,11 @@ def transform_lines(
 ) -> Iterator[str]:
     """A row for each axis: the translation along it and an angle, with one standard deviation."""
     left = ["", "x, y and z are not estimated", ""]
-    if not {*out_of_reach} & {*"xyz"}:
-        rows = zip(
-            "xyz", transform["translation"], transform["sigma_total_translation"], strict=True
-        )
-        left = [f"{name} {with_sigma(value, sigma, 3):>22} m" for name, value, sigma in rows]
     right = ["", "roll, pitch and yaw are not estimated", ""]
+    if not {*out_of_reach} & {*"xyz"}:
+        sigmas = transform["sigma_total_translation"]
+        rows = zip("xyz", transform["translation"], sigmas, strict=True)
+        left = [f"{name} {with_sigma(value, sigma, 3):>22} m" for name, value, sigma in rows]
     if not {*out_of_reach} & {*_ROTATIONS}:
         rows = zip(_ROTATIONS, transform["rpy_deg"], transform["sigma_total_rpy_deg"], strict=True)
         right = [f"{name:<5} {printed_angle(value, sigma):>20} deg" for name, value, sigma in rows]
@@ -227,23 +226,19 @@ def _details(calibration: Calibration) -> Iterator[str]:
         groups.setdefault(word, []).append(dof.name)
     told = "; ".join(f"{axes_in_words(names)} {words}" for words, names in groups.items())
     yield f"along and about the axes of {calibration.parent_frame}: {told}"
-    alone = [
-        f"{axes_in_words([dof.name])} {amount(dof.name, dof.sigma)}"
-        for dof in calibration.observability
-        if dof.name not in calibration.out_of_reach
-    ]
-    yield f"standard deviations without the common-mode uncertainty: {', '.join(alone)}"
-    for kind, title in _SCATTER.items():
-        scatter = {
-            axis: getattr(row, kind) for axis, row in (calibration.cross_check or {}).items()
+    reach, checked = calibration.out_of_reach, calibration.cross_check or {}
+    of_axes: dict[str, dict[str, float | None]] = {
+        "standard deviations without the common-mode uncertainty": {
+            dof.name: dof.sigma for dof in calibration.observability if dof.name not in reach
         }
-        far = [
-            f"{axes_in_words([axis])} {amount(axis, value)}"
-            for axis, value in scatter.items()
-            if value is not None
-        ]
-        if far:
-            yield f"{title}: {', '.join(far)}"
+    }
+    for kind, title in _SCATTER.items():
+        of_axes[title] = {axis: getattr(row, kind) for axis, row in checked.items()}
+    for title, values in of_axes.items():
+        known = {axis: value for axis, value in values.items() if value is not None}
+        told = ", ".join(f"{axes_in_words([axis])} {amount(axis, known[axis])}" for axis in known)
+        if told:
+            yield f"{title}: {told}"
     yield from _comparisons(calibration)
     on = f"on reference {calibration.reference}"
     if not METHODS[calibration.method].uses_reference:

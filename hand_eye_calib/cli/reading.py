@@ -99,7 +99,7 @@ def read_paths(
     """
     if are_files:
         return read_pair(paths, [{}] * 2, options)
-    journal = journal_in(paths)
+    journal = journal_in(paths[0]) if len(paths) == 1 else None
     if journal is None:
         return read_bags(paths, sources, CalibratorConfig.from_options(dict(options)))
     if sources:
@@ -276,13 +276,13 @@ def feed(calibrator: Calibrator, blocks: "Iterable[PoseBlock]", topics: Mapping[
     return count
 
 
-def journal_in(paths: Sequence[Path | str]) -> Path | None:
-    """The directory of the session's journal that is meant; None for bags."""
+def journal_in(path: Path | str) -> Path | None:
+    """The directory of a session's journal at a path, or in its output directory; None for bags."""
     from hand_eye_calib.io.journal import has_session
 
-    if len(paths) != 1 or isinstance(paths[0], str):
+    if isinstance(path, str):
         return None
-    return next((path for path in (paths[0], paths[0] / "journal") if has_session(path)), None)
+    return next((each for each in (path, path / "journal") if has_session(each)), None)
 
 
 def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:

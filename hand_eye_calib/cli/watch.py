@@ -58,13 +58,19 @@ def run(arguments: argparse.Namespace) -> int:
     came: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda signum, _: came.append(signum))
-    with (
-        Watcher(board) as watcher,
-        _web(arguments, board, requests) as address,
-        _keyboard() as keys,
-        _display(address) as show,
-    ):
-        session = Session(board, requests, keys)
+    with contextlib.ExitStack() as stack:
+        watcher = stack.enter_context(Watcher(board))
+        addresses = [""]
+        if arguments.web is not None:
+            from hand_eye_calib.watch.web import WebServer
+
+            server = WebServer(board, requests.put, arguments.web, key=arguments.key)
+            stack.callback(server.stop)
+            addresses = server.addresses()
+            for address in addresses:
+                note(f"open {address} in a browser")
+        session = Session(board, requests, stack.enter_context(_keyboard()))
+        show = stack.enter_context(_display(addresses[0]))
         while not came and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
@@ -74,15 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Session:
-    """What the person at the terminal has typed, also keys that wait for a second press.
-
-    Parameters
-    ----------
-    board : Board
-    requests : queue
-        Takes the requests.
-    keys : callable
-        Gives the keys pressed since the last call.
+    """What the person at the terminal has typed, also keys that wait for a second press; ``keys``
+    gives those pressed since the last call, and the queue takes the requests.
     """
 
     def __init__(
@@ -188,25 +187,6 @@ def _keyboard() -> Iterator[Callable[[], str]]:
         yield pressed
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-
-
-@contextlib.contextmanager
-def _web(
-    arguments: argparse.Namespace, board: "Board", requests: "queue.SimpleQueue[str]"
-) -> Iterator[str]:
-    """Serve the page, if it is wanted; yields its address."""
-    if arguments.web is None:
-        yield ""
-        return
-    from hand_eye_calib.watch.web import WebServer
-
-    server = WebServer(board, requests.put, arguments.web, key=arguments.key)
-    try:
-        for address in server.addresses():
-            note(f"open {address} in a browser")
-        yield server.addresses()[0]
-    finally:
-        server.stop()
 
 
 @argument_type

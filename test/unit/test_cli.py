@@ -37,7 +37,7 @@ from hand_eye_calib.results.finding import Finding, Severity
 pytestmark = pytest.mark.usefixtures("no_figures")
 
 ROOT = Path(__file__).resolve().parents[2]
-ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
 PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"
 TOPICS = ["--parent-topic", PARENT_TOPIC, "--child-topic", CHILD_TOPIC]
 START_NS = 1_700_000_000_000_000_000
@@ -68,14 +68,14 @@ def drive(count=120, planar=False, first_ns=START_NS):
 def new_bag(tmp_path):
     """Writes a bag with both trajectories and returns its path."""
 
-    def write(parent=None, child=None, storage="mcap", types=(ODOMETRY, ODOMETRY)):
-        both = [
-            good if given is None else given
-            for given, good in zip((parent, child), drive(), strict=True)
-        ]
+    def write(parent=None, child=None, storage="mcap"):
+        both = drive()
+        streams = {
+            PARENT_TOPIC: (both[0] if parent is None else parent, ODOMETRY),
+            CHILD_TOPIC: (both[1] if child is None else child, ODOMETRY),
+        }
         path = tmp_path / ("drive.bag" if storage == "rosbag1" else "drive")
-        streams = zip((PARENT_TOPIC, CHILD_TOPIC), both, types, strict=True)
-        write_bag(path, {topic: (stream, kind) for topic, stream, kind in streams}, storage)
+        write_bag(path, streams, storage)
         return str(path)
 
     return write
@@ -94,17 +94,6 @@ def refused(run):
         return lines[0]
 
     return call
-
-
-def with_pose(trajectory, index, **fields):
-    """A trajectory whose one pose is not checked, for writing bad messages."""
-    poses = trajectory.poses.copy()
-    poses[index] = fields["pose"]
-    spoiled = object.__new__(Trajectory)
-    for field in dataclasses.fields(Trajectory):
-        object.__setattr__(spoiled, field.name, getattr(trajectory, field.name))
-    object.__setattr__(spoiled, "poses", poses)
-    return spoiled
 
 
 # ---- replay and calibrate on good input
@@ -145,9 +134,7 @@ def test_json_is_one_document_on_stdout(run, new_bag):
 @pytest.mark.parametrize(
     ("parent", "child"),
     [
-        ("/parent/odometry", "/child/odometry"),
         ("/base_link/odom", "/a"),
-        ("/wheel_odom", "/child/a"),
         ("/a", "/b"),
     ],
 )
@@ -158,18 +145,6 @@ def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path, parent, child)
     code, out, err = run("check", bag)
     assert code == 0
     assert f"parent is {parent}\nchild is {child}\n" in out
-
-
-def test_pose_stamped_takes_its_frames_from_the_options(run, new_bag):
-    bag = new_bag(types=(ODOMETRY, POSE_STAMPED))
-    document = json.loads(run("replay", bag, *TOPICS, "--json", "--child-frame", "cam0")[1])
-    assert (document["parent_frame"], document["child_frame"], document["warnings"]) == (
-        "lidar",
-        "cam0",
-        [],
-    )
-    document = json.loads(run("replay", bag, *TOPICS, "--json")[1])
-    assert (document["child_frame"], document["warnings"]) == ("camera/odom", [])
 
 
 def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
@@ -339,10 +314,10 @@ def test_what_is_not_there_is_named_with_what_is(refused, new_bag, tmp_path):
 
 
 def test_nan_is_named_with_topic_message_and_stamp(refused, new_bag):
-    parent, child = drive()
-    pose = child.poses[7].copy()
-    pose[1, 3] = np.nan
-    line = refused("replay", new_bag(parent, with_pose(child, 7, pose=pose)), *TOPICS)
+    child = drive()[1]
+    child.poses.setflags(write=True)
+    child.poses[7, 1, 3] = np.nan
+    line = refused("replay", new_bag(child=child), *TOPICS)
     assert f"error: {CHILD_TOPIC}, message 8, stamp 1700000000.700000000: " in line
     assert "not finite" in line
 
@@ -512,14 +487,6 @@ def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     assert main(["calibrator", *arguments]) == 5
     assert main(["calibrator"]) == 5
     assert seen == [arguments, []]
-
-
-def test_executables_of_ros2_run_are_called_like_their_command(monkeypatch):
-    seen = []
-    monkeypatch.setattr(cli, "main", lambda argv: seen.append(argv) or 0)
-    monkeypatch.setattr(sys, "argv", ["/opt/lib/hand_eye_calib/replay", "bag", "--json"])
-    assert cli.named_command() == 0
-    assert seen == [["replay", "bag", "--json"]]
 
 
 def test_a_missing_optional_package_breaks_only_its_command(refused, run, tmp_path, monkeypatch):

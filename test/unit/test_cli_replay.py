@@ -256,8 +256,8 @@ def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
-    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "map:lidar", "yes"] in rows
-    assert ["/b", "geometry_msgs/msg/PoseStamped", "100", "10.0", "Hz", "odom", "yes"] in rows
+    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "yes", "map:lidar"] in rows
+    assert ["/b", "geometry_msgs/msg/PoseStamped", "100", "10.0", "Hz", "yes", "odom"] in rows
     assert ["/tf_static", TF, "1", "base:lidar"] in rows
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list", "--json")
     document = json.loads(out)
