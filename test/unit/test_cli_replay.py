@@ -45,19 +45,13 @@ def matrix(text):
 
 def write_session(directory, options, *given):
     """The journal of a node that has heard both trajectories."""
-    trajectories = {"parent": PARENT, "child": CHILD}
-    topics = {"parent": "/a", "child": "/b"}
+    streams = {"parent": (PARENT, "/a"), "child": (CHILD, "/b")}
     about = {
-        stream: {
-            "options": options,
-            "given": given,
-            "topic": topics[stream],
-            "frame": trajectory.sensor_frame,
-        }
-        for stream, trajectory in trajectories.items()
+        stream: {"options": options, "given": given, "topic": topic, "frame": poses.sensor_frame}
+        for stream, (poses, topic) in streams.items()
     }
     writer = JournalWriter(directory, about)
-    for stream, trajectory in trajectories.items():
+    for stream, (trajectory, _) in streams.items():
         quats = se3.to_quat_xyzw(trajectory.poses).tolist()
         positions = trajectory.poses[:, :3, 3].tolist()
         for message in zip(trajectory.stamps_ns.tolist(), positions, quats, strict=True):
@@ -98,15 +92,10 @@ def test_what_does_not_go_with_a_journal(run, tmp_path):
 
 
 def test_frames_stand_for_topics(run, bag, tmp_path):
-    messages = [
-        (
-            stamp_ns,
-            "/tf",
-            TF,
-            tf_message([(stamp_ns, "map", "lidar", parent), (stamp_ns, "odom", "camera", child)]),
-        )
-        for stamp_ns, parent, child in zip(PARENT.stamps_ns, PARENT.poses, CHILD.poses, strict=True)
-    ]
+    messages = []
+    for ns, parent, child in zip(PARENT.stamps_ns, PARENT.poses, CHILD.poses, strict=True):
+        both = [(ns, "map", "lidar", parent), (ns, "odom", "camera", child)]
+        messages.append((ns, "/tf", TF, tf_message(both)))
     path = write_messages(tmp_path / "tf", messages)
     code, out, err = run(path, "--parent-tf", "map:lidar", "--child-tf", "odom:camera", "--json")
     document = json.loads(out)
@@ -119,27 +108,12 @@ def test_frames_stand_for_topics(run, bag, tmp_path):
     assert "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera" in err
 
 
-def test_a_topic_and_frames_together(run, bag, tmp_path):
-    path_topic = [
-        (
-            PARENT.stamps_ns[-1],
-            "/path",
-            "nav_msgs/msg/Path",
-            path_message(PARENT.stamps_ns, PARENT.poses),
-        )
-    ]
-    path = write_messages(tmp_path / "path", path_topic)
-    code, out, _ = run(
-        bag,
-        path,
-        "--parent-topic",
-        "/path",
-        "--child-topic",
-        "/b",
-        "--json",
-        "--parent-frame",
-        "lidar",
-    )
+def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
+    message = path_message(PARENT.stamps_ns, PARENT.poses)
+    messages = [(PARENT.stamps_ns[-1], "/path", "nav_msgs/msg/Path", message)]
+    path = write_messages(tmp_path / "path", messages)
+    both = ["--parent-topic", "/path", "--child-topic", "/b", "--parent-frame", "lidar"]
+    code, out, _ = run(bag, path, *both, "--json")
     assert code == 0
     np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
 
@@ -245,14 +219,10 @@ def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, change, pa
 
 
 def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
-    messages = [
-        (PARENT.stamps_ns[0], "/tf_static", TF, tf_message([(0, "base", "lidar", np.eye(4))]))
-    ]
-    write_messages(tmp_path / "tf", messages)
-    write_bag(
-        tmp_path / "drive",
-        {"/a": (PARENT, ODOMETRY), "/b": (CHILD, "geometry_msgs/msg/PoseStamped")},
-    )
+    static = tf_message([(0, "base", "lidar", np.eye(4))])
+    write_messages(tmp_path / "tf", [(PARENT.stamps_ns[0], "/tf_static", TF, static)])
+    streams = {"/a": (PARENT, ODOMETRY), "/b": (CHILD, "geometry_msgs/msg/PoseStamped")}
+    write_bag(tmp_path / "drive", streams)
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
