@@ -60,7 +60,6 @@ def assert_is_the_trajectory(found, stamps_ns=TRAJECTORY.stamps_ns):
         ("1317375625.661736123", 1317375625661736123),
         ("9223372036.854775807", 2**63 - 1),
         ("1317375625.6617361234", 1317375625661736123),  # a tenth digit is rounded
-        ("1.317375625661736e+09", 1317375625661736000),
         (".5", 500_000_000),
         ("-0.000000001", -1),
     ],
@@ -100,7 +99,6 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ([f"0,{POSE.replace(' ', ',')}"], "line 1: expected 8 numbers"),
         (["0 1 2 x 0 0 0 1"], "line 1: expected 8 numbers, .* 'x'"),
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),
-        ([f"nan {POSE}"], "line 1: .* found 'nan' for the timestamp"),
         ([f"1e999999999 {POSE}"], "line 1: .* timestamp"),
         (
             [f"13173756256617361230 {POSE}"],
@@ -220,7 +218,6 @@ def test_without_a_header_the_columns_must_be_named(file):
     ("header", "message"),
     [
         ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
-        ("t,x,y,a,qx,qy,qz,qw", "no column for z among t, x, y, a"),
         ("t,x,y,z,q0,q1,q2,q3", "no column for qx, qy, qz, qw among"),
         (f"t,time,{XYZW[2:]}", "columns t, time could all be t; name them with `columns`"),
     ],

@@ -84,7 +84,7 @@ class TestReading:
         order = np.r_[0, 2, 1, 2, 3:30]
         with pytest.raises(InputError, match="stamps must increase"):
             hec.read_trajectory(POSES[order], times=SECONDS[order])
-        with pytest.warns(UserWarning, match="sorted by time; 1 repeated"):
+        with pytest.warns(UserWarning, match="were sorted; dropped 1 whose stamp"):
             assert_same(hec.read_trajectory(POSES[order], times=SECONDS[order], repair=True))
 
 

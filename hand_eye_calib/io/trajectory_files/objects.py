@@ -11,7 +11,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files.columns import POSITION, QUATERNION
-from hand_eye_calib.io.trajectory_files.poses import unit_by_size
+from hand_eye_calib.io.trajectory_files.poses import sorted_stamps, unit_by_size
 from hand_eye_calib.io.trajectory_files.table import check_stamp_unit
 
 _POSE = (*POSITION, *QUATERNION)
@@ -59,9 +59,8 @@ def trajectory_from_object(
             f"{values.shape}"
         )
     if repair and not (np.diff(stamps_ns) > 0).all():
-        keep = np.unique(stamps_ns, return_index=True)[1]
-        n_repeated = len(stamps_ns) - len(keep)
-        notes.append(f"poses were sorted by time; {n_repeated} repeated ones dropped")
+        keep, repairs = sorted_stamps(stamps_ns)
+        notes.append(repairs)
         stamps_ns, values = stamps_ns[keep], values[keep]
     if values.ndim == 3:
         return Trajectory(stamps_ns, values), notes

@@ -98,16 +98,17 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
                 "and drop repeated timestamps, or have that done with `repair`"
             ),
         )
+    keep, repairs = sorted_stamps(stamps_ns)
+    return keep, [f"{table.path}: {repairs}"]
+
+
+def sorted_stamps(stamps_ns: IntArray) -> tuple[IntArray, str]:
+    """Indices of stamps that are out of order, sorted and each once, and what was done."""
     keep = np.unique(stamps_ns, return_index=True)[1]
     backward, n_dropped = int((np.diff(stamps_ns) < 0).sum()), len(stamps_ns) - len(keep)
-    repairs = []
-    if backward:
-        repairs.append(
-            f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"
-        )
-    if n_dropped:
-        repairs.append(f"dropped {n_dropped} whose stamp was there already")
-    return keep, [f"{table.path}: {'; '.join(repairs)}"]
+    went_back = f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"
+    dropped = f"dropped {n_dropped} whose stamp was there already"
+    return keep, "; ".join([went_back] * (backward > 0) + [dropped] * (n_dropped > 0))
 
 
 def seconds(stamp_ns: int) -> str:
