@@ -1,6 +1,7 @@
 """Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,8 +87,11 @@ class FrameTree:
         edge.pose = pose
         return edge
 
-    def pose(self, frame: str, of: str) -> FloatArray:
-        """Pose (4, 4) of the frame ``of`` in ``frame``.
+    def pose(
+        self, frame: str, of: str, moving: Mapping[str, FloatArray] | None = None
+    ) -> FloatArray:
+        """Pose (..., 4, 4) of the frame ``of`` in ``frame``, with the poses (..., 4, 4) of those
+        whose edges move.
 
         Raises
         ------
@@ -98,9 +102,10 @@ class FrameTree:
         T_frame_of = np.eye(4)
         for each in up + down:
             edge = self.edges[each]
-            if not edge.is_static or edge.pose is None:
+            T = moving[each] if moving and each in moving else edge.pose
+            if T is None or not (edge.is_static or moving):
                 raise InputError(f"{frame} and {of} are not fixed to each other: {each} moves")
-            T_frame_of = T_frame_of @ (se3.inverse(edge.pose) if each in up else edge.pose)
+            T_frame_of = T_frame_of @ (se3.inverse(T) if each in up else T)
         return T_frame_of
 
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:

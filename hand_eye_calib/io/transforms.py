@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -87,8 +88,6 @@ class TfStream:
     def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
         self.source, self.max_gap_s = source, max_gap_s
         self._tree = tree or FrameTree("/tf and /tf_static")
-        self._up: list[str] = []
-        self._down: list[str] = []
         self._moving: dict[str, _MovingEdge] = {}
         self._find_chain()
 
@@ -113,28 +112,19 @@ class TfStream:
         """
         frame, edges = transform.sensor_frame or "", self._tree.edges
         before = edges[frame].is_static if frame in edges else None
-        row = (*transform.position, *transform.quat_xyzw)
-        try:
-            check_pose(*row)
-        except InputError as error:
-            raise InputError(f"transform {transform.world_frame}:{frame}: {error}") from None
-        pose = _matrices(row) if is_static else None
+        pose = _matrices(_checked(transform)) if is_static else None
         is_fixed = self._tree.add(transform.world_frame, frame, pose, is_static).is_static
         if len(edges) > MOST_FRAMES:
             raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
         if before != is_fixed:
             self._find_chain()
         if frame in self._moving and not is_static:
-            yield from self._move(frame, transform.stamp_ns, row)
+            yield from self._move(frame, transform.stamp_ns, _checked(transform))
 
     def composed(self, moving: Mapping[str, FloatArray]) -> FloatArray:
         """Poses of the sensor (..., 4, 4) from those of the moving edges (..., 7)."""
-        T_world_sensor = np.eye(4)
-        for frame in self._up + self._down:
-            T = _matrices(moving[frame]) if frame in moving else self._tree.edges[frame].pose
-            assert T is not None
-            T_world_sensor = T_world_sensor @ (se3.inverse(T) if frame in self._up else T)
-        return T_world_sensor
+        matrices = {frame: _matrices(rows) for frame, rows in moving.items()}
+        return self._tree.pose(*self.source, matrices)
 
     def describe_missing(self) -> str:
         """Why there is no pose yet."""
@@ -147,12 +137,10 @@ class TfStream:
         return "its transforms do not come at the same times"
 
     def _find_chain(self) -> None:
-        self._slowest = ""
-        try:
-            self._up, self._down = self._tree.route(*self.source)
-        except InputError:
-            self._up = self._down = []
-        frames = [each for each in self._up + self._down if not self._tree.edges[each].is_static]
+        self._slowest, frames = "", []
+        with suppress(InputError):
+            up, down = self._tree.route(*self.source)
+            frames = [each for each in up + down if not self._tree.edges[each].is_static]
         self._moving = {each: self._moving.get(each, deque(maxlen=_MOST_KEPT)) for each in frames}
 
     def _move(self, frame: str, stamp_ns: int, row: _Row) -> Iterator[tuple[int, dict[str, _Row]]]:
@@ -206,6 +194,16 @@ def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
     fraction = np.array([float(stamp_ns - start_ns) / float(end_ns - start_ns)])
     (T,) = se3.interpolate(_matrices([row]), _matrices([end]), fraction)
     return *T[:3, 3].tolist(), *se3.to_quat_xyzw(T).tolist()
+
+
+def _checked(transform: PoseFields) -> _Row:
+    row = (*transform.position, *transform.quat_xyzw)
+    try:
+        check_pose(*row)
+    except InputError as error:
+        edge = f"{transform.world_frame}:{transform.sensor_frame}"
+        raise InputError(f"transform {edge}: {error}") from None
+    return row
 
 
 def _matrices(rows: ArrayLike) -> FloatArray:
