@@ -16,7 +16,7 @@ from hand_eye_calib.cli.console import (
     typed_options,
     waiting_for,
 )
-from hand_eye_calib.cli.reporting import static_transform_command, write_report
+from hand_eye_calib.cli.reporting import rendered, static_transform_command, write_report
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
@@ -74,7 +74,7 @@ def deliver(
         steps = next_steps(calibration, arguments, snapshot)
         print_result(as_text(calibration, steps, arguments.verbose))
     if arguments.out and calibration.motion_residuals:
-        write_report(arguments.out, calibration, snapshot, inputs)
+        write_report(arguments.out, lambda: rendered(calibration, snapshot, inputs))
     for one in calibration.reasons[:1] if calibration.status.failure else ():
         fail(f"{one.sentence}; do not use this result, {one.what_to_do}", _EXIT_FAILED)
     return exit_code(calibration)

@@ -61,28 +61,21 @@ def rendered(
     return render(calibration, snapshot, inputs=inputs, command=command)
 
 
-def write_report(directory: Path, *of: Any) -> None:
-    """Write the report of a calibration; the arguments are those of :func:`rendered`."""
-    write_page(directory / REPORT, lambda: rendered(*of))
+def write_report(directory: Path, render: Callable[[], str]) -> None:
+    """Write the report that a function gives, such as :func:`rendered`; if a library for it is
+    missing, say so and go on.
+    """
+    if can_draw(REPORT):
+        with waiting_for(f"writing {REPORT}"):
+            save_text(directory / REPORT, render())
+        note(f"wrote {directory / REPORT}")
 
 
-def write_rig_report(directory: Path, rig: "RigCalibration", names: Any) -> None:
-    """Write the report of a rig, whose sensors have these files, topics or frames."""
+def rendered_rig(rig: "RigCalibration", names: Any) -> str:
+    """The report of a rig, whose sensors have these files, topics or frames."""
+    from hand_eye_calib.report.rig_page import render_rig
 
-    def render() -> str:
-        from hand_eye_calib.report.rig_page import render_rig
-
-        return render_rig(rig, names)
-
-    write_page(directory / REPORT, render)
-
-
-def write_page(path: Path, render: Callable[[], str]) -> None:
-    """Write a page; if a library for it is missing, say so and go on."""
-    if can_draw(path.name):
-        with waiting_for(f"writing {path.name}"):
-            save_text(path, render())
-        note(f"wrote {path}")
+    return render_rig(rig, names)
 
 
 def can_draw(file_name: str) -> bool:
@@ -128,7 +121,8 @@ def write_session() -> None:
             found = review(result.calibration, result.snapshot, may_solve=False)
             # The file and the report beside it say the same.
             save_result(found.calibration, directory, result.inputs)
-            write_report(directory, found.calibration, result.snapshot, result.inputs)
+            of = found.calibration, result.snapshot, result.inputs
+            write_report(directory, lambda: rendered(*of))
     except (HandEyeCalibError, OSError) as error:
         sys.exit(fail(error, 1))
 
@@ -162,5 +156,5 @@ def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
     rig = solve_rig(sensors, {name: options[name] for name in of_all})
     inputs = {**result.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
-    write_rig_report(directory, rig, rig.sensors)
+    write_report(directory, lambda: rendered_rig(rig, rig.sensors))
     return [*rig.calibrations[1:]]

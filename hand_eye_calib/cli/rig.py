@@ -10,7 +10,7 @@ from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.parts import refuse_recordings
 from hand_eye_calib.cli.present import exit_code, transform_lines, wrapped
 from hand_eye_calib.cli.reading import file_settings, read_files, source_of
-from hand_eye_calib.cli.reporting import write_rig_report
+from hand_eye_calib.cli.reporting import rendered_rig, write_report
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import json_text
 
@@ -39,14 +39,13 @@ def calibrate_bag(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     trajectories = []
     with PoseBag(*arguments.paths) as bag:
         for topic in arguments.topics:
-            source = source_of(topic)
             with waiting_for(f"reading {topic}"):
-                trajectory, notes = trajectory_of(bag, source)
-            refuse_recordings(bag.paths, {source: "auto"})
+                trajectory, notes = trajectory_of(bag, source_of(topic))
             for text in notes:
                 note(text)
             frame = trajectory.sensor_frame or topic
             trajectories.append(replace(trajectory, sensor_frame=frame))
+        refuse_recordings(bag.paths, dict.fromkeys(map(source_of, arguments.topics), "auto"))
         for text in bag.warnings:
             note(text)
         inputs: dict[str, Any] = {"bag": str(bag), "topics": arguments.topics}
@@ -83,7 +82,7 @@ def _calibrate(
         print_result("\n".join(printable(line) for line in as_lines(rig)))
     if arguments.out:
         names = inputs.get("topics") or inputs["files"]
-        write_rig_report(arguments.out, rig, names)
+        write_report(arguments.out, lambda: rendered_rig(rig, names))
     failed = [each for each in rig.calibrations if each.status.failure]
     for each in failed:
         fail(f"{each.child_frame}: {each.headline}", 1)

@@ -20,7 +20,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
 from hand_eye_calib.cli.present import static_transform_command
-from hand_eye_calib.cli.reporting import write_report
+from hand_eye_calib.cli.reporting import rendered, write_report
 from hand_eye_calib.engine import evidence
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
@@ -278,7 +278,7 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
         offline_config(drive.parent, drive.child, options), drive.parent, drive.child
     )
     calibration = snapshot.estimate()
-    write_report(tmp_path, calibration, snapshot, {})
+    write_report(tmp_path, lambda: rendered(calibration, snapshot, {}))
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]

@@ -16,7 +16,6 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
-from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import scans
 from hand_eye_calib.io.bags.fields import FIELDS, FieldReader, decoder, split_fields
 from hand_eye_calib.io.bags.mcap_files import Message, MessageKind
@@ -73,7 +72,6 @@ class PoseBag:
         self._n_wrong_stamps = Counter[str]()
         self._readers: dict[str, MessageReader] = {}
         self._notes: list[str] = []
-        self._parts: dict[tuple[str, int], list[PoseBlock]] = {}
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
@@ -205,7 +203,7 @@ class PoseBag:
         """
         sources = {"parent": parent} | ({"child": child} if child else {})
         self._n_wrong_stamps = Counter()
-        self._readers, self._parts = {}, {}
+        self._readers = {}
         direct: dict[str, str] = {}
         others, transforms = dict[str, str](), dict[str, TfSource]()
         for stream, source in sources.items():
@@ -246,15 +244,7 @@ class PoseBag:
                 self._n_wrong_stamps[name] += int((~is_right).sum())
                 poses = PoseBlock.of_columns(streams[name], numbers, columns, bag_ns)
                 found.append(poses[keep & is_right])
-                if len(self.paths) > 1:
-                    self._parts.setdefault((name, kind.bag), []).append(found[-1])
             yield _in_bag_order(PoseBlock.concatenate(found))
-
-    def parts(self, topic: str) -> list[tuple[Path, Trajectory]]:
-        """The poses of a topic in each of several bags, after they were read."""
-        numbers = [number for name, number in sorted(self._parts) if name == topic]
-        found = [(number, PoseBlock.concatenate(self._parts[topic, number])) for number in numbers]
-        return [(self.paths[number], poses.trajectory()) for number, poses in found if len(poses)]
 
     def _whole(self, stream: str, columns: PoseColumns, bag_ns: Any) -> PoseBlock:
         """All poses of a source that is no topic of poses, in the order of bag time."""
