@@ -141,7 +141,7 @@ def check_streams(
     try:
         explanation = explain(aligned, thorough=correlation.is_clear)
         if correlation.is_clear and not explanation.holds:
-            pose_pairs = aligned.synchronised()
+            pose_pairs = aligned.synchronised
             motions = _motions(pose_pairs, _MAX_MOTIONS)
             findings += check_coordinates(pose_pairs, motions) or explanation.findings
         elif explanation.holds:
@@ -182,7 +182,7 @@ def _on_one_clock(
         return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
-        if len(found.synchronised()) > MIN_PAIRS and (is_near or not correlation.is_clear):
+        if len(found.synchronised) > MIN_PAIRS and (is_near or not correlation.is_clear):
             return found, replace(correlation, offset_s=0.0)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
@@ -202,7 +202,7 @@ def _check_sizes(
     """Findings about the scale, beside the one that is known, and the axes of rotation of streams
     that agree under a hypothesis, and the fit with the scale.
     """
-    pose_pairs = explanation.hypothesis.undo(streams).shifted(offset_s).synchronised()
+    pose_pairs = explanation.hypothesis.undo(streams).shifted(offset_s).synchronised
     rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
     findings, fit = _check_axes(rotations, explanation.fit.sigma_rotation), explanation.fit
     if explanation.same_unit:
@@ -223,7 +223,7 @@ def _check_agreeing(
     best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
     if copied := check_independent(streams.parent, streams.child, aligned.child):
         return [*copied, *check_same(*best)]
-    pose_pairs = replace(aligned, child=aligned.child.scaled(fit.scale)).synchronised()
+    pose_pairs = replace(aligned, child=aligned.child.scaled(fit.scale)).synchronised
     motions = _motions(pose_pairs, _MAX_MOTIONS)
     return check_agreement(pose_pairs, motions, fit.T_parent_child, best)
 

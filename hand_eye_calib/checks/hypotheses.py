@@ -81,6 +81,7 @@ class StreamPair:
         """The same with another clock of the child."""
         return replace(self, child=self.child.shifted(offset_s))
 
+    @functools.cached_property
     def synchronised(self) -> PosePairs:
         """Poses of both at common stamps."""
         return synchronise(self.parent, self.child, self.max_gap_s)
@@ -93,7 +94,7 @@ class StreamPair:
         NotEnoughDataError
             If the streams have too few in common.
         """
-        pairs = pairs_over(self.synchronised(), lag_s, max_pairs)
+        pairs = pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
             raise NotEnoughDataError(
                 f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
@@ -116,6 +117,8 @@ class Hypothesis:
 
     def undo(self, streams: StreamPair) -> StreamPair:
         """Both streams without the mistake."""
+        if not self.code:
+            return streams
         parent, child = streams.parent, streams.child
         return replace(
             streams,
