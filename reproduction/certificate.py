@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
@@ -25,22 +27,6 @@ _HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [
 _HIGHER = 1e-3
 
 
-@dataclass(frozen=True)
-class Proof:
-    """One answer: whether it was proved, and the time of the proof.
-
-    ``n_false`` counts other local minima, from rotations by pi beside it, and ``n_false_proved``
-    those that the certificate let pass.
-    """
-
-    dataset: str
-    answer: str
-    is_proved: bool
-    n_false: int
-    n_false_proved: int
-    seconds: float
-
-
 def write(name: str, results: Results) -> list[Path]:
     """Try to prove every answer and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
     datasets = [dataset for dataset in (*SIMULATED, *KITTI) if dataset in results.source.datasets]
@@ -49,12 +35,19 @@ def write(name: str, results: Results) -> list[Path]:
         for dataset in datasets
         for level in LEVELS.get(dataset, (None,))
     ]
-    proofs = [proof for found in in_parallel(prove_level, tasks, results.jobs) for proof in found]
-    groups: dict[tuple[str, str], list[Proof]] = {}
-    for proof in proofs:
-        kind = "KITTI" if proof.dataset in KITTI else "simulated"
-        groups.setdefault((kind, proof.answer), []).append(proof)
-    rows = [_row(kind, group) for (kind, _), group in groups.items()]
+    found = in_parallel(prove_level, tasks, results.jobs)
+    proofs = pd.DataFrame([proof for several in found for proof in several])
+    table = proofs.groupby(["data sets", "answer"], sort=False).agg(
+        **{
+            "answers": ("proved", "size"),
+            "proved": ("proved", "sum"),
+            "false minima near": ("false", "sum"),
+            "of them proved": ("false_proved", "sum"),
+            "median (ms)": ("ms", "median"),
+            "largest (ms)": ("ms", "max"),
+        }
+    )
+    rows = table.round({"median (ms)": 2, "largest (ms)": 1}).reset_index()
     return [
         write_csv(results.out / f"{name}.csv", rows),
         write_text(
@@ -64,19 +57,37 @@ def write(name: str, results: Results) -> list[Path]:
             "Park: the local minimum of DNL's cost from Park's rotation. False minima are other "
             "local minima of the same cost, found from rotations by pi beside the answer. "
             "Processor time of one certificate.",
-            markdown_table(rows),
+            markdown_table(rows.to_dict("records")),
         ),
     ]
 
 
-def prove_level(source: Source, dataset: str, level: float | None) -> list[Proof]:
-    """Proofs of the cases of a data set at a level."""
-    return [
-        _proof(dataset, answer, pairs, solution)
-        for case in source.cases(dataset, level)
-        for pairs in map(case.pairs, REFERENCES)
-        for answer, solution in _answers(pairs)
-    ]
+def prove_level(source: Source, dataset: str, level: float | None) -> list[dict[str, Any]]:
+    """Proofs of the cases of a data set at a level: whether each answer was proved, and how long
+    that took; other local minima, from rotations by pi beside it, and how many of them the
+    certificate let pass.
+    """
+    proofs = []
+    for case in source.cases(dataset, level):
+        for pairs in map(case.pairs, REFERENCES):
+            for answer, solution in _answers(pairs):
+                forms = quadratic_form.coefficients(pairs)
+                Q = quadratic_form.weighted_sum(forms, solution.weights)
+                start = time.process_time()
+                is_proved = is_global(Q, solution.T_parent_child)
+                seconds = time.process_time() - start
+                false = list(_false_minima(Q, solution.T_parent_child))
+                proofs.append(
+                    {
+                        "data sets": "KITTI" if dataset in KITTI else "simulated",
+                        "answer": answer,
+                        "proved": is_proved,
+                        "false": len(false),
+                        "false_proved": sum(is_global(Q, T) for T in false),
+                        "ms": 1e3 * seconds,
+                    }
+                )
+    return proofs
 
 
 def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
@@ -88,39 +99,9 @@ def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
     yield "dnl from park", replace(park, T_parent_child=minimum.T_parent_child[0])
 
 
-def _proof(dataset: str, answer: str, pairs: MotionPairs, solution: Solution) -> Proof:
-    Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
-    start = time.process_time()
-    is_proved = is_global(Q, solution.T_parent_child)
-    seconds = time.process_time() - start
-    false = list(_false_minima(Q, solution.T_parent_child))
-    return Proof(
-        dataset,
-        answer,
-        is_proved,
-        len(false),
-        sum(is_global(Q, T) for T in false),
-        seconds,
-    )
-
-
 def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatArray]:
     value = float(quadratic_form.minimise(Q, T_parent_child[None, :3, :3]).value[0])
     minimum = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
     for T, other in zip(minimum.T_parent_child, minimum.value, strict=True):
         if other > value * (1 + _HIGHER) + 1e-9 * np.trace(Q):
             yield T
-
-
-def _row(kind: str, proofs: list[Proof]) -> dict[str, object]:
-    milliseconds = [1e3 * proof.seconds for proof in proofs]
-    return {
-        "data sets": kind,
-        "answer": proofs[0].answer,
-        "answers": len(proofs),
-        "proved": sum(proof.is_proved for proof in proofs),
-        "false minima near": sum(proof.n_false for proof in proofs),
-        "of them proved": sum(proof.n_false_proved for proof in proofs),
-        "median (ms)": f"{np.median(milliseconds):.2f}",
-        "largest (ms)": f"{max(milliseconds):.1f}",
-    }
