@@ -2,7 +2,6 @@
 simulator.
 """
 
-import dataclasses
 from xml.etree import ElementTree
 
 import numpy as np
@@ -72,7 +71,7 @@ def test_rows_hold_the_errors_of_what_was_solved(rows):
     expected = metrics.errors(pairs, park.solve(pairs).T_parent_child, case.T_parent_child)
     np.testing.assert_allclose(
         [row[metric] for metric in METRICS],
-        np.array(dataclasses.astuple(expected)) * [1, 180 / np.pi, 1, 180 / np.pi],
+        np.array(expected) * [1, 180 / np.pi, 1, 180 / np.pi],
     )
     np.testing.assert_array_equal(row["T_parent_child"], park.solve(pairs).T_parent_child.ravel())
     table = table_of([row])
