@@ -445,13 +445,6 @@ def heightless(parent: Trajectory, child: Trajectory, which: float, _: Random) -
     return flat if which == 1.0 else (upright(flat[0]), upright(flat[1]))
 
 
-@_child("W9", "heading low-passed", (0.05, 0.1, 0.3), "s")
-def slow_heading(child: Trajectory, tau_s: float, _: Random) -> Trajectory:
-    angles = angles_of(child)
-    angles[:, 0] = filtered(np.unwrap(angles[:, 0]), child.stamps_ns, tau_s)
-    return turned(child, angles)
-
-
 @_child("W10", "stamps of arrival, in bursts", (0.1, 0.3, 1.0), "s")
 def in_bursts(child: Trajectory, seconds: float, _: Random) -> Trajectory:
     """The poses are held back, come together, and have stamps of when they came."""
