@@ -15,11 +15,6 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 
-# Matrices that are fewer than so many times their size are inverted faster by LAPACK, one by one,
-# than by stacked rows. So many small ones are factored faster entry by entry, all at once.
-_FEW = 3
-_MANY, _SMALL = 200, 8
-
 # The blocks that are left when they have so few rows together are one dense matrix.
 _DENSE = 64
 
@@ -38,64 +33,10 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     numpy.linalg.LinAlgError
         If a matrix is not positive definite.
     """
-    if len(matrices) >= _MANY and matrices.shape[1] <= _SMALL:
-        return _inverse_roots_by_entry(matrices)
-    lower = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
+    lower = np.linalg.cholesky(matrices)
     pivots = np.diagonal(lower, axis1=1, axis2=2)
-    log_determinants = 2.0 * np.log(pivots).sum(axis=1)
-    if len(lower) < _FEW * lower.shape[1]:
-        return np.asarray(np.linalg.inv(lower), dtype=np.float64), log_determinants
-    inverse: FloatArray = np.zeros_like(lower)
-    inverse[:, 0, 0] = 1.0 / pivots[:, 0]
-    for row in range(1, lower.shape[1]):
-        scaled = lower[:, row : row + 1, :row] / -pivots[:, row, None, None]
-        inverse[:, row : row + 1, :row] = scaled @ inverse[:, :row, :row]
-        inverse[:, row, row] = 1.0 / pivots[:, row]
-    return inverse, log_determinants
-
-
-def _inverse_roots_by_entry(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """:func:`inverse_roots` with the matrices last, so that every operation runs along them: rows
-    are eliminated in turn, and the same is done to the identity.
-    """
-    size = matrices.shape[1]
-    left: FloatArray = np.array(matrices.transpose(1, 2, 0), order="C")
-    inverse: FloatArray = np.zeros_like(left)
-    for row in range(size):
-        pivot = left[row, row]
-        if not (pivot > 0.0).all():
-            raise np.linalg.LinAlgError("not positive definite")
-        root = 1.0 / np.sqrt(pivot)
-        inverse[row, :row] *= root
-        inverse[row, row] = root
-        below = left[row + 1 :, row] * root
-        left[row + 1 :, row + 1 :] -= below[:, None] * below
-        inverse[row + 1 :, : row + 1] -= below[:, None] * inverse[row, : row + 1]
-    log_determinants = np.log(left[range(size), range(size)]).sum(axis=0)
-    return inverse.transpose(2, 0, 1).copy(), log_determinants
-
-
-def inverse_products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """``v' M^-1 v`` (n,) of positive definite matrices (n, d, d) and vectors (n, d)."""
-    if len(matrices) < _MANY or matrices.shape[1] > _SMALL:
-        return (vectors * np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]).sum(axis=1)
-    size = matrices.shape[1]
-    # The matrices last, the vectors as one more row: its elimination leaves the product.
-    rows = np.concatenate([matrices, vectors[:, None]], axis=1).transpose(1, 2, 0).copy()
-    products = np.zeros(len(vectors))
-    for row in range(size):
-        factors = rows[row + 1 :, row] / rows[row, row]
-        products += rows[size, row] * factors[-1]
-        rows[row + 1 :, row + 1 :] -= factors[:, None] * rows[row + 1 : size, row]
-    return products
-
-
-def squared(blocks: FloatArray) -> FloatArray:
-    """Products A'A (n, k, k) of matrices (n, d, k).
-
-    numpy multiplies two arrays of small matrices faster than it squares one.
-    """
-    return np.asarray(transposed(blocks) @ blocks.copy(), dtype=np.float64)
+    inverse: FloatArray = np.linalg.inv(lower)
+    return inverse, np.asarray(2.0 * np.log(pivots).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -135,7 +76,7 @@ class _Level:
         with_before[:n_behind] += to_behind @ below[:n_behind]
         with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
         with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
-        own = squared(self.inverse)
+        own = transposed(self.inverse) @ self.inverse
         own += with_before @ transposed(to_before)
         own[:n_behind] += transposed(to_behind @ with_behind)
         all_diagonal = np.empty((len(diagonal) + n_own, *diagonal.shape[1:]))
@@ -153,8 +94,8 @@ class _Level:
     def rest(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The diagonal, and the blocks below it, of the matrix that stays."""
         n_behind, diagonal = len(self.behind), diagonal[::2].copy()
-        diagonal[: len(self.before)] -= squared(self.before)
-        diagonal[1 : 1 + n_behind] -= squared(self.behind)
+        diagonal[: len(self.before)] -= transposed(self.before) @ self.before
+        diagonal[1 : 1 + n_behind] -= transposed(self.behind) @ self.behind
         return diagonal, -transposed(self.behind) @ self.before[:n_behind]
 
 

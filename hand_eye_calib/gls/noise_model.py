@@ -9,6 +9,7 @@ and one for rotation.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,11 +45,9 @@ _LONGEST_SHARE = 0.25
 # twin stamps dominate.
 _RELATIVE = (0.1, 100.0)
 
-# Errors that last are looked for at so many time constants, from a few intervals to a share of
-# the recording, where they have this share of the white and walking noise; one is tried if a step
-# of its variance alone promises to lower the loss by so much.
-_N_TAUS, _FIRST_TAU, _LAST_TAU = 2, 10.0, 0.06
-_FAINT, _PROMISING = 1e-3, 1.0
+# A search for errors that last begins at this share of the white and walking noise, and at a time
+# constant between so many intervals and this share of the recording.
+_FIRST_VARIANCE, _FIRST_TAU, _LAST_TAU = 0.1, 10.0, 0.06
 
 # Where a search starts again, no white noise and no walk is smaller than this share of the whole.
 _AUDIBLE_WHITE, _AUDIBLE_WALK = 0.1, 1e-3
@@ -180,10 +179,6 @@ class NoiseModel:
             return of_parent, of_child + turning
         return of_parent + turning, of_child
 
-    def richer(self, slow: tuple[Slow, ...]) -> NoiseModel:
-        """The same with other slow processes."""
-        return dataclasses.replace(self, slow=slow)
-
     def prior(self, levels: FloatArray) -> Prior:
         """What is known beforehand, for a search from these levels."""
         extent = self.extent
@@ -217,14 +212,18 @@ class NoiseModel:
         """Standard deviation per axis (m) of white noise and walk of a typical step."""
         return float(np.exp(0.5 * _whole(levels)[0]))
 
-    def with_faint_lasting(self, levels: FloatArray, tau_s: float) -> tuple[NoiseModel, FloatArray]:
-        """The model with all processes that last, and log levels at which they hardly count."""
-        slow_levels = []
-        for process in LASTING:
-            white, walk = _fast_levels(process)
-            whole = np.logaddexp(levels[white], levels[walk])
-            slow_levels += [whole + np.log(_FAINT), np.log(tau_s)]
-        return self.richer(LASTING), np.concatenate([levels, slow_levels])
+    def with_lasting(
+        self, processes: Sequence[Slow], levels: FloatArray
+    ) -> tuple[NoiseModel, FloatArray]:
+        """The model with processes that last, and log levels to start a search at."""
+        shortest = _FIRST_TAU * self.extent.interval_s
+        longest = max(_LAST_TAU * self.extent.duration_s, shortest)
+        whole = dict(zip(PARTS, _whole(levels), strict=True))
+        starts = [
+            [whole[process.part] + np.log(_FIRST_VARIANCE), 0.5 * np.log(shortest * longest)]
+            for process in processes
+        ]
+        return dataclasses.replace(self, slow=tuple(processes)), np.r_[levels, np.ravel(starts)]
 
     def fixed_to_body(self, levels: FloatArray) -> FloatArray:
         """Variances (6,) of the lasting errors that are fixed to the body."""
@@ -233,43 +232,6 @@ class NoiseModel:
             if process.kind == "body":
                 variances[PARTS[process.part]] += np.exp(levels[group.variance])
         return variances
-
-    def taus_s(self) -> list[float]:
-        """Time constants to look for lasting errors at."""
-        shortest = _FIRST_TAU * self.extent.interval_s
-        longest = max(_LAST_TAU * self.extent.duration_s, shortest)
-        return np.geomspace(shortest, longest, _N_TAUS).tolist()
-
-    def promising(
-        self, scores: list[tuple[float, FloatArray, FloatArray]], levels: FloatArray
-    ) -> tuple[tuple[Slow, ...], FloatArray, float]:
-        """Processes that last whose presence promises to lower the loss, log levels to start their
-        search at, and by how much they promise to lower it together.
-
-        Parameters
-        ----------
-        scores : list of (float, (m,) array, (m, m) array)
-            Time constants, and derivatives of the loss and average information at the levels of
-            :meth:`with_faint_lasting`.
-        levels : (m,) array
-            Log levels without these processes.
-        """
-        chosen, starts, total = [], [], 0.0
-        for index, process in enumerate(LASTING):
-            at = N_FAST + 2 * index
-            white, walk = _fast_levels(process)
-            faint = np.logaddexp(levels[white], levels[walk]) + np.log(_FAINT)
-            gains = [_promised(gradient, information, at) for _, gradient, information in scores]
-            best = int(np.argmax([gain for gain, _ in gains]))
-            gain, factor = gains[best]
-            if gain > _PROMISING:
-                chosen.append(process)
-                starts += [
-                    faint + np.log(np.clip(factor, 1.0, 0.3 / _FAINT)),
-                    np.log(scores[best][0]),
-                ]
-                total = max(total, gain)
-        return tuple(chosen), np.concatenate([levels, starts]), total
 
     def reduced(self, fit: Levels) -> tuple[NoiseModel, FloatArray]:
         """The model and log levels without the slow processes that make no difference."""
@@ -283,7 +245,7 @@ class NoiseModel:
             if kept
         ]
         slow = tuple(process for process, kept in zip(self.slow, keep, strict=True) if kept)
-        return self.richer(slow), np.concatenate([fit.levels[:N_FAST], *levels])
+        return dataclasses.replace(self, slow=slow), np.concatenate([fit.levels[:N_FAST], *levels])
 
     def lasting(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
@@ -308,27 +270,6 @@ def slow_directions(process: Slow, streams: Streams, to_child: FloatArray) -> Fl
 def _both_rotations(to_child: FloatArray) -> FloatArray:
     """Rotation noise, half of it the parent's, which moves the child by the lever arm."""
     return 0.5 * (_ROTATIONS + to_child @ _ROTATIONS @ to_child.T)
-
-
-def _promised(gradient: FloatArray, information: FloatArray, at: int) -> tuple[float, float]:
-    """By how much a step of one variance lowers the loss, and the factor that it multiplies it by.
-
-    White noise, jitter and walk may move along with it.
-    """
-    others = [0, 1, 2, 3, 4]
-    block = information[np.ix_(others, others)] + 0.05 * np.eye(len(others))
-    shared = information[others, at]
-    own = information[at, at] - shared @ np.linalg.solve(block, shared)
-    slope = gradient[at]
-    if slope >= 0.0 or own <= 0.0:
-        return 0.0, 1.0
-    return 0.5 * slope**2 / own, 1.0 - slope / own
-
-
-def _fast_levels(process: Slow) -> tuple[int, int]:
-    if process.part == "translation":
-        return TRANSLATION, WALK_TRANSLATION
-    return ROTATION, WALK_ROTATION
 
 
 def _whole(levels: FloatArray) -> FloatArray:

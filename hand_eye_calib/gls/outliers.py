@@ -14,7 +14,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.block_tridiagonal import inverse_products, transposed
+from hand_eye_calib.gls.block_tridiagonal import transposed
 from hand_eye_calib.gls.increments import Streams
 from hand_eye_calib.gls.reml import walk_covariance
 from hand_eye_calib.gls.state_space import WHITE, Posterior
@@ -162,7 +162,7 @@ def _chi_squares(
     """
     spread = np.where(left_out[:, None, None], prior + posterior, prior - posterior)
     spread += _ROUNDING * prior + _LEAST_VARIANCE * np.eye(6)
-    return inverse_products(spread, values)
+    return np.asarray((values * np.linalg.solve(spread, values[:, :, None])[:, :, 0]).sum(axis=1))
 
 
 def judged(

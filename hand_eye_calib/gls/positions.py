@@ -85,9 +85,8 @@ _ACCELERATING_S, _NEAR = 0.2, 2.5
 # An axis that is not known to this (m) need not settle: noise moves it on and on.
 _UNKNOWN_M = 0.2
 
-# An error that lasts is part of the model if the loss is so much lower with it; it starts at this
-# share of the rest, a logarithm.
-_LEAST_GAIN, _FIRST_SHARE = 4.0, -1.0
+# An error that lasts is part of the model if the loss is so much lower with it.
+_LEAST_GAIN = 4.0
 
 # Noise levels need no more poses than this. A jump is a step of the walk with this many times the
 # variance that it needs.
@@ -275,33 +274,22 @@ class _State:
 
     def fitted(self) -> _State:
         """With noise levels fitted."""
-        return self._likeliest([(self.model, self.levels)])[0]
-
-    def _likeliest(self, starts: list[tuple[NoiseModel, FloatArray]]) -> tuple[_State, float]:
-        """With the likeliest of some models, fitted from log levels on, and its loss."""
-        fits = [
-            (model, reml.fit(self.sampled_space(model), levels, _prior(model, levels)))
-            for model, levels in starts
-        ]
-        model, fit = min(fits, key=lambda each: each[1].loss)
-        return replace(self, model=model, levels=fit.levels), fit.loss
+        space, prior = self.sampled_space(), _prior(self.model, self.levels)
+        return replace(self, levels=reml.fit(space, self.levels, prior).levels)
 
     def with_lasting_error(self) -> _State:
-        """With an error of the positions that lasts, if the data ask for it."""
-        levels, shortest_s = self.levels, 2 * self.model.extent.interval_s
-        first = np.logaddexp(levels[TRANSLATION], levels[WALK_TRANSLATION]) + _FIRST_SHARE
-        found, loss = self._likeliest(
-            [
-                (
-                    self.model.richer((Slow(kind, "translation"),)),
-                    np.r_[levels, first, np.log(max(tau_s, shortest_s))],
-                )
-                for kind in ("body", "world")
-                for tau_s in self.model.taus_s()
-            ]
-        )
-        before = Posterior(self.sampled_space(), levels).loss
-        return found if before - loss >= _LEAST_GAIN else self
+        """With an error of the positions that lasts, fixed to the body or to the world, if the data
+        ask for it.
+        """
+        fits = []
+        for kind in ("body", "world"):
+            model, levels = self.model.with_lasting([Slow(kind, "translation")], self.levels)
+            fits.append((model, reml.fit(self.sampled_space(model), levels, _prior(model, levels))))
+        model, fit = min(fits, key=lambda each: each[1].loss)
+        before = Posterior(self.sampled_space(), self.levels).loss
+        if before - fit.loss < _LEAST_GAIN:
+            return self
+        return replace(self, model=model, levels=fit.levels)
 
     def with_outliers(self, posterior: Posterior) -> _State:
         """With jumps, which are large steps of the walk, and positions wrong by themselves."""

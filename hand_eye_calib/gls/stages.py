@@ -24,7 +24,7 @@ from hand_eye_calib.gls.increments import (
     course_of,
     linearise,
 )
-from hand_eye_calib.gls.noise_model import CENTRES, LOWEST_VARIANCE, Extent, NoiseModel
+from hand_eye_calib.gls.noise_model import CENTRES, LASTING, LOWEST_VARIANCE, Extent, NoiseModel
 from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.outliers import (
     Outliers,
@@ -164,24 +164,15 @@ def tails(problem: Problem, fit: Fit) -> Fit:
 
 def lasting(problem: Problem, fit: Fit) -> Fit:
     """Errors that last, if the data ask for them."""
-    tuning, model = problem.tuning, fit.model
+    tuning = problem.tuning
     kept = sample(len(problem.streams), tuning.most_poses_lasting)
-    scores = []
-    for tau_s in model.taus_s():
-        with_faint, faint = model.with_faint_lasting(fit.levels, tau_s)
-        posterior = Posterior(problem.space(fit, kept, with_faint), faint)
-        scores.append((tau_s, *reml.derivatives(posterior)))
-    slow, levels, promised = model.promising(scores, fit.levels)
-    if promised < tuning.least_promise:
-        return fit
-    richer = model.richer((*slow, *model.slow))
-    levels = richer.raised(levels)
-    found = reml.fit(problem.space(fit, kept, richer), levels, richer.prior(levels))
+    model, levels = fit.model.with_lasting(LASTING, fit.model.raised(fit.levels))
+    found = reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))
     before = Posterior(problem.space(fit, kept), fit.levels)
-    fit = replace(fit, n_evaluations=fit.n_evaluations + found.n_evaluations + len(scores) + 1)
+    fit = replace(fit, n_evaluations=fit.n_evaluations + found.n_evaluations + 1)
     if before.loss - found.loss < tuning.least_gain:
         return fit
-    reduced, levels = richer.reduced(found)
+    reduced, levels = model.reduced(found)
     return replace(fit, model=reduced, levels=levels)
 
 

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.gls.block_tridiagonal import Factor, inverse_roots, squared, transposed
+from hand_eye_calib.gls.block_tridiagonal import Factor, inverse_roots, transposed
 from hand_eye_calib.gls.normal import NormalEquations, multiplied
 
 WHITE = 6
@@ -141,7 +141,7 @@ class StateSpace:
         grown = np.log1p(np.exp(levels[len(self.white)]) * squares)
         share = -np.expm1(-0.5 * grown) / np.where(squares > 0.0, squares, 1.0)
         roots = roots - share * along @ (transposed(along) @ roots)
-        return squared(roots), log_determinants + grown[:, 0, 0]
+        return transposed(roots) @ roots, log_determinants + grown[:, 0, 0]
 
     def walk_covariance(self, levels: FloatArray) -> FloatArray:
         """Covariance (6, 6) of the walk over a typical increment."""

@@ -34,13 +34,12 @@ class Tuning:
     # primesense is 20 mm off at a stated 2 mm.
     strides: tuple[int, ...] = (3, 10, 30)
     fewest_strides: int = 50
-    # Errors that last are looked for if a first step promises to lower the loss by so much, and
-    # part of the model if it is so much lower in the end: two levels each, by Akaike and more.
-    least_promise: float = 2.0
+    # Errors that last are part of the model if that lowers the loss by so much: two levels each, by
+    # Akaike and more.
     least_gain: float = 4.0
     # Errors that are fixed to the body last on all scales (flicker). A recording hardly shows those
     # about as long as itself, and X takes their mean: this share of the variance of those found.
-    unseen_share: float = 0.1
+    unseen_share: float = 0.05
     # X is followed until it moves by less than this share of its sigma, or by so little (m, rad).
     max_rounds: int = 6
     settled_sigmas: float = 0.1
