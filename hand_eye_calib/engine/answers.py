@@ -16,7 +16,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import Solved, estimate_beside
+from hand_eye_calib.engine.estimation import Solved, solve_poses
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -81,7 +81,8 @@ def other_answers(
             poses = pose_pairs[part]
             if len(poses) >= _MIN_POSES:
                 with contextlib.suppress(HandEyeCalibError):
-                    found.append(estimate_beside(poses, replace(settled, reference=reference)))
+                    config = replace(settled, reference=reference)
+                    found.append(solve_poses(poses, config, is_beside=True).calibration())
         return found
 
     n_poses, own = len(pose_pairs), calibration.reference
@@ -94,11 +95,9 @@ def other_answers(
     if not METHODS[calibration.method].uses_reference or own[0] not in "BC":
         own = f"B{_BASELINES[-2]}"
     half = n_poses // 2
+    stride = _stride(n_poses - half)
     edges = ((0, half), (half, n_poses))
-    strides = [_stride(end - start) for start, end in edges]
-    halves = [
-        (_coarser(own, each), slice(*edge, each)) for edge, each in zip(edges, strides, strict=True)
-    ]
+    halves = [(_coarser(own, stride), slice(start, end, stride)) for start, end in edges]
     return answers(others), answers(halves)
 
 

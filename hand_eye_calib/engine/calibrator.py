@@ -239,13 +239,7 @@ class Calibrator:
         self._config = config
 
     def inputs(self, topics: Mapping[str, object]) -> dict[str, Any]:
-        """Options and streams in plain values: where a result came from.
-
-        Parameters
-        ----------
-        topics : mapping
-            "parent" and "child" to where their poses came from.
-        """
+        """Where a result came from, in plain values: options, and streams by their topics."""
         streams = {
             stream: {"topic": str(topic), **self.statistics(stream).to_dict()}
             for stream, topic in topics.items()
@@ -296,7 +290,7 @@ class Calibrator:
         ----------
         stream : {"parent", "child"}
         stamp_ns : int
-            Nanoseconds, on the stream's own clock.
+            On the stream's own clock.
         position : sequence of 3 floats
             Metres.
         quat_xyzw : sequence of 4 floats

@@ -158,18 +158,6 @@ def residuals_of(
     )
 
 
-def estimate_extrinsic(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
-    """Solve and assess synchronised poses: the calibration of :func:`solve_poses`."""
-    return solve_poses(pose_pairs, config).calibration()
-
-
-def estimate_beside(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
-    """The same, to be compared with a result: without a floor, or a proof that the minimum is
-    global.
-    """
-    return solve_poses(pose_pairs, config, is_beside=True).calibration()
-
-
 def solve_poses(
     pose_pairs: PosePairs,
     config: CalibratorConfig,
@@ -187,7 +175,8 @@ def solve_poses(
     time_offset : TimeOffset, optional
         That offset, if it was estimated.
     is_beside : bool
-        The answer is only to be compared with a result.
+        The answer is only to be compared with a result: without a floor, or a proof that the
+        minimum is global.
 
     Raises
     ------

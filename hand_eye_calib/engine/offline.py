@@ -151,19 +151,16 @@ def _as_trajectories(*given: object) -> list[Trajectory]:
     """Trajectories from what :data:`TrajectoryLike` names."""
     read_trajectory = upstairs("io.trajectory_files.reading", "read_trajectory")
     are_paths = [isinstance(each, str | PathLike) for each in given]
-    read: list[Trajectory] = [
-        each
-        if isinstance(each, Trajectory)
-        else read_trajectory(each, *(["auto"] if is_path else []))
-        for each, is_path in zip(given, are_paths, strict=True)
-    ]
-    if not all(are_paths):
-        return read
-    names = names_of_files([Path(str(each)) for each in given])
-    return [
-        replace(each, sensor_frame=each.sensor_frame or name)
-        for each, name in zip(read, names, strict=True)
-    ]
+    read: list[Trajectory] = []
+    for each, is_path in zip(given, are_paths, strict=True):
+        if not isinstance(each, Trajectory):
+            each = read_trajectory(each, *(["auto"] if is_path else []))
+        read.append(each)
+    if all(are_paths):
+        names = names_of_files([Path(str(each)) for each in given])
+        for k, name in enumerate(names):
+            read[k] = replace(read[k], sensor_frame=read[k].sensor_frame or name)
+    return read
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:

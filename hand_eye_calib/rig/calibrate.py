@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import estimate_extrinsic
+from hand_eye_calib.engine.estimation import solve_poses
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.errors import ConfigError, InputError
@@ -93,7 +93,7 @@ def solve_rig(
         tell(0.6 + 0.4 * index / (len(star) - 1), "closure of pairs")
         pairs = synchronise(before, after, config.max_gap)
         of_pair = {"method": answer.method, "max_pairs": max(len(pairs), 10)}
-        found = estimate_extrinsic(pairs, CalibratorConfig.from_options(of_pair))
+        found = solve_poses(pairs, CalibratorConfig.from_options(of_pair)).calibration()
         ends = before.sensor_frame, after.sensor_frame
         chain.append(replace(found, parent_frame=ends[0], child_frame=ends[1]))
     tell(1.0, "done")

@@ -183,13 +183,11 @@ def common_of(
     variances = (np.repeat(factors, 3, axis=1) * usual) ** 2
     # Half-Cauchy, on a grid of logarithms.
     log_prior = np.log(factors / (1.0 + factors**2)).sum(axis=1)
-    # Many recordings at a few factors at a time: the matrices of all would fill the memory.
-    chunks = np.array_split(np.arange(len(factors)), max(1, len(factors) * len(Ts) // 5000))
     T = start
     for _ in range(_ROUNDS):
         errors = deviation(Ts, T)
-        found = [_at_scatter(errors, covariances, variances[chunk]) for chunk in chunks]
-        means, each, likelihoods = map(np.concatenate, zip(*found, strict=True))
+        found = [_at_scatter(errors, covariances + np.diag(one)) for one in variances]
+        means, each, likelihoods = map(np.array, zip(*found, strict=True))
         shares = log_prior + likelihoods
         shares = np.exp(shares - shares.max())
         shares /= shares.sum()
@@ -201,20 +199,17 @@ def common_of(
     return T, covariance, np.sqrt(shares @ variances)
 
 
-def _at_scatter(
-    errors: FloatArray, covariances: FloatArray, variances: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Means (G, 6) of errors at variances (G, 6) of u_i, their covariances (G, 6, 6), and the
-    restricted log likelihoods (G,).
+def _at_scatter(errors: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Mean (6,) of errors (N, 6) of covariances (N, 6, 6), that of the mean (6, 6), and the
+    restricted log likelihood.
     """
-    spread = covariances + (variances[:, :, None] * np.eye(6))[:, None]
     weights = np.linalg.inv(spread)
-    each = np.linalg.inv(weights.sum(axis=1))
-    means = np.einsum("gij,gnjk,nk->gi", each, weights, errors, optimize=True)
-    rest = errors - means[:, None]
-    squared = (rest * np.einsum("gnij,gnj->gni", weights, rest)).sum(axis=(1, 2))
-    volumes = np.linalg.slogdet(spread)[1].sum(axis=1) - np.linalg.slogdet(each)[1]
-    return means, each, -0.5 * (volumes + squared)
+    covariance = np.linalg.inv(weights.sum(axis=0))
+    mean = covariance @ np.einsum("nij,nj->i", weights, errors)
+    rest = errors - mean
+    squared = (rest * np.einsum("nij,nj->ni", weights, rest)).sum()
+    volume = np.linalg.slogdet(spread)[1].sum() - np.linalg.slogdet(covariance)[1]
+    return mean, covariance, float(-0.5 * (volume + squared))
 
 
 def unknown_directions(covariance: FloatArray) -> FloatArray:

@@ -207,9 +207,6 @@ class TestNotGettingThere:
             stuck = goal.add(result(sigmas_m=sigma), seen(motion_s)).will_not_get_there
         assert stuck
 
-    def test_a_faint_hope_is_none(self):
-        assert Goal(TARGETS).add(result(sigmas_m=0.5), seen(40.0)).will_not_get_there
-
 
 @pytest.mark.parametrize(
     ("axis", "rotation_deg", "words"),

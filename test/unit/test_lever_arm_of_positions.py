@@ -130,31 +130,12 @@ class TestLeverArm:
         assert np.abs(distances(found)).max() < 3.0
         assert any("answer to acceleration" in text for text in found.noise.in_words)
 
-    def test_a_scale_is_found_if_asked_for(self, streams):
-        parent, child = streams
-        small = Trajectory(parent.stamps_ns, parent.scaled(0.5).poses, "camera")
-        found = hec.calibrate(small, child, scale="estimate")
-        assert found.scale == pytest.approx(0.5, rel=0.01)
-        assert found.T_parent_child[:3, 3] == pytest.approx(0.5 * LEVER_ARM, abs=0.02)
-
     def test_a_scale_is_within_its_sigma_whatever_the_worlds(self):
         parent, child = recorded(drift_rad=1e-3, noise_m=0.02, seed=1)
         small = Trajectory(parent.stamps_ns, parent.scaled(0.97).poses, "camera")
         found = hec.calibrate(small, child, scale="estimate")
         assert abs(found.scale - 0.97) < 4.0 * found.scale_sigma < 0.01
         assert found.T_parent_child[:3, 3] == pytest.approx(0.97 * LEVER_ARM, abs=0.02)
-
-    def test_short_windows_do_not_lead_to_a_false_minimum(self):
-        poses = swaying_poses(720, seed=4)
-        parent, child = recorded(drift_rad=3e-4, noise_m=0.001, poses=poses)
-        found = hec.calibrate(parent, child)
-        assert found.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
-
-    def test_float_solutions_of_a_receiver_leave_millimetres(self):
-        parent, child, lever_arm = simulated_positions("excavator", seed=0)
-        found = hec.calibrate(parent, child)
-        assert found.T_parent_child[:3, 3] == pytest.approx(lever_arm, abs=0.02)
-        assert found.sigmas[:2].max() < 0.004
 
     def test_a_drift_with_the_path_is_within_sigma(self):
         parent, child, lever_arm = simulated_positions("car", seed=3)
