@@ -237,9 +237,9 @@ def test_paths_that_are_no_bag(tmp_path):
     for suffix in ("bag", "mcap", "db3"):
         (tmp_path / f"empty.{suffix}").touch()
         (tmp_path / f"text.{suffix}").write_text("this is not a bag\n" * 100)
-        messages[f"empty.{suffix}"] = f"empty.{suffix} is an empty file"
-        kind = "it is cut off, damaged or of an unsupported kind"
-        messages[f"text.{suffix}"] = f"text.{suffix}: {kind}"
+        for kind in ("empty", "text"):
+            said = f"{kind}.{suffix}: it is cut off, damaged or of an unsupported kind"
+            messages[f"{kind}.{suffix}"] = said
     for name, message in messages.items():
         assert re.search(message, *read(tmp_path / name)[1]), name
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.fields import FIELDS
@@ -26,8 +27,8 @@ MALFORMED = (struct.error, ValueError)
 
 Buffer = bytes | memoryview
 
-_NS_PER_S = 1_000_000_000
-_POSE_SIZE = 7 * 8
+_NS_PER_S = STAMP_UNITS["s"]
+_POSE_SIZE = struct.calcsize("=7d")
 # Of what is no pose, the part that is not measured: at the origin, level.
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 

@@ -36,7 +36,6 @@ _REPAIRS = {
     ".bag": "'rosbag reindex'",
 }
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_PIECE_BYTES = 1 << 20
 
 
 class Storage:
@@ -253,7 +252,7 @@ def _unpack(file: Path, target: Path) -> str:
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
         while left >= 0:
             try:
-                piece = packed.read(_PIECE_BYTES)
+                piece = packed.read(BLOCK_BYTES)
             except (EOFError, zstd.ZstdError) as error:
                 return f"its compression is damaged ({reason_of(error)})"
             if not piece:
@@ -293,5 +292,3 @@ def _check_path(path: Path) -> None:
         raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; expected {_EXPECTED}")
-    if path.stat().st_size == 0:
-        raise InputError(f"bag {path} is an empty file; record it again")

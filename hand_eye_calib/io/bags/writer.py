@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import POSE_TYPES
 
 STORAGES = ("mcap", "sqlite3", "rosbag1")
-
-_NS_PER_S = 1_000_000_000
 
 Streams = Mapping[str, tuple[Trajectory, str]]
 
@@ -110,7 +109,7 @@ def stamped_messages(
     quats_xyzw = se3.to_quat_xyzw(trajectory.poses).tolist()
     for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
         header = types["std_msgs/msg/Header"](
-            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _NS_PER_S)),
+            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, STAMP_UNITS["s"])),
             frame_id=trajectory.world_frame,
             **({"seq": number} if is_ros1 else {}),
         )

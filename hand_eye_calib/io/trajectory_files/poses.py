@@ -22,7 +22,6 @@ from hand_eye_calib.io.trajectory_files.orientations import (
 from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.stats import median
 
-_NS_PER_S = 1_000_000_000
 _LARGEST_NS = int(np.iinfo(np.int64).max)
 # Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
 # mistaken.
@@ -113,7 +112,7 @@ def sorted_stamps(stamps_ns: IntArray) -> tuple[IntArray, str]:
 
 def seconds(stamp_ns: int) -> str:
     """A stamp in seconds, with all its digits."""
-    whole, nanoseconds = divmod(abs(int(stamp_ns)), _NS_PER_S)
+    whole, nanoseconds = divmod(abs(int(stamp_ns)), STAMP_UNITS["s"])
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{nanoseconds:09d}"
 
 

@@ -40,9 +40,8 @@ Line = tuple[int, str]
 AUTO = "auto"
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
-_NS_PER_S = 1_000_000_000
-# Characters of a line that a message shows, and of a reason.
-_MOST_SHOWN, _LONGEST_REASON = 60, 120
+# Characters of a line or of a reason that a message shows.
+_MOST_SHOWN = 100
 # A stamp in nanoseconds since 1970 has at least so many digits.
 _DIGITS_OF_NS = 17
 _NOT_EMPTY = re.compile("[^\n]+")
@@ -255,10 +254,8 @@ class Table:
                     self.stamps.append(_stamp([cells[index] for index in stamp_at]))
                 self.numbers.extend(float(cells[index]) for index in at)
             except ValueError as error:
-                reason = str(error)[:_LONGEST_REASON]
-                raise InputError(
-                    f"{self.path}, line {number}: expected {self.expected}; {reason}"
-                ) from None
+                reason = f"expected {self.expected}; {str(error)[:_MOST_SHOWN]}"
+                raise InputError(f"{self.path}, line {number}: {reason}") from None
             self.line_numbers.append(number)
         return self
 
@@ -283,7 +280,7 @@ def _stamp(cells: Sequence[str]) -> Decimal:
             raise ValueError(
                 f"expected whole seconds and nanoseconds; found {secs[:40]!r} and {nsecs[:40]!r}"
             )
-        return Decimal(int(secs) * _NS_PER_S + int(nsecs))
+        return Decimal(int(secs) * STAMP_UNITS["s"] + int(nsecs))
     if date := _ISO.fullmatch(cells[0]):
         day, clock, fraction, zone = date.groups()
         moment = datetime.fromisoformat(f"{day}T{clock}{zone or 'Z'}")
