@@ -5,7 +5,7 @@ in csv files, with their units; vx, vy, vz, wx, wy, wz are integrated.
 
 import json
 from collections.abc import Callable, Iterable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -94,11 +94,10 @@ class FieldReader:
                 raise InputError(
                     f"{self._topic}: a message has no {'.'.join(path)}; name other fields"
                 ) from None
-        parts = value if isinstance(value, dict) else getattr(value, "__dict__", {})
-        if "sec" in parts:
-            names = ("nanosec", "nsec", "nanosecs")
-            return f"{parts['sec']}.{next((parts[each] for each in names if each in parts), 0):09d}"
-        return str(value)
+        get = value.get if isinstance(value, dict) else partial(getattr, value)
+        if (whole := get("sec", None)) is None:
+            return str(value)
+        return f"{whole}.{get('nanosec', 0) or get('nsec', 0) or get('nanosecs', 0):09d}"
 
     def poses(self, rows: Iterable[list[str]]) -> tuple[IntArray, FloatArray, list[str]]:
         """Stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of the cells of messages, and

@@ -19,6 +19,7 @@ UNNAMED = ("q1", "q2", "q3", "q4")
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 RATES = ("wx", "wy", "wz")
 TWIST = ("vx", "vy", "vz", *RATES)
+Groups = Sequence[tuple[str, ...]]
 # Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
 # plane, fewer.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
@@ -128,50 +129,41 @@ def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -
 
 def _quantities(found: dict[str, list[int]], measures: str) -> tuple[str, ...]:
     """The quantities to read: of poses, or of the part of them that is measured; of "twists",
-    velocities.
+    velocities. The preferred ones if none are complete.
     """
     if measures in ("rates", "twists"):
         return RATES if measures == "rates" else TWIST
-    if measures == "positions":
-        return _first_complete(_ALL_POSITIONS, found)
-    orientation = _first_complete(_ALL_ORIENTATIONS, found)
-    if measures == "rotations":
-        return orientation
-    is_planar = orientation in _PLANAR_ORIENTATIONS
-    return (*_first_complete(_ALL_POSITIONS if is_planar else _POSITIONS, found), *orientation)
+    orientation = (_complete(_ALL_ORIENTATIONS, found) or _ORIENTATIONS)[0]
+    is_planar = measures == "positions" or orientation in _PLANAR_ORIENTATIONS
+    position = (_complete(_ALL_POSITIONS if is_planar else _POSITIONS, found) or _POSITIONS)[0]
+    parts = {"positions": position, "rotations": orientation}
+    return parts.get(measures, (*position, *orientation))
 
 
 def _what_is_there(found: dict[str, list[int]], names: Sequence[str]) -> str:
     """What the columns measure; poses in doubt, so that what is missing is named."""
 
-    def has_any(groups: Sequence[tuple[str, ...]]) -> bool:
+    def has_any(groups: Groups) -> bool:
         return any(name in found for group in groups for name in group)
 
-    if _has_all(_ALL_POSITIONS, found):
+    if _complete(_ALL_POSITIONS, found):
         is_oriented = has_any(_ALL_ORIENTATIONS) or any(map(_ORIENTED.search, names))
         return "poses" if is_oriented else "positions"
     if has_any(_POSITIONS):
         return "poses"
-    if _has_all((RATES,), found):
+    if _complete((RATES,), found):
         return "rates"
-    return "rotations" if _has_all(_ORIENTATIONS, found) else "poses"
+    return "rotations" if _complete(_ORIENTATIONS, found) else "poses"
 
 
-def _has_all(groups: Sequence[tuple[str, ...]], found: dict[str, list[int]]) -> bool:
-    """Whether there are columns for all of a group."""
-    return any(set(group) <= found.keys() for group in groups)
+def _complete(groups: Groups, found: dict[str, list[int]]) -> Groups:
+    """The groups of which every quantity has a column."""
+    return [group for group in groups if set(group) <= found.keys()]
 
 
 def are_columns(names: Sequence[str]) -> bool:
     """Whether these are names of columns, or some other text."""
-    return _has_all((*_ALL_POSITIONS, RATES), _matches(names))
-
-
-def _first_complete(
-    groups: Sequence[tuple[str, ...]], found: dict[str, list[int]]
-) -> tuple[str, ...]:
-    """The first group of which every quantity has a column; the first of all if none has."""
-    return next((group for group in groups if set(group) <= found.keys()), groups[0])
+    return bool(_complete((*_ALL_POSITIONS, RATES), _matches(names)))
 
 
 def _matches(names: Sequence[str]) -> dict[str, list[int]]:
