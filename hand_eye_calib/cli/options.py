@@ -139,14 +139,8 @@ def _value(field: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
-    """The options that were set, by their public names: the command line before the file.
-
-    Raises
-    ------
-    ConfigError
-        If the file sets something that does not exist or cannot be.
-    InputError
-        If the file cannot be read.
+    """The options that were set, by their public names: the command line before the file, of which
+    a ConfigError says what does not exist or cannot be.
     """
     options = _read_config(arguments.config) if arguments.config else {}
     typed = {name: value for name, value in vars(arguments).items() if name.startswith(_DEST)}

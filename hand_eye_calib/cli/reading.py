@@ -62,12 +62,8 @@ class Recording:
 
 
 def are_bags(paths: Sequence[Path | str]) -> bool:
-    """Whether these are bags, or parts of one, rather than trajectory files.
-
-    Raises
-    ------
-    ConfigError
-        If some are bags and others are not, or a file stands alone.
+    """Whether these are bags, or parts of one, rather than trajectory files; a ConfigError if some
+    are bags and others are not, or a file stands alone.
     """
     bags = [
         path

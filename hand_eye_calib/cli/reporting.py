@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from hand_eye_calib.rig.result import RigCalibration
 
 REPORT = "report.html"
-_OPTIONAL = ("jinja2", "markupsafe", "matplotlib")
 # Frame of a child sensor that names none: in a rig it has the name of its input.
 _NAMELESS = "child_sensor"
 
@@ -62,13 +61,10 @@ def rendered(
 
 
 def write_report(directory: Path, render: Callable[[], str]) -> None:
-    """Write the report that a function gives, such as :func:`rendered`; if a library for it is
-    missing, say so and go on.
-    """
-    if can_draw(REPORT):
-        with waiting_for(f"writing {REPORT}"):
-            save_text(directory / REPORT, render())
-        note(f"wrote {directory / REPORT}")
+    """Write the report that a function gives, such as :func:`rendered`."""
+    with waiting_for(f"writing {REPORT}"):
+        save_text(directory / REPORT, render())
+    note(f"wrote {directory / REPORT}")
 
 
 def rendered_rig(rig: "RigCalibration", names: Any) -> str:
@@ -76,19 +72,6 @@ def rendered_rig(rig: "RigCalibration", names: Any) -> str:
     from hand_eye_calib.report.rig_page import render_rig
 
     return render_rig(rig, names)
-
-
-def can_draw(file_name: str) -> bool:
-    """Whether the libraries for pages are installed; prints which one is missing."""
-    try:
-        import hand_eye_calib.report.report  # noqa: F401
-    except ModuleNotFoundError as error:
-        library = (error.name or "").partition(".")[0]
-        if library not in _OPTIONAL:
-            raise
-        note(f"no {file_name}: {library} is missing; pip install {library}")
-        return False
-    return True
 
 
 def save_text(path: Path, text: str) -> None:

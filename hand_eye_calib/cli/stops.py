@@ -18,12 +18,8 @@ _SUFFIXES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 
 def are_stops(arguments: Namespace) -> bool:
-    """Whether the paths are the samples of an arm, or two files whose order does not count.
-
-    Raises
-    ------
-    ConfigError
-        If the order of something else is not to count.
+    """Whether the paths are the samples of an arm, or two files whose order does not count; a
+    ConfigError if the order of something else is not to count.
     """
     if bool(arguments.target) != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
@@ -36,13 +32,7 @@ def are_stops(arguments: Namespace) -> bool:
 
 
 def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
-    """The calibration, and where the poses came from in plain values.
-
-    Raises
-    ------
-    HandEyeCalibError
-        If a file cannot be read, or the stops are too few.
-    """
+    """The calibration, and where the poses came from in plain values."""
     config = config_from(arguments)
     if len(arguments.paths) == 1:
         path = arguments.paths[0]

@@ -27,7 +27,6 @@ from hand_eye_calib.cli.batch import work as batch_work
 from hand_eye_calib.cli.batch.run import row_of, write_rows
 from hand_eye_calib.cli.batch.tasks import Task, matching, tasks_of
 from hand_eye_calib.cli.batch.work import outcomes, work
-from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
@@ -257,12 +256,12 @@ def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
 # ---- rows
 
 
-def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path, monkeypatch):
-    monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
+def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path):
+    more = ("--vehicle", "truck", "--no-report")
     tables = {}
     for jobs in ("1", "2"):
         out_dir = tmp_path / jobs
-        assert run(*fleet, "--vehicle", "truck", "--out", out_dir, "--jobs", jobs)[0] == 1
+        assert run(*fleet, *more, "--out", out_dir, "--jobs", jobs)[0] == 1
         tables[jobs] = (out_dir / "rows.csv").read_text()
     assert tables["1"] == tables["2"]
     rows = list(csv.DictReader(tables["1"].splitlines()))
@@ -407,8 +406,7 @@ def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
     ]
 
 
-def test_recordings_without_a_vehicle_are_not_judged_together(run, fleet, tmp_path, monkeypatch):
-    monkeypatch.setattr(batch_run, "can_draw", lambda page: page != REPORT)  # they take long
+def test_recordings_without_a_vehicle_are_not_judged_together(run, fleet):
     _, out, err = run(*fleet, "--jobs", "1")
     assert "3 of 4 bags calibrated, 1 failed" in out
     assert "agree" not in out

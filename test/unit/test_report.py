@@ -4,7 +4,6 @@ alone.
 
 import dataclasses
 import re
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -316,19 +315,6 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     # Names of the files, not of the folders: the page goes to customers.
     assert all(Path(file).name in page.text for file in files)
     assert str(tmp_path) not in page.text
-
-
-@pytest.mark.parametrize("library", ["jinja2", "matplotlib"])
-def test_without_the_libraries_the_rest_is_written(files, tmp_path, capsys, monkeypatch, library):
-    # Imported anew: afterwards the package has its former module again.
-    monkeypatch.setattr(hec, "report", hec.report)
-    for name in [name for name in sys.modules if name.startswith("hand_eye_calib.report")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, library, None)
-    assert calibrate(files, tmp_path / "out") in (0, 3)
-    assert f"no report.html: {library} is missing" in capsys.readouterr().err
-    assert (tmp_path / "out" / "extrinsic.yaml").exists()
-    assert not (tmp_path / "out" / "report.html").exists()
 
 
 def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):

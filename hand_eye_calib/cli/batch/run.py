@@ -20,7 +20,7 @@ from hand_eye_calib.cli.batch.work import Outcome, outcomes
 from hand_eye_calib.cli.console import STREAMS, note, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from, sources_from
 from hand_eye_calib.cli.present import deliver, exit_code, wrapped
-from hand_eye_calib.cli.reporting import REPORT, can_draw, save_text
+from hand_eye_calib.cli.reporting import REPORT, save_text
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
@@ -127,7 +127,7 @@ def _all_done(
         options=options_from(arguments),
         sources=sources_from(arguments),
         with_fingerprints=bool(out),
-        with_report=bool(out) and not arguments.no_report and can_draw(REPORT),
+        with_report=bool(out) and not arguments.no_report,
         are_files=are_files,
     )
     found: dict[str, Done] = {}
@@ -152,11 +152,7 @@ def _all_done(
 
 def stored(task: Task, directory: Path) -> Done | None:
     """What an earlier run did; None if there is nothing, it failed, or something has changed since.
-
-    Raises
-    ------
-    InputError
-        If its folder is a link out of the directory.
+    A folder that is a link out of the directory is an InputError.
     """
     folder = directory / task.name
     if folder.is_symlink() and not folder.resolve().is_relative_to(directory.resolve()):
@@ -238,15 +234,14 @@ def _write_rows_and_page(
     vehicles: Mapping[str, Calibration],
     page: str,
 ) -> None:
+    from hand_eye_calib.report.batch_page import render_batch
+
     rows = [one.row for one in done]
     write_rows(directory / names.TABLE, rows)
-    note(f"wrote {directory / names.TABLE}")
-    if can_draw(page):
-        from hand_eye_calib.report.batch_page import render_batch
-
-        linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
-        save_text(directory / page, render_batch(title, rows, vehicles, linked))
-        note(f"wrote {directory / page}")
+    linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
+    save_text(directory / page, render_batch(title, rows, vehicles, linked))
+    for name in (names.TABLE, page):
+        note(f"wrote {directory / name}")
 
 
 def _print_results(done: Sequence[Done], vehicles: Mapping[str, Calibration]) -> None:

@@ -90,12 +90,8 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
 
 
 def matching(pattern: str) -> list[str]:
-    """The bags that a pattern stands for; a path stands for itself. ``**`` finds bags alone.
-
-    Raises
-    ------
-    ConfigError
-        If there are none.
+    """The bags that a pattern stands for, or a ConfigError; a path stands for itself. ``**`` finds
+    bags alone.
     """
     found = [pattern]
     if remote.is_url(pattern):  # a question mark begins its query
