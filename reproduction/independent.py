@@ -178,13 +178,18 @@ def _poses_wxyz(path: Path) -> FloatArray:
     return np.asarray(se3.from_quat_xyzw(rows[:, 4:7], np.roll(rows[:, :4], -1, axis=1)))
 
 
+def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
+    """Navigation system and lidar of the farm robot."""
+    files = folder / "independent" / "shrimp"
+    return tuple(
+        _shrimp_trajectory(files / f"Shrimp{name}Data.mat", f"{name.lower()}Data")
+        for name in ("Nav", "Vel")
+    )
+
+
 def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
     """Random segments of a farm robot's drive, as long as those of Taylor and Nieto."""
-    sensors = []
-    for name in ("Nav", "Vel"):
-        path = folder / "independent" / "shrimp" / f"Shrimp{name}Data.mat"
-        sensors.append(_shrimp_trajectory(path, f"{name.lower()}Data"))
-    nav, velodyne = sensors
+    nav, velodyne = shrimp_sensors(folder)
     truth = np.eye(4)
     truth[:3, 3] = _SHRIMP[:3]
     truth[:3, :3] = se3.rotation_exp(_SHRIMP[3:])

@@ -111,20 +111,14 @@ def check_streams(
     Parameters
     ----------
     parent, child : Trajectory
-    time_offset_s : float
-        Known offset: seconds that are added to the child's stamps.
-    scale : float
-        Known scale: factor of the child's lengths.
+    time_offset_s, scale : float
+        Known: seconds to add to the child's stamps, and factor of its lengths.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
     correlation : Correlation, optional
         Of the angular rates of the streams as they are, if it is known.
     known : ((4, 4) array, (6,) array), optional
         An extrinsic of these streams, and its standard deviations.
-
-    Returns
-    -------
-    CheckResult
     """
     findings = _check_each(parent, child, max_gap_s, check_stream)
     if any(each.makes_unusable for each in findings):
@@ -138,18 +132,9 @@ def check_streams(
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
         return CheckResult(gravest_first([*findings, *flat]), correlation)
-    try:
-        explanation = explain(aligned, thorough=correlation.is_clear)
-        if correlation.is_clear and not explanation.holds:
-            pose_pairs = aligned.synchronised
-            motions = _motions(pose_pairs, _MAX_MOTIONS)
-            findings += check_coordinates(pose_pairs, motions) or explanation.findings
-        elif explanation.holds:
-            findings += explanation.findings
-    except NotEnoughDataError as error:
-        explanation = None
-        findings += [finding("too_short", text=str(error))] if correlation.is_clear else []
-    if explanation is None or not explanation.holds:
+    explanation, found = _explained(aligned, correlation.is_clear)
+    findings += found
+    if explanation is None:
         # Nothing is said about the rates of a frozen stream.
         if not correlation.is_clear and not frozen:
             is_still = correlation.variation < MIN_VARIATION
@@ -162,8 +147,8 @@ def check_streams(
     is_sound = not any(each.makes_unusable for each in findings)
     offset = _offset(streams, explanation, correlation)
     findings += check_offset(offset, time_offset_s)
-    more, fit = _check_sizes(streams, explanation, correlation.offset_s, scale)
-    findings += more
+    found, fit = _check_sizes(streams, explanation, correlation.offset_s, scale)
+    findings += found
     if is_sound:
         findings += _check_agreeing(streams.shifted(offset.seconds), streams, fit, known)
     return CheckResult(gravest_first(findings), correlation, explanation.fit)
@@ -185,6 +170,23 @@ def _on_one_clock(
         if len(found.synchronised) > MIN_PAIRS and (is_near or not correlation.is_clear):
             return found, replace(correlation, offset_s=0.0)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
+
+
+def _explained(streams: StreamPair, is_clear: bool) -> tuple[Explanation | None, list[Finding]]:
+    """The explanation that holds, if there is one, and findings; ``is_clear`` if the angular rates
+    agree.
+    """
+    try:
+        explanation = explain(streams, thorough=is_clear)
+    except NotEnoughDataError as error:
+        return None, [finding("too_short", text=str(error))] if is_clear else []
+    if explanation.holds:
+        return explanation, [*explanation.findings]
+    if not is_clear:
+        return None, []
+    motions = _motions(streams.synchronised, _MAX_MOTIONS)
+    found = check_coordinates(streams.synchronised, motions)
+    return None, found or [*explanation.findings]
 
 
 def _offset(streams: StreamPair, explanation: Explanation, correlation: Correlation) -> TimeOffset:

@@ -12,6 +12,8 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
+from reproduction.independent import shrimp_sensors
+from reproduction.recordings import between
 
 SENSORS = ("lidar", "radar")
 
@@ -198,6 +200,15 @@ def test_streams_of_1_hz_have_no_error(rig):
     for faster in (parent, recording.parent):
         found = calibrate(faster, child).findings
         assert [each.code for each in found if each.severity == "error"] == []
+
+
+@pytest.mark.parametrize("start_s", [68.8, 262.8, 424.9])
+def test_fifty_seconds_of_a_farm_robot_are_not_forbidden(start_s):
+    """Both worlds drift against each other, and short halves disagree by degrees."""
+    nav, velodyne = shrimp_sensors(real_data.data_folder())
+    start_ns = int(velodyne.stamps_ns[0] + start_s * 1e9)
+    pair = (between(each, start_ns, start_ns + 50 * 10**9) for each in (nav, velodyne))
+    assert calibrate(*pair).verdict is not Verdict.DO_NOT_USE
 
 
 def test_kitti_long_scale():
