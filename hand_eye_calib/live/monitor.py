@@ -236,7 +236,12 @@ class MountMonitor:
             H, S, _ = _information(residuals, jacobians, self._noise)
             shift = most_likely(H, S, _RIDGE)
             self._noise, _ = noise_covariance(residuals + jacobians @ shift)
-        floor = _floor([each for _, each in learned], self._installed)
+        parent = np.concatenate([each.Ts_parenti_parentj for _, each in learned])
+        child = np.concatenate([each.Ts_childi_childj for _, each in learned])
+        index = np.arange(len(parent))
+        pairs = MotionPairs(parent, child, index, index + 1)
+        floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed)
+        floor += shift_covariance(1e-3, 1e-4)  # never singular
         self._covariance = self._covariance + floor
         self._wander = _WANDER**2 * floor
         for second_ns, each in learned:
@@ -334,16 +339,6 @@ class MountMonitor:
         return np.repeat(seen_sigmas, 3) * self._sigmas(covariance)
 
 
-def _floor(learned: list[MotionPairs], T_parent_child: FloatArray) -> FloatArray:
-    """Common-mode floor (6, 6) of motions like these; never singular."""
-    parent = np.concatenate([each.Ts_parenti_parentj for each in learned])
-    child = np.concatenate([each.Ts_childi_childj for each in learned])
-    index = np.arange(len(parent))
-    pairs = MotionPairs(parent, child, index, index + 1)
-    floor = floor_of_pairs(pairs, np.ones(len(parent)), T_parent_child)
-    return floor + shift_covariance(1e-3, 1e-4)
-
-
 def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
     """Whether the sensors move: where they stand, noise would look like information."""
     parent = motions.Ts_parenti_parentj
@@ -395,16 +390,9 @@ def _long_run_variance(H: FloatArray, S: FloatArray, known: float) -> float:
 
 
 class MountWatch:
-    """Feeds the monitor with the pose pairs of the session, once a second.
-
-    Parameters
-    ----------
-    session : LiveSession
-    installed : callable
-        Gives the installed pose of the child's frame in the parent's; None while it is not known.
-    why_unknown : callable
-        Gives the reason for that.
-    log : NodeLog
+    """Feeds the monitor with the pose pairs of the session, once a second. ``installed`` gives the
+    pose of the child's frame in the parent's; None while it is not known, for which ``why_unknown``
+    gives the reason.
     """
 
     def __init__(

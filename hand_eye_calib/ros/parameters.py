@@ -44,7 +44,7 @@ class Parameters:
     ----------
     node : rclpy.node.Node
     qos_names : collection of str
-        Names of the QoS override parameters that the node's subscriptions will declare.
+        Of the QoS override parameters that the node's subscriptions will declare.
     on_change : callable
         Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
         new options by then.

@@ -111,17 +111,8 @@ class View:
 
 class Board:
     """Holds the newest state of one node, and makes views of it; may be used from several threads.
-
-    Parameters
-    ----------
-    wanted : str
-        Fully qualified name of the node; empty for the first that is heard, and for another one
-        when that is silent.
-
-    Attributes
-    ----------
-    topics : tuple of str
-        Lines about the topics with poses that exist.
+    The node is known by its fully qualified name; without one, it is the first that is heard, and
+    another one when that is silent. ``topics`` are lines about the topics with poses that exist.
     """
 
     def __init__(self, wanted: str = "") -> None:
