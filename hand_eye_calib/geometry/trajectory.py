@@ -240,20 +240,21 @@ class Trajectory:
         """The same poses with ``offset_s`` seconds added to every stamp, and ``rate`` seconds more
         for each second after a stamp.
         """
-        shifted = copy.copy(self)  # poses and order have been checked
         stamps_ns = self.stamps_ns + np.int64(round(offset_s * 1e9))
         if rate:
             stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
-        object.__setattr__(shifted, "stamps_ns", stamps_ns)
-        return shifted
+        return self._unchecked("stamps_ns", stamps_ns)
 
     def scaled(self, scale: float) -> Self:
         """The same rotations with every translation multiplied by ``scale``."""
-        scaled = copy.copy(self)  # in another unit, positions may be farther than FARTHEST_M
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
-        object.__setattr__(scaled, "poses", poses)
-        return scaled
+        return self._unchecked("poses", poses)  # in another unit, they may be farther away
+
+    def _unchecked(self, name: str, value: IntArray | FloatArray) -> Self:
+        changed = copy.copy(self)
+        object.__setattr__(changed, name, value)
+        return changed
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False

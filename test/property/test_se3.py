@@ -124,26 +124,3 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
 def test_a_quaternion_of_length_zero_is_refused():
     with pytest.raises(ValueError, match="length zero"):
         se3.from_quat_xyzw(np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 0]])
-
-
-@given(DIRECTIONS, st.one_of(ANGLES, st.just(np.pi)))
-def test_rotation_log_agrees_with_scipy_up_to_exact_half_turns(direction, angle):
-    from scipy.spatial.transform import Rotation
-
-    axis = np.array(direction) / np.linalg.norm(direction)
-    half_turn = 2 * np.outer(axis, axis) - np.eye(3)
-    rotation = half_turn if angle == np.pi else se3.rotation_exp(angle * axis)
-    found, expected = se3.rotation_log(rotation), Rotation.from_matrix(rotation).as_rotvec()
-    # At half a turn both signs are right.
-    np.testing.assert_allclose(
-        min(found, -found, key=lambda v: np.abs(v - expected).max()), expected, atol=1e-14
-    )
-    if angle < np.pi:
-        assert found @ expected >= 0.0
-
-
-@given(DIRECTIONS, st.floats(1e-6, np.pi - 1e-6), st.sampled_from([-3.0, -1.0, 0.5]))
-def test_quat_log_takes_any_length_and_sign(direction, angle, factor):
-    quat = unit_quat(direction, angle)
-    expected = angle * quat[:3] / np.linalg.norm(quat[:3])
-    np.testing.assert_allclose(se3.quat_log(factor * quat[None])[0], expected, rtol=0, atol=1e-14)

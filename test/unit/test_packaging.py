@@ -179,25 +179,6 @@ def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
         )
 
 
-def test_version_is_stated_once_and_known_everywhere():
-    import hand_eye_calib
-
-    version = MANIFEST.findtext("version")
-    assert re.fullmatch(r"\d+\.\d+\.\d+", version)
-    assert hand_eye_calib.__version__ == version
-    elsewhere = [
-        path
-        for path in [
-            ROOT / "setup.py",
-            ROOT / "setup.cfg",
-            ROOT / "pyproject.toml",
-            *(ROOT / PACKAGE).rglob("*.py"),
-        ]
-        if re.search(rf"(?<![\d.]){re.escape(version)}(?![\d.])", path.read_text(encoding="utf-8"))
-    ]
-    assert elsewhere == []
-
-
 def test_pip_install_gives_the_commands(source, tmp_path):
     target = tmp_path / "target"
     options = "--quiet --no-deps --no-build-isolation --no-compile --disable-pip-version-check"

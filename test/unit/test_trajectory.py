@@ -82,12 +82,3 @@ def test_shift_and_scale_keep_everything_else():
     assert (shifted.sensor_frame, scaled.world_frame) == ("lidar", "odom")
     np.testing.assert_array_equal(scaled.poses[:, :3, :3], POSES[:, :3, :3])
     np.testing.assert_array_equal(scaled.poses[:, :3, 3], 2 * POSES[:, :3, 3])
-
-
-def test_its_representation_is_one_short_line():
-    poses = np.repeat(np.eye(4)[None], 3, axis=0)
-    trajectory = Trajectory(STAMPS, poses, sensor_frame="lidar")
-    text = repr(trajectory)
-    assert text.startswith("Trajectory(3 poses over ")
-    assert text.endswith(" s, sensor_frame='lidar')")
-    assert len(text) < 80
