@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,9 @@ from hand_eye_calib.geometry.trajectory import (
     QUATERNION_NORM_TOLERANCE,
     far_position,
 )
+
+# A matrix whose rotation is further than this from one is none.
+_ROTATION_WITHIN = 1e-2
 
 # Edges that are listed in a message.
 _MOST_LISTED = 50
@@ -38,6 +42,62 @@ def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
     t, quat_xyzw = np.asarray(position, dtype=float), np.asarray(quat_xyzw, dtype=float)
     check_pose(*t.tolist(), *quat_xyzw.tolist())
     return se3.from_quat_xyzw(t, quat_xyzw)
+
+
+def pose_of(*values: Any) -> FloatArray:
+    """Pose (4, 4) of what a file has: a matrix of 12 or 16 numbers; x, y, z, qx, qy, qz, qw; a
+    message; or a translation and a rotation, as matrix, quaternion w, x, y, z, or roll, pitch and
+    yaw in degrees.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    parts = [numbers_of(value) for value in values]
+    sizes, flat, T = tuple(map(len, parts)), np.array(sum(parts, [])), np.eye(4)
+    if not np.isfinite(flat).all():
+        raise InputError("a number is not finite")
+    if sizes in ((16,), (12,)):
+        T[:3] = flat[:12].reshape(3, 4)
+    elif sizes == (7,):
+        T = checked_pose(flat[:3], flat[3:])
+    elif sizes == (3, 4):
+        T = checked_pose(flat[:3], np.roll(flat[3:], -1))
+    elif sizes == (3, 9):
+        T[:3, 3], T[:3, :3] = flat[:3], flat[3:].reshape(3, 3)
+    elif sizes == (3, 3):
+        rotation = se3.rotation_from_rpy(np.radians(flat[3:]))
+        T = se3.from_rotation_translation(rotation, flat[:3])
+    else:
+        raise InputError(
+            "expected a pose: 12 or 16 numbers of a matrix, 7 of x, y, z, qx, qy, qz, qw, or "
+            "translation and rotation"
+        )
+    rotation = se3.nearest_rotation(T[:3, :3])
+    if np.abs(rotation - T[:3, :3]).max() > _ROTATION_WITHIN:
+        raise InputError("the rotation is not one")
+    return se3.from_rotation_translation(rotation, T[:3, 3])
+
+
+def numbers_of(value: Any) -> list[float]:
+    """The numbers of nested lists, of a message, of OpenCV's matrix or of a text, in their order;
+    empty if something else is among them.
+    """
+    if isinstance(value, Mapping):
+        position = value.get("translation", value.get("position"))
+        quaternion = value.get("rotation", value.get("orientation"))
+        if isinstance(position, Mapping) and isinstance(quaternion, Mapping):
+            value = [position.get(axis) for axis in "xyz"]
+            value += [quaternion.get(axis) for axis in "xyzw"]
+        else:
+            value = value.get("data", ())
+    if isinstance(value, str):
+        value = value.split()
+    try:
+        return [float(x) for x in np.array(value, dtype=float).ravel()]
+    except (TypeError, ValueError):
+        return []
 
 
 @dataclass

@@ -14,7 +14,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.geometry.frames import FrameTree, checked_pose
+from hand_eye_calib.geometry.frames import FrameTree, numbers_of, pose_of
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_YAML
 from hand_eye_calib.io.results import FILE_NAME, load_result
@@ -29,8 +29,6 @@ from hand_eye_calib.text import parse_pose
 _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib", ".npy")
-# A matrix whose rotation is further than this from one is none.
-_ROTATION_WITHIN = 1e-2
 _EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(FORMATS)
 
 
@@ -112,62 +110,6 @@ def frames_of_bag(path: str | Path) -> FrameTree:
         return bag.static_frames()
 
 
-def pose_of(*values: Any) -> FloatArray:
-    """Pose (4, 4) of what a file has: a matrix of 12 or 16 numbers; x, y, z, qx, qy, qz, qw; a
-    message; or a translation and a rotation, as matrix, quaternion w, x, y, z, or roll, pitch and
-    yaw in degrees.
-
-    Raises
-    ------
-    InputError
-        If it is none.
-    """
-    parts = [_numbers(value) for value in values]
-    sizes, flat, T = tuple(map(len, parts)), np.array(sum(parts, [])), np.eye(4)
-    if not np.isfinite(flat).all():
-        raise InputError("a number is not finite")
-    if sizes in ((16,), (12,)):
-        T[:3] = flat[:12].reshape(3, 4)
-    elif sizes == (7,):
-        T = checked_pose(flat[:3], flat[3:])
-    elif sizes == (3, 4):
-        T = checked_pose(flat[:3], np.roll(flat[3:], -1))
-    elif sizes == (3, 9):
-        T[:3, 3], T[:3, :3] = flat[:3], flat[3:].reshape(3, 3)
-    elif sizes == (3, 3):
-        rotation = se3.rotation_from_rpy(np.radians(flat[3:]))
-        T = se3.from_rotation_translation(rotation, flat[:3])
-    else:
-        raise InputError(
-            "expected a pose: 12 or 16 numbers of a matrix, 7 of x, y, z, qx, qy, qz, qw, or "
-            "translation and rotation"
-        )
-    rotation = se3.nearest_rotation(T[:3, :3])
-    if np.abs(rotation - T[:3, :3]).max() > _ROTATION_WITHIN:
-        raise InputError("the rotation is not one")
-    return se3.from_rotation_translation(rotation, T[:3, 3])
-
-
-def _numbers(value: Any) -> list[float]:
-    """The numbers of nested lists, of a message, of OpenCV's matrix or of a text, in their order;
-    empty if something else is among them.
-    """
-    if isinstance(value, Mapping):
-        position = value.get("translation", value.get("position"))
-        quaternion = value.get("rotation", value.get("orientation"))
-        if isinstance(position, Mapping) and isinstance(quaternion, Mapping):
-            value = [position.get(axis) for axis in "xyz"]
-            value += [quaternion.get(axis) for axis in "xyzw"]
-        else:
-            value = value.get("data", ())
-    if isinstance(value, str):
-        value = value.split()
-    try:
-        return [float(x) for x in np.array(value, dtype=float).ravel()]
-    except (TypeError, ValueError):
-        return []
-
-
 def _of_numbers(text: str) -> FloatArray:
     try:
         values = parse_pose("installed", text)
@@ -232,7 +174,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
             layout, is_inverted, _ = arranged(fitting, parent_frame, child_frame)
             T = pose_of(*_of_sensors(nodes, layout.keys, {parent_frame, child_frame}))
             return se3.inverse(T) if is_inverted else T
-    if len(_numbers(document)) in (12, 16):
+    if len(numbers_of(document)) in (12, 16):
         return pose_of(document)
     raise InputError(f"expected {_EXPECTED}")
 
@@ -260,7 +202,7 @@ def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
     if {"parent", "child", "value"} <= node.keys():
         return node["parent"], node["child"], node["value"]
     if {*AXES} <= node.keys() and len(above) > 1:
-        rpy_deg = np.degrees(_numbers([node[name] for name in ROTATIONS]))
+        rpy_deg = np.degrees(numbers_of([node[name] for name in ROTATIONS]))
         return *above[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
     if isinstance(about, Mapping) and "transform" in node:  # easy_handeye2
         is_fixed = about.get("calibration_type") == "eye_on_base"

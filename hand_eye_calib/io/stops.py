@@ -16,10 +16,9 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import pose_of
 from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.installed import pose_of
 from hand_eye_calib.io.limits import LARGEST_YAML
-from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
@@ -103,6 +102,8 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
 
 
 def _document(path: Path) -> Any:
+    from hand_eye_calib.io.yaml_files import parse_foreign_yaml
+
     return parse_foreign_yaml(read_text(path, _EXPECTED, LARGEST_YAML), str(path))
 
 
