@@ -34,10 +34,10 @@ _Suspect: TypeAlias = tuple[float, Finding | None]
 
 _STREAMS = ("child", "parent")
 
-# Significance that a fault of the response needs, in standard deviations; smoothing, whose sigma
-# does not contain noise of the columns, needs more. How many times it must exceed what noise may
-# make of it.
-_SIGMAS, _SMOOTHING_SIGMAS, _BIASES = 6.0, 8.0, 2.0
+# Significance that a fault of the response needs, in standard deviations: a delay, which is most of
+# a lever arm at constant speed, needs less; smoothing, whose sigma does not contain noise of the
+# columns, needs more. How many times it must exceed what noise may make of it.
+_SIGMAS, _LATE_SIGMAS, _SMOOTHING_SIGMAS, _BIASES = 6.0, 5.0, 8.0, 2.0
 
 # Two frames are one if they are this close (m, rad), within their standard deviations. That of the
 # rotation must not be larger than this.
@@ -254,7 +254,7 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
     delay_s = float(of_positions.values[0] - of_rotations.values[0])
     sigma_s = float(np.hypot(of_positions.sigmas[0], of_rotations.sigmas[0]))
     shift_m = abs(delay_s) * _rms(speeds)
-    if abs(delay_s) > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
+    if abs(delay_s) > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
         # Which stream it is cannot be told; hardly a filter makes positions early.
         stream = "child" if delay_s > 0 else "parent"
         share = max(of_positions.share, of_rotations.share)
@@ -267,7 +267,7 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
         k, off_s, sigma_s = _odd_one(fitted)
         shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
         # The other stream's coordinate cannot be early.
-        if off_s > max(_DELAY_S, _SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
+        if off_s > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
             values = {"part": f"{'xyz'[k]} coordinates", "others": "others"}
             values |= {"delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
             is_error = shift_m > _SHIFTS_M[1]
