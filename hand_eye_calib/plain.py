@@ -55,7 +55,7 @@ def from_plain(kind: Any, value: Any) -> Any:
     args = get_args(kind)
     if get_origin(kind) in (Union, types.UnionType):
         if value is None:
-            return from_plain(types.NoneType, value)
+            return None
         wanted = [each for each in args if each is not types.NoneType]
         fitting = [each for each in wanted if get_origin(each) or is_dataclass(each)]
         fitting = fitting or [each for each in wanted if isinstance(value, each)]

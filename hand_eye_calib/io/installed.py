@@ -33,14 +33,8 @@ _EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", 
 
 
 def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
-    """The installed pose of the child sensor in the parent sensor's frame.
-
-    Parameters
-    ----------
-    text : str
-        As of :func:`open_installed`, which says what is raised, too.
-    parent_frame, child_frame : str
-        The sensors' frames.
+    """The installed pose of the child sensor in the parent sensor's frame; ``text`` and what is
+    raised are as of :func:`open_installed`.
 
     Raises
     ------

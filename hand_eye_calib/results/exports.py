@@ -189,16 +189,6 @@ _layout("opencv :parent :child T_parent_child", _OPENCV.format(key="T_parent_chi
 _layout("numpy :parent :child", "%(about)s\n%(plain_rows)s\n")
 
 
-class Arrangement(NamedTuple):
-    """A layout, whether its numbers are ``T_child_parent``, and whether the names of the frames say
-    so.
-    """
-
-    layout: Layout
-    is_inverted: bool
-    is_certain: bool
-
-
 def role_of(frame: str) -> str:
     """What a sensor is, by the name of its frame; empty if it does not say."""
     words = re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower())
@@ -209,8 +199,12 @@ def role_of(frame: str) -> str:
     return next((role for role in found if role != "base"), found[0] if found else "")
 
 
-def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> Arrangement:
-    """The layout that fits the sensors best, and which way round."""
+def arranged(
+    layouts: Sequence[Layout], parent_frame: str, child_frame: str
+) -> tuple[Layout, bool, bool]:
+    """The layout that fits the sensors best, whether its numbers are ``T_child_parent``, and
+    whether the names of the frames say so.
+    """
     roles = {"parent": role_of(parent_frame), "child": role_of(child_frame)}
     found = []
     for order, layout in enumerate(layouts):
@@ -222,7 +216,7 @@ def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> 
             matches = sum(role_at[place] == roles[place] != "" for place in places)
             misses = sum(role_at[place] not in ("", roles[place]) for place in places)
             is_natural = _RANKS.get(role_at["parent"], 0) <= _RANKS.get(role_at["child"], 0)
-            fit = Arrangement(layout, places[0] == "child", not misses)
+            fit = layout, places[0] == "child", not misses
             found.append((matches, -misses, -order, is_natural, fit))
     return max(found, key=lambda each: each[:4])[4]
 
@@ -247,8 +241,7 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
     if not usable:
         raise InputError(f"nothing is written: {headline}")
     frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
-    arrangement = arranged(FORMATS[name], *frames)
-    layout, is_inverted, _ = arrangement
+    layout, is_inverted, is_certain = arranged(FORMATS[name], *frames)
     if layout.target == _PARENT:
         frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
     unknown = [axis for axis in result.unobservable() if axis not in layout.by_axis]
@@ -271,7 +264,7 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
     lines = [
         f"{name}, by hand_eye_calib {package_version()}. {headline}",
-        *_directions(name, target, source, arrangement),
+        *_directions(name, target, source, layout, is_inverted, is_certain),
         f"Clocks: t({result.parent_frame}) = t({result.child_frame}) + "
         f"{_number(result.time_offset_s)} s, "
         + ("estimated." if result.time_offset_sigma_s else "given, not estimated."),
@@ -283,13 +276,15 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
     return layout.text % texts
 
 
-def _directions(name: str, target: str, source: str, arrangement: Arrangement) -> list[str]:
+def _directions(
+    name: str, target: str, source: str, layout: Layout, is_inverted: bool, is_certain: bool
+) -> list[str]:
     """What the numbers of a file map, in lines."""
     lines = [f"Maps coordinates of {source} into {target}: the pose of {source} in {target}."]
-    if arrangement.is_inverted:
+    if is_inverted:
         lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
-    if not arrangement.is_certain:
-        roles = [each.partition(":")[0] for each in arrangement.layout[:2]]
+    if not is_certain:
+        roles = [each.partition(":")[0] for each in layout[:2]]
         pairs = zip(roles, (target, source), strict=True)
         said = [f"{frame} is the {role}" for role, frame in pairs if role]
         lines.append(f"Assumed, as the names of the frames do not say it: {', '.join(said)}.")

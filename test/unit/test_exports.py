@@ -221,7 +221,7 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
         "",
     )
     # The name of one of both decides.
-    assert arranged(FORMATS["kalibr"], "cam0", "b").is_inverted is False
+    assert arranged(FORMATS["kalibr"], "cam0", "b")[1] is False
 
 
 @pytest.mark.parametrize(
