@@ -224,10 +224,13 @@ class Linearisation:
         Derivatives by xi in ``X Exp(xi)`` and by k parameters of systematic errors; last, e.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
+    by_scale : (n, 6, 1) array
+        Derivative by the scale.
     """
 
     columns: FloatArray
     adjoints: FloatArray
+    by_scale: FloatArray
 
     @property
     def jacobian(self) -> FloatArray:
@@ -286,9 +289,11 @@ def linearise(
     adjoints = se3.adjoint(back)
     by = np.zeros((len(step), 6, 6 + len(columns) + 1))
     np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
+    by_scale = np.zeros((len(step), 6, 1))
+    by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
     for at, index in enumerate(columns, start=6):
         if index == SCALE:
-            by[:, :3, at] = -turned(back[:, :3, :3], step)
+            by[:, :, at] = by_scale[:, :, 0]
         elif index in PARAMETERS["bias"]:
             by[:, :3, at] = turned(back[:, :3, :3], metres[:, :, index - BIAS.start])
         elif index == TIME:
@@ -298,7 +303,7 @@ def linearise(
     by[:, :, -1] = se3.log(back @ _as_child(streams.motions_p, T_parent_child))
     if error is not None:
         by[:, :, -1] += error[1:] - turned(adjoints, error[:-1])
-    return Linearisation(by, adjoints)
+    return Linearisation(by, adjoints, by_scale)
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
 stamps that jitter), the motions a random walk, and errors that last are first-order Gauss-Markov
 processes, fixed to the child's body or to the parent's world. Each has one variance for translation
-and one for rotation.
+and one for rotation. A scale that drifts is one more.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ _RELATIVE = (0.1, 100.0)
 # A search for errors that last begins at this share of the white and walking noise, and at a time
 # constant between so many intervals and this share of the recording.
 _FIRST_VARIANCE, _FIRST_TAU, _LAST_TAU = 0.1, 10.0, 0.06
+_FIRST_SCALE = np.exp(-10.0)
 
 # Where a search starts again, no white noise and no walk is smaller than this share of the whole.
 _AUDIBLE_WHITE, _AUDIBLE_WALK = 0.1, 1e-3
@@ -62,13 +63,23 @@ PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
 
 @dataclass(frozen=True)
 class Slow:
-    """A process of errors that last: ``kind`` body or world, ``part`` translation or rotation."""
+    """A process of errors that last: ``kind`` body or world, ``part`` translation or rotation; or
+    both scale.
+    """
 
     kind: str
     part: str
 
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return 1 if self.kind == "scale" else 3
 
-LASTING = tuple(Slow(kind, part) for kind in ("body", "world") for part in PARTS)
+
+LASTING = (
+    *(Slow(kind, part) for kind in ("body", "world") for part in PARTS),
+    Slow("scale", "scale"),
+)
 
 
 @dataclass(frozen=True)
@@ -137,18 +148,26 @@ class NoiseModel:
         )
 
     def _groups(self) -> tuple[Group, ...]:
+        ends = WHITE + np.cumsum([process.size for process in self.slow], dtype=int)
         return tuple(
-            Group(slice(WHITE + 3 * k, WHITE + 3 * k + 3), N_FAST + 2 * k, N_FAST + 2 * k + 1)
-            for k in range(len(self.slow))
+            Group(slice(end - process.size, end), N_FAST + 2 * k, N_FAST + 2 * k + 1)
+            for k, (process, end) in enumerate(zip(self.slow, ends.tolist(), strict=True))
         )
 
     def _entries(
         self, streams: Streams, linearisation: Linearisation, to_child: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        white = np.broadcast_to(np.eye(6), (len(streams), 6, 6))
-        lasting = [slow_directions(process, streams, to_child) for process in self.slow]
-        directions = np.concatenate([white, *lasting], axis=2)
-        return directions[1:], linearisation.adjoints @ directions[:-1]
+        ahead = [np.broadcast_to(np.eye(6), (len(streams) - 1, 6, 6))]
+        behind = [linearisation.adjoints]
+        for process in self.slow:
+            if process.kind == "scale":
+                ahead.append(np.zeros_like(linearisation.by_scale))
+                behind.append(-linearisation.by_scale)
+                continue
+            directions = slow_directions(process, streams, to_child)
+            ahead.append(directions[1:])
+            behind.append(linearisation.adjoints @ directions[:-1])
+        return np.concatenate(ahead, axis=2), np.concatenate(behind, axis=2)
 
     def _white_rotation(self, streams: Streams, to_child: FloatArray) -> FloatArray:
         if self.centre == "sensors":
@@ -218,11 +237,9 @@ class NoiseModel:
         """The model with processes that last, and log levels to start a search at."""
         shortest = _FIRST_TAU * self.extent.interval_s
         longest = max(_LAST_TAU * self.extent.duration_s, shortest)
-        whole = dict(zip(PARTS, _whole(levels), strict=True))
-        starts = [
-            [whole[process.part] + np.log(_FIRST_VARIANCE), 0.5 * np.log(shortest * longest)]
-            for process in processes
-        ]
+        first = dict(zip(PARTS, _whole(levels) + np.log(_FIRST_VARIANCE), strict=True))
+        first["scale"] = np.log(_FIRST_SCALE)
+        starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
         return dataclasses.replace(self, slow=tuple(processes)), np.r_[levels, np.ravel(starts)]
 
     def fixed_to_body(self, levels: FloatArray) -> FloatArray:
@@ -254,8 +271,9 @@ class NoiseModel:
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         error = np.zeros((len(states), 6))
         for process, group in zip(self.slow, self._groups(), strict=True):
-            directions = slow_directions(process, streams, to_child)
-            error += (directions @ states[:, group.states, None])[:, :, 0]
+            if process.kind != "scale":
+                directions = slow_directions(process, streams, to_child)
+                error += (directions @ states[:, group.states, None])[:, :, 0]
         return error
 
 

@@ -335,6 +335,8 @@ class LeverArmSolution(ModelSolution):
 
 
 def _slow_in_words(slow: CorrelatedError) -> str:
+    if slow.kind == "scale":
+        return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
     size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
     return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
 
