@@ -228,16 +228,15 @@ def _freed(problem: Problem, fit: Fit) -> Fit:
 
 
 def is_settled(problem: Problem, fit: Fit) -> bool:
-    """Whether the next step is small beside its sigmas, but for a translation that the rotations
-    hardly reveal: noise moves it on and on.
+    """Whether the next step is small beside its sigmas, but for translations that the motion does
+    not reveal.
     """
     tuning, normal = problem.tuning, problem.posterior(fit).normal
     variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
-    known = axes if variances[2] < tuning.most_uneven * variances[1] else axes[:, :2]
-    steps = np.concatenate([known.T @ normal.step[:3], normal.step[3:]])
-    of_axes = np.diag(known.T @ normal.covariance[:3, :3] @ known)
-    sigmas = np.sqrt(np.maximum(np.r_[of_axes, np.diag(normal.covariance)[3:]], 0.0))
+    steps = np.r_[axes.T @ normal.step[:3], normal.step[3:]]
+    sigmas = np.sqrt(np.maximum(np.r_[variances, np.diag(normal.covariance)[3:]], 0.0))
     limits = np.maximum(tuning.settled_sigmas * sigmas, tuning.settled_step)
+    limits[:3][sigmas[:3] > tuning.unknown_m] = np.inf
     return bool((np.abs(steps) < limits).all())
 
 

@@ -44,8 +44,8 @@ class Tuning:
     max_rounds: int = 6
     settled_sigmas: float = 0.1
     settled_step: float = 1e-9
-    # A translation whose variance is this many times that of the next one need not settle.
-    most_uneven: float = 9.0
+    # A translation that is not known to this (m) need not settle: noise moves it on and on.
+    unknown_m: float = 0.2
     # Standard deviations of systematic errors beforehand: of a scale, of a bias along each axis
     # (m/m), of a time offset (s), of a bias of rates (rad/s), if they are there, at these odds;
     # and the one that stands for none. A time offset that is not known beforehand is all but
