@@ -55,7 +55,7 @@ CHANGES = {
     "keyframe.min_interval": (0.45, {}),
     "max_gap": (0.05, {}),
     "time_offset": (0.03, {}),
-    "scale": (1.5, {}),
+    "scale": (2, {}),
     "parent_scale": (1.5, {}),
     **{f"{each}_invert": ("poses", {}) for each in ("parent", "child")},
     **{f"{each}_quaternion": ("wxyz", {}) for each in ("parent", "child")},

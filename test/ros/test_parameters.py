@@ -2,10 +2,8 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
-from geometry_msgs.msg import TransformStamped
-from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
+from ros_harness import RELIABLE_INPUTS, drive
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
 from hand_eye_calib.methods import METHODS
@@ -68,26 +66,6 @@ def test_changes_are_applied_or_rejected_with_the_reason(start_node, peer):
         assert reason in result.reason
         assert peer.parameter(name) == before
     assert "; dnl B3: " in peer.trigger("solve").message
-
-
-def test_scale_takes_a_word_or_a_number(start_node, peer):
-    start_node("-p solve_period:=1000.0", "-p scale:=2.0", *RELIABLE_INPUTS)
-    stamps_ns, Ts_pw_p, Ts_cw_c = drive()
-    Ts_cw_c[:, :3, 3] /= 2.0
-    _, extrinsic = peer.solve(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
-    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
-    heard = peer.listen(TransformStamped, "extrinsic")
-    assert peer.set_parameter("scale", "none").successful
-    peer.trigger("solve")
-    peer.spin_until(
-        lambda: heard and not np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3),
-        "the unscaled result",
-    )
-    assert peer.set_parameter("scale", 2).successful
-    peer.trigger("solve")
-    peer.spin_until(
-        lambda: np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3), "the scaled result"
-    )
 
 
 @pytest.mark.parametrize(

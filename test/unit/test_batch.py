@@ -205,19 +205,6 @@ def test_a_recording_of_which_workers_die_takes_no_other_along():
     assert found == dict.fromkeys(NAMES[:-1], "done")
 
 
-def test_a_dask_cluster_does_what_a_worker_that_dies_had_to_do(tmp_path):
-    distributed = pytest.importorskip(
-        "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
-    )
-    tasks = some_tasks(*NAMES, b={"marker": str(tmp_path / "marker")})
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as cluster:
-        found = done_by(tasks, dies_once, dask=cluster.scheduler_address)
-    assert found == dict.fromkeys(NAMES, "done")
-    assert (tmp_path / "marker").exists()
-
-
 def ended(pidfd, within_s=120):
     """Wait for a process to end."""
     return bool(select.select([pidfd], [], [], within_s)[0])

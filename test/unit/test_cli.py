@@ -457,15 +457,6 @@ def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     assert seen == [arguments, []]
 
 
-def test_a_missing_optional_package_breaks_only_its_command(refused, run, tmp_path, monkeypatch):
-    hec.save(solved(), tmp_path / "result")
-    monkeypatch.setitem(sys.modules, "rosbags", None)
-    assert "writing bags needs rosbags, which is not installed" in refused(
-        "simulate", "--out", tmp_path / "runs", "--poses", "30", "--bag", "mcap"
-    )
-    assert run("info", tmp_path / "result")[0] == 0
-
-
 def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
     for module in [name for name in sys.modules if name.startswith("hand_eye_calib.ros")]:
         monkeypatch.delitem(sys.modules, module)

@@ -259,13 +259,6 @@ def calibrate(run, tmp_path):
     return lambda: run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0]
 
 
-def test_earlier_results_are_kept_whatever_they_hold(calibrate, tmp_path):
-    (tmp_path / "out" / "extrinsic.yaml").write_bytes(b"\xff\xfe not text")
-    assert calibrate() == 0
-    assert (tmp_path / "out" / "previous" / "extrinsic.yaml").read_bytes() == b"\xff\xfe not text"
-    assert load_result(tmp_path / "out").method == "park"
-
-
 def test_links_are_replaced_and_not_followed(calibrate, tmp_path):
     names = ("extrinsic.yaml", "extrinsic.urdf.xacro", "static_transform.launch.py", "report.html")
     for name in names:

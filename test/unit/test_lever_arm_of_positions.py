@@ -250,11 +250,6 @@ class TestLeverArm:
         flat = recorded(drift_rad=0.0, poses=planar_poses(200, seed=3))
         assert codes(*flat) == ["one_axis"]
 
-    def test_it_survives_a_file(self, result, tmp_path):
-        again = hec.load(hec.save(result, tmp_path))
-        assert again.out_of_reach == ("roll", "pitch", "yaw")
-        assert "MEASURE_ROLL_BY_HAND" in (tmp_path / "extrinsic.urdf.xacro").read_text()
-
 
 def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, capsys):
     parent, child = streams

@@ -22,38 +22,29 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 # Library imported: (requirement in setup.py, key in package.xml); None where that side has no say,
 # as with pip and launch.
 DECLARED_AS = {
+    # Optional, or without a rosdep key: mcap is for damaged files alone.
+    **{name: (name, None) for name in ("mcap", "fsspec", "small_gicp", "argcomplete", "segno")},
+    **{name: (name, None) for name in ("pandas", "pyulog")},
     "backports": ("backports.zstd", None),  # rosbags requires it too
     "compression": (None, None),  # the standard library of Python 3.14
-    "mcap": ("mcap", None),  # for damaged mcap files alone; there is no rosdep key
-    "dask": ("distributed", None),  # optional, for replay --batch --dask alone
-    "fsspec": ("fsspec", None),  # optional, for bags at URLs alone
-    "cv2": ("opencv-python-headless", None),  # optional, for images of a target alone
-    "small_gicp": ("small_gicp", None),  # optional, for points of a lidar alone
-    "argcomplete": ("argcomplete", None),  # optional, for the command completion alone
-    "segno": ("segno", None),  # optional, for the QR code of watch --web alone
+    "dask": ("distributed", None),
+    "cv2": ("opencv-python-headless", None),
     "casadi": ("casadi", "casadi-pip"),
     "jinja2": ("jinja2", "python3-jinja2"),
     "matplotlib": ("matplotlib", "python3-matplotlib"),
     "numpy": ("numpy", "python3-numpy"),
-    "pandas": ("pandas", None),  # optional, for tables in Python
-    "pyulog": ("pyulog", None),  # optional, for logs of PX4 alone
     "rich": ("rich", "python3-rich"),
     "rosbags": ("rosbags", "python3-rosbags-pip"),
     "scipy": ("scipy", "python3-scipy"),
     "yaml": ("PyYAML", "python3-yaml"),
-    "ament_index_python": (None, "ament_index_python"),
-    "builtin_interfaces": ("ros-jazzy-common-interfaces", "builtin_interfaces"),
-    "diagnostic_msgs": ("ros-jazzy-common-interfaces", "diagnostic_msgs"),
-    "geometry_msgs": ("ros-jazzy-common-interfaces", "geometry_msgs"),
-    "launch": (None, "launch"),
-    "launch_ros": (None, "launch_ros"),
-    "nav_msgs": ("ros-jazzy-common-interfaces", "nav_msgs"),
-    "sensor_msgs": ("ros-jazzy-common-interfaces", "sensor_msgs"),
-    "rcl_interfaces": ("ros-jazzy-rclpy", "rcl_interfaces"),
-    "rclpy": ("ros-jazzy-rclpy", "rclpy"),
-    "std_msgs": ("ros-jazzy-common-interfaces", "std_msgs"),
-    "std_srvs": ("ros-jazzy-common-interfaces", "std_srvs"),
-    "tf2_msgs": (None, "tf2_msgs"),  # not among the wheels; publish_tf alone needs it
+    **{name: ("ros-jazzy-rclpy", name) for name in ("rclpy", "rcl_interfaces")},
+    **{
+        name: ("ros-jazzy-common-interfaces", name)
+        for name in ("builtin_interfaces", "std_srvs")
+        + tuple(f"{kind}_msgs" for kind in ("diagnostic", "geometry", "nav", "sensor", "std"))
+    },
+    # tf2_msgs is not among the wheels; publish_tf alone needs it.
+    **{name: (None, name) for name in ("ament_index_python", "launch", "launch_ros", "tf2_msgs")},
 }
 
 

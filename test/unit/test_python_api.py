@@ -116,11 +116,6 @@ class TestOptionsOfCalibrate:
         )
         assert offline_config(long, long, {"max_pairs": 2_000_000}).max_pairs == 2_000_000
 
-    def test_other_objects_are_refused_by_name(self):
-        parent, child = streams()
-        with pytest.raises((ConfigError, InputError), match="times"):
-            hec.calibrate(parent, child.poses)
-
     def test_progress_is_told_and_changes_nothing(self):
         parent, child = streams()
         told = []
@@ -248,17 +243,3 @@ class TestAnswerOfTheMethod:
         np.testing.assert_array_equal(loaded.T_method, result.T_method)
         del document["T_method"]
         assert hec.Calibration.from_dict(document).T_method is None
-
-
-@pytest.mark.parametrize(
-    ("option", "guess"),
-    [
-        ({"method": "dlno"}, "dnlo"),
-        ({"backend": "ipotp"}, "ipopt"),
-        ({"scale": "atuo"}, "auto"),
-        ({"max_gp": 1.0}, "max_gap"),
-    ],
-)
-def test_a_misspelt_option_or_value_is_answered_with_a_guess(option, guess):
-    with pytest.raises(ConfigError, match=rf"did you mean {guess}\?"):
-        CalibratorConfig.from_options(option)

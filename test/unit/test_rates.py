@@ -139,12 +139,6 @@ class TestRates:
         with pytest.raises(ConfigError, match="a cross-check needs poses"):
             hec.cross_check(result, *streams)
 
-    def test_it_survives_a_file(self, result, tmp_path):
-        again = hec.load(hec.save(result, tmp_path))
-        assert (again.measured, again.rate_bias) == (result.measured, result.rate_bias)
-        assert again.out_of_reach == ("x", "y", "z")
-        assert "MEASURE_X_BY_HAND" in (tmp_path / "extrinsic.urdf.xacro").read_text()
-
     def test_positions_and_rates_show_nothing_together(self, streams):
         parent, child = streams
         with pytest.raises(ConfigError, match="beside poses"):

@@ -38,9 +38,15 @@ def test_help_loads_no_library(arguments):
     assert not loaded_by(SHOW_HELP, *arguments, "--help") & HEAVY
 
 
-def test_the_engine_loads_only_what_it_computes_with():
-    code = "import sys, hand_eye_calib.engine.calibrator; print(*sys.modules, file=sys.stderr)"
-    loaded = loaded_by(code)
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import hand_eye_calib.engine.calibrator",
+        "import hand_eye_calib as hec; hec.Trajectory; hec.Calibration; hec.calibrate",
+    ],
+)
+def test_the_engine_loads_only_what_it_computes_with(code):
+    loaded = loaded_by(f"{code}; import sys; print(*sys.modules, file=sys.stderr)")
     assert not {name.partition(".")[0] for name in loaded} & (HEAVY - {"numpy", "scipy"})
     # Any part of scipy takes as long as all the rest, but for the wrapper of LAPACK alone.
     assert {name for name in loaded if name.startswith("scipy")} <= {"scipy.linalg._flapack"}
