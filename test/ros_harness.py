@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from motions import disturbed
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -45,6 +45,11 @@ RELIABLE_INPUTS = [
 ]
 
 _domains = itertools.count(os.getpid())
+
+
+def values_of(status):
+    """Keys and values of a diagnostic status."""
+    return {pair.key: pair.value for pair in status.values}
 
 
 def free_domain():
@@ -280,6 +285,16 @@ class Peer:
         self.node.create_subscription(kind, f"{self.target}/{name}", heard.append, LATCHED)
         return heard
 
+    def diagnostics(self):
+        """Dictionary that fills with the newest status of each name."""
+        newest = {}
+
+        def take(array):
+            newest.update({each.name: each for each in array.status})
+
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+        return newest
+
     def ask(self, kind, name, request=None):
         """Future of a service's answer."""
         if name not in self._clients:
@@ -328,7 +343,6 @@ class Peer:
 
     def set_parameter(self, name, value):
         parameter = Parameter(name, value=value).to_parameter_msg()
-        assert isinstance(parameter, ParameterMessage)
         (result,) = self.call(
             SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])
         ).results

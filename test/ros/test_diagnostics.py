@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from faults import inverted, reordered
-from ros_harness import LATCHED, RELIABLE_INPUTS, drive, message
+from ros_harness import LATCHED, RELIABLE_INPUTS, drive, message, values_of
 from std_msgs.msg import String
 
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -59,17 +59,15 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
 def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     start_node("-r __ns:=/robot1", "-p target.translation:=0.03")
     start_node("-r __node:=other")
-    heard, states = [], []
-    peer.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    statuses, states = peer.diagnostics(), []
     topic = "/robot1/calibrator/progress"
     peer.node.create_subscription(String, topic, states.append, LATCHED)
-    statuses = lambda: {each.name: each for array in heard for each in array.status}  # noqa: E731
-    peer.spin_until(lambda: states and len(statuses()) == 2 * len(PARTS), "both nodes")
+    peer.spin_until(lambda: states and len(statuses) == 2 * len(PARTS), "both nodes")
     names = [f"{node}: {part}" for node in ("/robot1/calibrator", "/other") for part in PARTS]
-    assert set(statuses()) == set(names)
-    said, document = statuses()["/robot1/calibrator: progress"], json.loads(states[-1].data)
+    assert set(statuses) == set(names)
+    said, document = statuses["/robot1/calibrator: progress"], json.loads(states[-1].data)
     assert said.message == document["progress"]["text"]
-    values = {pair.key: pair.value for pair in said.values}
+    values = values_of(said)
     assert (said.level, said.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
     z = [values[f"{name}.z"] for name in ("sigma", "target")]
     assert (values["done"], *z) == ("false", "unknown", "0.03")

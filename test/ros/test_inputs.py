@@ -6,11 +6,10 @@ import time
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, message
+from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, message, values_of
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
@@ -143,13 +142,12 @@ def test_the_qos_of_one_input_is_not_that_of_the_other(start_node, peer):
 
 def test_a_qos_that_keeps_messages_away_is_named(start_node, peer):
     start_node(*QUIET)
-    heard = []
-    peer.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    statuses = peer.diagnostics()
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     peer.node.create_publisher(Odometry, "parent_odom", best_effort)
     said = "no message on /parent_odom yet: it is published best effort, and qos_overrides ask"
     peer.spin_until(
-        lambda: heard and any(each.message.startswith(said) for each in heard[-1].status), "that"
+        lambda: any(each.message.startswith(said) for each in statuses.values()), "that"
     )
 
 
@@ -218,20 +216,8 @@ class TestRefusedInput:
 class TestLoss:
     """Messages that are lost on the way are counted, to within two in a hundred."""
 
-    @pytest.fixture
-    def counted(self, peer):
-        """Values of the inputs' newest statuses."""
-        newest = {}
-
-        def take(array):
-            for each in array.status:
-                values = {pair.key: pair.value for pair in each.values}
-                newest[each.name.rpartition(": ")[2]] = values | {"said": each.message}
-
-        peer.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
-        return newest
-
-    def test_a_node_that_does_not_keep_up(self, start_node, peer, counted):
+    def test_a_node_that_does_not_keep_up(self, start_node, peer):
+        statuses = peer.diagnostics()
         node = start_node("-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom")
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         publishers = [
@@ -253,8 +239,8 @@ class TestLoss:
             for publisher in publishers:
                 pose = message(Odometry, START_NS + 2_500_000 * index, Ts_pw_p[-1], "lidar")
                 publisher.publish(pose)
-            for name in ("parent input", "child input"):
-                values = counted.get(name, {})
+            for name in ("/calibrator: parent input", "/calibrator: child input"):
+                values = values_of(statuses[name]) if name in statuses else {}
                 if values.get("lost", "unknown") == "unknown":
                     return False
                 received, lost = (int(values[key]) for key in ("messages", "lost"))

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, values_of
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
@@ -17,21 +17,12 @@ NUMBERS = " ".join(
 @pytest.fixture
 def status(peer):
     """``status(part, condition)``: the first status of a part that meets a condition."""
-    heard = []
-    peer.node.create_subscription(
-        DiagnosticArray,
-        "/diagnostics",
-        lambda array: heard.append({each.name: each for each in array.status}),
-        10,
-    )
+    statuses = peer.diagnostics()
 
     def wait(part, condition):
         name = f"/calibrator: {part}"
-        peer.spin_until(
-            lambda: heard and name in heard[-1] and condition(heard[-1][name]), f"such a {part}"
-        )
-        found = heard[-1][name]
-        return found, {pair.key: pair.value for pair in found.values}
+        peer.spin_until(lambda: name in statuses and condition(statuses[name]), f"such a {part}")
+        return statuses[name], values_of(statuses[name])
 
     return wait
 
@@ -51,7 +42,7 @@ def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, t
     peer.solve(peer.publishers(), *noisy(*drive(400)))
 
     def is_told(each):
-        told = {pair.key: pair.value for pair in each.values}
+        told = values_of(each)
         # Not the one of an early solve, of a few poses.
         return (
             told.get("comparison.verdict") == "moved" and float(told["comparison.sigma.z"]) < 0.02

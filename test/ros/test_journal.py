@@ -6,7 +6,7 @@ import signal
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
@@ -138,11 +138,10 @@ def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
     node = start_node(*QUIET, *into(blocked / "out"))
     node.wait_for_log("cannot write the session journal in")
     assert peer.solve(peer.publishers(), *drive())[0].success
-    heard = []
-    peer.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    statuses, name = peer.diagnostics(), "/calibrator: journal"
     error = "a crash would lose the session"
-    peer.spin_until(lambda: heard and error in heard[-1].status[-1].message, "the status")
-    assert heard[-1].status[-1].level == DiagnosticStatus.ERROR
+    peer.spin_until(lambda: name in statuses and error in statuses[name].message, "the status")
+    assert statuses[name].level == DiagnosticStatus.ERROR
     refused = peer.trigger("save")
     assert (refused.success, str(blocked) in refused.message) == (False, True)
     assert peer.trigger("solve").success

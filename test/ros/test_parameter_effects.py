@@ -9,12 +9,12 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from ros_harness import (
@@ -38,6 +38,7 @@ from hand_eye_calib.io.journal import has_session
 PROJECT = Path(__file__).resolve().parents[2]
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 LAX = {"threshold": 1e-9}
+STREAMS = ("parent", "child")
 T_PARENT_REAR = se3.exp(np.array([-1.0, 0.1, 0.3, 0.2, 0.1, 2.5]))
 
 # Parameters that change the answer while the node runs: another value, and what has to be set
@@ -57,19 +58,14 @@ CHANGES = {
     "time_offset": (0.03, {}),
     "scale": (2, {}),
     "parent_scale": (1.5, {}),
-    **{f"{each}_invert": ("poses", {}) for each in ("parent", "child")},
-    **{f"{each}_quaternion": ("wxyz", {}) for each in ("parent", "child")},
-    "parent_kind": ("exact", {}),
-    "child_kind": ("exact", {}),
+    **{f"{each}_invert": ("poses", {}) for each in STREAMS},
+    **{f"{each}_quaternion": ("wxyz", {}) for each in STREAMS},
+    **{f"{each}_kind": ("exact", {}) for each in STREAMS},
     "target.translation": (1e-5, {}),
     "target.rotation": (1e-5, {}),
     "target.axes": ("yaw=1e-5", {}),
-    "prior.x": ("1+/-0.001", {}),
-    "prior.y": ("1+/-0.001", {}),
-    "prior.z": ("1+/-0.001", {}),
-    "prior.roll": ("10deg+/-0.01deg", {}),
-    "prior.pitch": ("10deg+/-0.01deg", {}),
-    "prior.yaw": ("10deg+/-0.01deg", {}),
+    **{f"prior.{each}": ("1+/-0.001", {}) for each in "xyz"},
+    **{f"prior.{each}": ("10deg+/-0.01deg", {}) for each in ("roll", "pitch", "yaw")},
     "prior.transform": ("1 1 1 0.1 0.1 0.1+/-0.001 0.001", {}),
 }
 
@@ -235,34 +231,21 @@ def publish_tf_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 0, "the node to stop that")
 
 
-def tf_is_used(start_node, peer, tmp_path, stream):
+def tf_is_used(start_node, peer, tmp_path, name, value, topic):
+    node = start_node(*QUIET, f"-p {name}:={value}")
     if importlib.util.find_spec("tf2_msgs") is None:
-        node = start_node(*QUIET, f"-p {stream}_tf:=odom:lidar")
         assert node.wait() == 1
         assert node.log.startswith(
-            f"calibrator: {stream}_tf needs the message package tf2_msgs, which is not installed"
+            f"calibrator: {name} needs the message package tf2_msgs, which is not installed"
         )
         return
-    node = start_node(*QUIET, f"-p {stream}_tf:=odom:lidar")
-    node.wait_for_log("transform odom:lidar")
-    peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 1, "the node to listen to /tf")
+    peer.spin_until(lambda: peer.node.count_subscribers(topic) == 1, f"a listener to {topic}")
 
 
 def installed_is_used(start_node, peer, tmp_path):
     node = start_node("-p solve_period:=0.2", "-p installed:=1 2 3 0 0 0", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())
     node.wait_for_log("installed is what 1 2 3 0 0 0 says")
-
-
-def base_frame_is_used(start_node, peer, tmp_path):
-    node = start_node(*QUIET, "-p base_frame:=base_link")
-    if importlib.util.find_spec("tf2_msgs") is None:
-        assert node.wait() == 1
-        assert node.log.startswith("calibrator: base_frame needs the message package tf2_msgs")
-        return
-    peer.spin_until(
-        lambda: peer.node.count_subscribers("/tf_static") == 1, "the node to listen to /tf_static"
-    )
 
 
 def enabled_is_used(start_node, peer, tmp_path):
@@ -275,27 +258,25 @@ def enabled_is_used(start_node, peer, tmp_path):
 
 def monitor_is_used(start_node, peer, tmp_path):
     start_node(*QUIET, "-p monitor:=true", "-p installed:=0 0 0 0 0 0")
-    heard = []
-    peer.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
-    peer.spin_until(lambda: heard, "diagnostics")
-    names = [status.name for status in heard[-1].status]
-    assert names == [f"/calibrator: {part}" for part in ("mount", "parent input", "child input")]
+    statuses = peer.diagnostics()
+    peer.spin_until(lambda: statuses, "diagnostics")
+    assert list(statuses) == [
+        f"/calibrator: {part}" for part in ("mount", "parent input", "child input")
+    ]
     # Its page has a button that ends the watch, and calibrates anew.
     assert peer.set_parameter("monitor", False).successful
     peer.solve(peer.publishers(), *drive(60))
-    peer.spin_until(lambda: len(heard[-1].status) > 3, "the state of a calibration")
-    assert {each.name for each in heard[-1].status} >= {"/calibrator: extrinsic"}
+    peer.spin_until(lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration")
 
 
+TF = [(f"{each}_tf", "odom:lidar", "/tf") for each in STREAMS]
+TF.append(("base_frame", "base_link", "/tf_static"))
 EFFECTS = {
-    "parent_frame": lambda *fixtures: frame_is_used(*fixtures, "parent", "camera in chosen: "),
-    "child_frame": lambda *fixtures: frame_is_used(*fixtures, "child", "chosen in lidar: "),
-    "parent_type": lambda *fixtures: type_is_used(*fixtures, "parent"),
-    "child_type": lambda *fixtures: type_is_used(*fixtures, "child"),
-    "parent_tf": lambda *fixtures: tf_is_used(*fixtures, "parent"),
-    "child_tf": lambda *fixtures: tf_is_used(*fixtures, "child"),
-    "parent_measures": lambda *fixtures: measures_is_used(*fixtures, "parent"),
-    "child_measures": lambda *fixtures: measures_is_used(*fixtures, "child"),
+    "parent_frame": partial(frame_is_used, stream="parent", text="camera in chosen: "),
+    "child_frame": partial(frame_is_used, stream="child", text="chosen in lidar: "),
+    **{f"{each}_type": partial(type_is_used, stream=each) for each in STREAMS},
+    **{f"{each}_measures": partial(measures_is_used, stream=each) for each in STREAMS},
+    **{name: partial(tf_is_used, name=name, value=value, topic=topic) for name, value, topic in TF},
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
     "journal": journal_is_used,
@@ -303,7 +284,6 @@ EFFECTS = {
     "report": report_is_used,
     "publish_tf": publish_tf_is_used,
     "installed": installed_is_used,
-    "base_frame": base_frame_is_used,
     "monitor": monitor_is_used,
     "enabled": enabled_is_used,
 }
@@ -342,10 +322,8 @@ GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "output_directory": ("{folder}/out", "{folder}/out"),
     "journal": ("off", "off"),
     "publish_tf": ("true", True),
-    "parent_measures": ("poses", "poses"),
-    "child_measures": ("poses", "poses"),
-    "parent_tf": ("odom:lidar", "odom:lidar"),
-    "child_tf": ("vision:camera", "vision:camera"),
+    **{f"{each}_measures": ("poses", "poses") for each in STREAMS},
+    **{f"{each}_tf": ("odom:lidar", "odom:lidar") for each in STREAMS},
     "other_children": ("2", 2),
     "report": ("false", False),
     "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
@@ -372,6 +350,17 @@ sys.exit(service.run())
 """
 
 
+LAUNCHER = [sys.executable, "-c", LAUNCH, str(PROJECT / "launch" / "calibrator.launch.py")]
+
+
+def environment(prefix, **more):
+    """The environment in which launch finds the package."""
+    found = os.environ | {"ROS_LOG_DIR": str(prefix / "ros_log"), "PYTHONUNBUFFERED": "1"} | more
+    for name, path in (("AMENT_PREFIX_PATH", prefix), ("PYTHONPATH", PROJECT)):
+        found[name] = os.pathsep.join(filter(None, [str(path), os.environ.get(name, "")]))
+    return found
+
+
 @pytest.fixture
 def prefix(tmp_path):
     """An installed package, as far as launch looks."""
@@ -393,21 +382,12 @@ def start_launch(prefix, domain, tmp_path):
 
     def start(*arguments):
         log = tmp_path / "log"
-        earlier = os.environ.get("AMENT_PREFIX_PATH", "")
-        environment = {
-            "ROS_DOMAIN_ID": str(domain),
-            "ROS_LOG_DIR": str(tmp_path / "ros_log"),
-            "AMENT_PREFIX_PATH": os.pathsep.join(filter(None, [str(prefix), earlier])),
-            "PYTHONPATH": os.pathsep.join([str(PROJECT), os.environ.get("PYTHONPATH", "")]),
-            "PYTHONUNBUFFERED": "1",
-        }
-        command = [sys.executable, "-c", LAUNCH, str(PROJECT / "launch" / "calibrator.launch.py")]
         with log.open("wb") as file:
             process = subprocess.Popen(
-                [*command, *arguments],
+                [*LAUNCHER, *arguments],
                 stdout=file,
                 stderr=file,
-                env=os.environ | environment,
+                env=environment(prefix, ROS_DOMAIN_ID=str(domain)),
                 start_new_session=True,
             )
         running.append((process, log))
@@ -459,16 +439,8 @@ TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child
 )
 def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, told):
     """The node is not started."""
-    command = [sys.executable, "-c", LAUNCH, str(PROJECT / "launch" / "calibrator.launch.py")]
-    environment = {"ROS_LOG_DIR": str(prefix / "ros_log"), "AMENT_PREFIX_PATH": str(prefix)}
-    environment["PYTHONPATH"] = os.pathsep.join([str(PROJECT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [*command, argument],
-        capture_output=True,
-        text=True,
-        env=os.environ | environment,
-        timeout=PATIENCE_S,
-    )
+    options = dict(capture_output=True, text=True, timeout=PATIENCE_S)
+    done = subprocess.run([*LAUNCHER, argument], env=environment(prefix), **options)
     assert done.returncode == 1
     assert told in done.stdout + done.stderr
 

@@ -6,10 +6,9 @@ import time
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from motions import as_trajectory, child_of, feed, wandering_poses
-from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix
+from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix, values_of
 from std_msgs.msg import String
 
 from hand_eye_calib.config import CalibratorConfig
@@ -111,23 +110,12 @@ class TestNode:
 
         return publish
 
-    @pytest.fixture
-    def said(self, peer):
-        """Newest message of the extrinsic's status."""
-        newest = {}
-
-        def take(array):
-            newest.update({each.name.rpartition(": ")[2]: each for each in array.status})
-
-        peer.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
-        return newest
-
     def test_what_is_done_is_broadcast_to_who_stops_then_and_a_reset_withdraws_it(
-        self, start_node, peer, listen, robot, said, tmp_path
+        self, start_node, peer, listen, robot, tmp_path
     ):
         robot(("base_link", "lidar"))
         heard, extrinsics = listen(), peer.listen(TransformStamped, "extrinsic")
-        states = peer.listen(String, "progress")
+        states, said = peer.listen(String, "progress"), peer.diagnostics()
         start_node(
             "-p publish_tf:=true", "-p solve_period:=1000.0", f"-p output_directory:={tmp_path}",
             *RELIABLE_INPUTS,
@@ -137,7 +125,7 @@ class TestNode:
             return [each for each in found if each.child_frame_id == "camera"]
 
         def state(part="extrinsic", key="tf_static"):
-            return {pair.key: pair.value for pair in said[part].values}[key]
+            return values_of(said[f"/calibrator: {part}"])[key]
 
         publishers, poses = peer.publishers(), drive(450)
         peer.solve(publishers, *(part[:400] for part in poses))
