@@ -9,28 +9,16 @@ ODD_TEXTS = (
 
 
 class Chaos:
-    """Changes values with some probability.
+    """Changes values with a drawn probability; the same seed makes the same changes."""
 
-    Parameters
-    ----------
-    seed : int
-        The same seed makes the same changes.
-    rate : float, optional
-        Probability that a value is changed; drawn if left out.
-    """
-
-    def __init__(self, seed, rate=None):
+    def __init__(self, seed):
         self.random = random.Random(seed)
-        drawn = self.random.choice([0.0, 0.0003, 0.001, 0.004, 0.02, 0.1])
-        self.rate = drawn if rate is None else rate
+        self.choice = self.random.choice
+        self.rate = self.choice([0.0, 0.0003, 0.001, 0.004, 0.02, 0.1])
 
     def hits(self, factor=1.0):
         """Whether to change something now."""
         return self.random.random() < self.rate * factor
-
-    def choice(self, values):
-        """One of several values."""
-        return self.random.choice(values)
 
     def number(self, value, bits):
         """An unsigned integer of so many bits."""

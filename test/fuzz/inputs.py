@@ -67,9 +67,9 @@ def whole_bag(suffix):
 # ---- what is done with each kind
 
 
-def bag(chaos, folder, name):
+def bag(chaos, folder, *names):
     """List a bag, and calibrate from it."""
-    path = folder / name
+    path = folder / chaos.choice(names)
     data = whole_bag(path.suffix)
     if chaos.random.random() < 0.5:
         data = chaos.flipped(data, chaos.choice([1, 10, 100]))
@@ -80,18 +80,6 @@ def bag(chaos, folder, name):
     topics = ("--parent-topic", "/a", "--child-topic", "/b", "--child-frame", "b")
     saved = ("--out", folder / "out") if chaos.random.random() < 0.01 else ()
     return min(listed, command("replay", path, *topics, *SOLVE, "--json", *saved))
-
-
-def mcap(chaos, folder):
-    return bag(chaos, folder, "bag.mcap")
-
-
-def rosbag1(chaos, folder):
-    return bag(chaos, folder, "bag.bag")
-
-
-def sqlite3(chaos, folder):
-    return bag(chaos, folder, chaos.choice(["bag.db3", "a%31#?.db3"]))
 
 
 def trajectory(chaos, folder):
@@ -143,9 +131,9 @@ def journal(chaos, folder):
 
 
 FORMATS = {
-    "mcap": mcap,
-    "rosbag1": rosbag1,
-    "sqlite3": sqlite3,
+    "mcap": lambda *case: bag(*case, "bag.mcap"),
+    "rosbag1": lambda *case: bag(*case, "bag.bag"),
+    "sqlite3": lambda *case: bag(*case, "bag.db3", "a%31#?.db3"),
     "trajectory": trajectory,
     "config": config,
     "info": info,

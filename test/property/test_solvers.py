@@ -186,26 +186,19 @@ def test_each_cost_is_lowest_at_its_own_method(seed, truth):
     assert found["ali"].objective <= found["park"].objective * (1 + 1e-9)
 
 
-def along(axis, amounts):
-    return np.outer(amounts, axis)
-
-
 def degenerate_motions(seed):
     """Tangent vectors (K, 6) of motions that leave part of X, or all of it, unseen, by kind."""
     random = np.random.default_rng(seed)
-    shifts, turns, amounts = (
-        random.uniform(-1, 1, (12, 3)),
-        random.uniform(-1, 1, (12, 3)),
-        random.uniform(-1, 1, 12),
-    )
+    shifts, turns = random.uniform(-1, 1, (2, 12, 3))
+    amounts = random.uniform(-1, 1, (12, 1))
     axis = turns[0] / np.linalg.norm(turns[0])
     none = np.zeros((12, 3))
     kinds = {
         "no motion": [none, none],
         "translation": [shifts, none],
-        "straight line": [along(axis, amounts), none],
-        "rotation about one axis": [shifts, along(axis, amounts)],
-        "plane": [shifts * [1, 1, 0], along([0, 0, 1], amounts)],
+        "straight line": [amounts * axis, none],
+        "rotation about one axis": [shifts, amounts * axis],
+        "plane": [shifts * [1, 1, 0], amounts * [0, 0, 1]],
         "rotation on the spot": [none, turns],
         "half turns": [shifts, np.pi * turns / np.linalg.norm(turns, axis=1, keepdims=True)],
         "one pair": [shifts[:1], turns[:1]],

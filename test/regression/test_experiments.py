@@ -119,14 +119,8 @@ def test_everything_from_one_command(tmp_path, few_levels, one_error_figure):
     assert objective.sum() == ROWS
     assert "higher" not in objective
     assert objective["lower"] > 250
-    for figure, exact in (
-        ("figS1", 1.0),
-        ("figS2", 0.95),
-        ("figS3", 1.0),
-        ("figS4", 1.0),
-        ("figS5", 0.99),
-        ("fig3", 0.5),
-    ):
+    shares = {"figS1": 1.0, "figS2": 0.95, "figS3": 1.0, "figS4": 1.0, "figS5": 0.99, "fig3": 0.5}
+    for figure, exact in shares.items():
         points = [line["agrees"] == "True" for line in read(tmp_path / f"{figure}_comparison.csv")]
         assert len(points) == 11 * 6 * 4
         assert sum(points) >= exact * len(points), figure

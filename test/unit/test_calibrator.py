@@ -20,8 +20,6 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import SolveStatus
 
-IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-
 
 def drive(n_poses=200, seed=0):
     """Parent at 10 Hz, child at 50 Hz, 13 ms apart; smooth, so that interpolation costs little."""
@@ -93,7 +91,6 @@ def test_time_offset_and_scale_are_applied_to_the_child():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"reference": "B0"}, "reference must be auto, A, B<n>"),
         ({"min_inlier_fraction": 1.5}, "min_inlier_fraction must be at most 1"),
         ({"scale": "big"}, "scale must be none or auto or estimate or a number"),
         ({"time_offset": float("nan")}, "time_offset must be a finite number"),
@@ -148,8 +145,6 @@ class TestRefusals:
 @pytest.mark.parametrize(
     ("n_poses", "parent_s", "child_s", "options", "message"),
     [
-        (30, 0.0, 100.0, {}, r"do not overlap in time .* 97\.\d+ s apart"),
-        (8, 0.0, 0.0, {}, "10 synchronised pose pairs are needed, found 7"),
         (12, 0.0, 0.0, {"reference": "B50"}, "too few common poses for the chosen reference"),
         (40, 0.005, 0.0, {"max_gap": 0.01}, "raise max_gap"),
     ],
@@ -162,65 +157,14 @@ def test_missing_data_is_named(n_poses, parent_s, child_s, options, message):
         Calibrator().estimate()
 
 
-class TestLongSessions:
-    """With small buffers, so that a short drive fills them many times."""
-
-    LIMITS = BufferLimits(capacity=100)
-
-    @staticmethod
-    def interleaved(calibrator, parent, child):
-        messages = [
-            (stamp_ns, stream, pose[:3, 3], quat)
-            for stream, trajectory in (("parent", parent), ("child", child))
-            for stamp_ns, pose, quat in zip(
-                trajectory.stamps_ns.tolist(),
-                trajectory.poses,
-                se3.to_quat_xyzw(trajectory.poses),
-                strict=True,
-            )
-        ]
-        for stamp_ns, stream, position, quat in sorted(messages, key=lambda message: message[:2]):
-            calibrator.add_pose(stream, stamp_ns, position, quat)
-
-    @pytest.mark.parametrize("max_pairs", [500, 100])
-    def test_every_pose_is_paired_once_and_the_pairs_are_bounded(self, max_pairs):
-        parent, child = drive(400)
-        config = CalibratorConfig(max_pairs=max_pairs, reference="B3")
-        calibrator = Calibrator(config, self.LIMITS)
-        self.interleaved(calibrator, parent, child)
-        stamps_ns = calibrator.snapshot().pose_pairs().stamps_ns
-        inside = parent.stamps_ns[parent.stamps_ns <= child.stamps_ns[-1]]
-        if max_pairs > len(inside):
-            assert np.array_equal(stamps_ns, inside)
-        else:
-            assert 50 <= len(stamps_ns) <= max_pairs
-            assert np.ptp(stamps_ns) > 0.9 * np.ptp(parent.stamps_ns)
-        np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
-        assert not calibrator.add_pose("parent", int(parent.stamps_ns[0]) + 1, *IDENTITY)
-        assert calibrator.statistics("parent").refused_late == 1
-
-    def test_a_stream_on_its_own_does_not_fill_the_memory(self):
-        parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(reference="B3"), self.LIMITS)
-        feed(calibrator, "parent", parent)
-        assert calibrator.statistics("parent").dropped_unpaired > 0
-        assert len(calibrator.snapshot().parent) <= 100
-        feed(calibrator, "child", child)
-        assert len(calibrator.snapshot().pose_pairs()) > 20
-
-    def test_reset_forgets_and_reconfigure_keeps(self):
-        parent, child = drive(400)
-        calibrator = Calibrator(CalibratorConfig(reference="B3"), self.LIMITS)
-        self.interleaved(calibrator, parent, child)
-        calibrator.reconfigure(dataclasses.replace(calibrator.config, reference="B5"))
-        assert calibrator.estimate().reference == "B5"
-        before = len(calibrator.snapshot().pose_pairs())
-        calibrator.reconfigure(dataclasses.replace(calibrator.config, time_offset=0.01))
-        assert 0 < len(calibrator.snapshot().pose_pairs()) < before
-        calibrator.reset()
-        assert calibrator.statistics("parent").received == 0
-        with pytest.raises(NotEnoughDataError):
-            calibrator.estimate()
+def test_a_stream_on_its_own_does_not_fill_the_memory():
+    parent, child = drive(400)
+    calibrator = Calibrator(CalibratorConfig(reference="B3"), BufferLimits(capacity=100))
+    feed(calibrator, "parent", parent)
+    assert calibrator.statistics("parent").dropped_unpaired > 0
+    assert len(calibrator.snapshot().parent) <= 100
+    feed(calibrator, "child", child)
+    assert len(calibrator.snapshot().pose_pairs()) > 20
 
 
 def test_a_snapshot_does_not_change_when_poses_come_in():

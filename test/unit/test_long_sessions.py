@@ -21,6 +21,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.snapshot import downsample
+from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 
@@ -68,6 +69,21 @@ def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
     assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
     assert len(calibrator.snapshot().parent) < 150
     np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert not calibrator.add_pose("parent", parent.stamps_ns[0] + 1, [0.0] * 3, [0.0, 0, 0, 1])
+    assert calibrator.statistics("parent").refused_late == 1
+
+
+def test_reset_forgets_and_reconfigure_keeps():
+    calibrator = play(by_stamp(*drive()))
+    calibrator.reconfigure(dataclasses.replace(calibrator.config, reference="B5"))
+    assert calibrator.estimate().reference == "B5"
+    before = len(calibrator.snapshot().pose_pairs())
+    calibrator.reconfigure(dataclasses.replace(calibrator.config, time_offset=0.01))
+    assert 0 < len(calibrator.snapshot().pose_pairs()) < before
+    calibrator.reset()
+    assert calibrator.statistics("parent").received == 0
+    with pytest.raises(NotEnoughDataError):
+        calibrator.estimate()
 
 
 def test_the_answer_is_that_of_all_poses_at_once():

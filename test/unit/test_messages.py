@@ -140,8 +140,3 @@ def test_bytes_that_are_no_message_are_malformed_and_nothing_else(unpack, data, 
     for start in (b"", b"\x00\x01\x00\x00"):
         with contextlib.suppress(*MALFORMED):
             list(unpack(start + data, is_ros1))
-
-
-def test_an_encoding_that_is_not_plain_cdr_is_named():
-    with pytest.raises(ValueError, match="expected plain CDR, found encoding 0x0007"):
-        unpack_poses([b"\x00\x07\x00\x00" + bytes(100)], POSE_STAMPED, False)

@@ -4,6 +4,7 @@ pair.
 
 import numpy as np
 import pytest
+from motions import child_of, disturbed, wandering_poses
 from scipy.optimize import approx_fprime, check_grad, minimize
 from scipy.spatial.transform import Rotation
 
@@ -24,17 +25,11 @@ def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
     )
 
 
-def random_pairs(noise=0.0, n_poses=25, seed=0):
-    """Motions of up to 1 m and 0.8 rad per axis, with noise (m and rad) on both sensors' poses."""
-    random = np.random.default_rng(seed)
-    poses = [np.eye(4)]
-    for step in random.uniform(
-        [-1, -1, -1, -0.8, -0.8, -0.8], [1, 1, 1, 0.8, 0.8, 0.8], (n_poses - 1, 6)
-    ):
-        poses.append(poses[-1] @ se3.exp(step))
-    poses = np.array(poses)
-    parent_noise, child_noise = se3.exp(noise * random.normal(size=(2, n_poses, 6)))
-    return motion_pairs(poses @ parent_noise, poses @ TRUTH @ child_noise, "B1")
+def random_pairs(noise=0.0, n_poses=25):
+    """Motions of about 1 m and 0.5 rad, with noise (m and rad) on both sensors' poses."""
+    poses = wandering_poses(n_poses, step_m=0.6, step_rad=0.4)
+    child = disturbed(child_of(poses, TRUTH, np.eye(4)), 2, noise, noise)
+    return motion_pairs(disturbed(poses, 1, noise, noise), child, "B1")
 
 
 def split(T):
@@ -95,15 +90,8 @@ def test_park_aligns_the_rotation_vectors(noisy):
 
 def test_rotation_is_never_a_reflection():
     # Rotation vectors in a plane leave the sign of the third axis to the determinant.
-    motions = se3.exp(
-        np.array(
-            [
-                [0.3, 0.1, 0.2, 0.5, 0.0, 0.0],
-                [0.1, -0.3, 0.4, 0.0, 0.4, 0.0],
-                [0.2, 0.2, 0.1, 0.3, 0.3, 0.0],
-            ]
-        )
-    )
+    twists = [[0.3, 0.1, 0.2, 0.5, 0.0, 0.0], [0.1, -0.3, 0.4, 0.0, 0.4, 0.0]]
+    motions = se3.exp(np.array([*twists, [0.2, 0.2, 0.1, 0.3, 0.3, 0.0]]))
     pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
     np.testing.assert_allclose(park.solve(pairs).T_parent_child, TRUTH, atol=1e-12)
 
