@@ -265,11 +265,17 @@ def _rotation(
     only for what is left of it after a first solve.
     """
     if not has_rates:
-        solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_ROTATIONS)
+        solution = adaptive_estimator.solve(
+            stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_ROTATIONS, is_clock_free=True
+        )
         return solution, Ts_cw_c
-    first = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True)
+    first = adaptive_estimator.solve(
+        stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True, is_clock_free=True
+    )
     Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
-    solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES)
+    solution = adaptive_estimator.solve(
+        stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, is_clock_free=True
+    )
     parameters = solution.parameters.copy()
     parameters[RATE] += first.parameters[RATE]
     return replace(solution, parameters=parameters), Ts_cw_c
