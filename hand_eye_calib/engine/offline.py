@@ -16,7 +16,6 @@ from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
 from hand_eye_calib.text import AXIS_UNITS, Prior, names_of_files
@@ -205,10 +204,8 @@ def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajecto
         warnings += (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
     return Snapshot(
         config=config,
-        kept=PosePairs.empty(),
         buffered_parent=parent,
         buffered_child=child,
-        paired_at=None,
         parent_frame=parent_frame,
         child_frame=child_frame,
         warnings=warnings,
@@ -243,10 +240,6 @@ def cross_check(
         The trajectories that gave it.
     config : CalibratorConfig, optional
         The options that gave it; the defaults, with the result's method, if left out.
-
-    Returns
-    -------
-    CrossCheck
 
     Raises
     ------

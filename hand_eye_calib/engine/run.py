@@ -43,20 +43,9 @@ _MAX_MISFIT = 2.0
 
 @dataclass(frozen=True)
 class Run:
-    """A result after the stream checks.
-
-    Attributes
-    ----------
-    calibration : Calibration
-        With its findings, and with a warning about each option that was set.
-    snapshot : Snapshot
-        With the options that gave it.
-    check : CheckResult
-        Of its streams.
-    options : mapping
-        What was set because a check is certain of it; empty if nothing was.
-    told : tuple of str
-        Warnings about that.
+    """A result after the stream checks: with its findings, the snapshot with the options that gave
+    it, and the check of its streams; ``options`` that were set because a check is certain of them,
+    and the warnings about these, which the calibration has as well.
     """
 
     calibration: Calibration

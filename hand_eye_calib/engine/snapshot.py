@@ -1,7 +1,7 @@
 """A snapshot of the engine: all that an estimate needs, independent of the poses that follow."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -68,10 +68,10 @@ class Snapshot:
     """
 
     config: CalibratorConfig
-    kept: PosePairs
+    kept: PosePairs = field(default_factory=PosePairs.empty)
     buffered_parent: RawPoses | Trajectory
     buffered_child: RawPoses | Trajectory
-    paired_at: str | None
+    paired_at: str | None = None
     parent_frame: str
     child_frame: str
     warnings: tuple[str, ...] = ()

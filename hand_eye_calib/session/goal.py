@@ -97,10 +97,6 @@ class Goal:
             The motion that it comes from.
         faults : sequence of str
             What the stream checks found; the goal is not reached while there is something.
-
-        Returns
-        -------
-        Progress
         """
         wanted = _SHARE * self._targets
         # What somebody measured by hand, no motion would tell better; some streams never show all.
@@ -116,14 +112,14 @@ class Goal:
             faults = [one.sentence for one in found if one.verdict is Verdict.DO_NOT_USE]
         may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
-        is_known = bool(is_within) and motion_s >= _least_motion_s(calibration)
+        least_s = _least_motion_s(calibration)
+        is_known = bool(is_within) and motion_s >= least_s
         point = _Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known)
         # Every result of a robot that stands still is the same result.
         if not self._points or motion_s > self._points[-1].motion_s:
             self._points.append(point)
         if is_within:
             self._keep_best(calibration, point)
-        least_s = _least_motion_s(calibration)
         # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(least_s - motion_s, 0.0))

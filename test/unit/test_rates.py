@@ -135,10 +135,6 @@ class TestRates:
         with pytest.raises(ConfigError, match="needs poses of both sensors"):
             hec.calibrate(*streams, **options)
 
-    def test_cross_checks_are_of_poses(self, streams, result):
-        with pytest.raises(ConfigError, match="a cross-check needs poses"):
-            hec.cross_check(result, *streams)
-
     def test_positions_and_rates_show_nothing_together(self, streams):
         parent, child = streams
         with pytest.raises(ConfigError, match="beside poses"):
