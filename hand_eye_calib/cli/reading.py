@@ -94,7 +94,9 @@ def read_paths(
     sources and options are those that somebody gave.
     """
     if are_files:
-        return read_pair(paths, [{}] * 2, options)
+        # The sensors of all recordings are the same, whatever their files are called.
+        frames = {f"{stream}_frame": f"{stream}_sensor" for stream in STREAMS}
+        return read_pair(paths, [{}] * 2, frames | dict(options))
     journal = journal_in(paths[0]) if len(paths) == 1 else None
     if journal is None:
         return read_bags(paths, sources, CalibratorConfig.from_options(dict(options)))
