@@ -115,17 +115,8 @@ def render(
     inputs: Plain | None = None,
     command: str = "",
 ) -> str:
-    """The report as HTML.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    snapshot : Snapshot or None
-        The poses and options that gave it; None for stops.
-    inputs : mapping, optional
-        Where the data came from, in plain values.
-    command : str
-        Shell command that publishes the result; empty for none.
+    """The report as HTML, of a result and the poses and options that gave it (none for stops);
+    ``inputs`` say in plain values where the data came from, ``command`` publishes the result.
     """
     inputs = inputs or {}
     calibration = replace(
@@ -135,7 +126,8 @@ def render(
     )
     parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
     verdict, _, said = calibration.headline.partition(": ")
-    document, numbers = calibration.to_dict(), calibration.usable_numbers()
+    document = calibration.to_dict()
+    by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
     evidence = gather(calibration, snapshot) if snapshot else None
     advice, unknown = "", {*calibration.out_of_reach}
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
@@ -159,7 +151,7 @@ def render(
         differences=list(_differences(calibration)),
         advice=advice,
         command=command,
-        unknown=listing([value for value in numbers.values() if isinstance(value, str)]),
+        unknown=listing(by_hand),
         target=_targets(calibration),
         reasons=[_reason(reason) for reason in shown(calibration.reasons)],
         figures=figures_of(calibration, evidence),

@@ -355,19 +355,19 @@ class Calibration(Result):
                 "matrix": self.T_method,
             }
         if self.T_world_world is not None and self.cov_world_world is not None:
-            frames = self.parent_world_frame, self.child_world_frame
-            covariances = self.cov_world_world, np.zeros((6, 6))
-            printed = self._printed_dict(self.T_world_world, *frames, *covariances)
-            document["T_world_world"] = printed
-            document["cov_world_world"] = _matrix_of(
-                "error xi in T_world_world @ exp(xi)", self.child_world_frame, self.cov_world_world
-            )
+            frames, cov = (self.parent_world_frame, self.child_world_frame), self.cov_world_world
+            document |= {
+                "T_world_world": self._printed_dict(
+                    self.T_world_world, *frames, cov, np.zeros((6, 6))
+                ),
+                "cov_world_world": _matrix_of(
+                    "error xi in T_world_world @ exp(xi)", frames[1], cov
+                ),
+            }
         if self.floor is not None:
             of = "errors of a whole recording, the same in every part; not in the covariance"
             document["floor"] = _matrix_of(of, self.child_frame, self.floor)
-        document["sigma_total"] = dict(
-            zip((dof.name for dof in self.observability), self.sigmas_with_floor, strict=True)
-        )
+        document["sigma_total"] = dict(zip(AXES, self.sigmas_with_floor, strict=True))
         document |= {
             name: getattr(self, name)
             for name in self.__dataclass_fields__
