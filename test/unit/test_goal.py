@@ -38,6 +38,11 @@ def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
     return Excitation(100, np.radians(rotation_deg), lever_arms, 10.0, motion_s)
 
 
+def told(goal, *results):
+    """What a session says after results from 40 s of motion on, 2 s apart."""
+    return [goal.add(each, seen(40.0 + 2.0 * k)) for k, each in enumerate(results)][-1]
+
+
 def seconds_left(progress):
     return [each.seconds_left for each in progress.axes.values()]
 
@@ -62,8 +67,7 @@ def test_every_axis_has_its_own_target():
     assert config.targets == pytest.approx((0.02, 0.02, 0.1, 0.00524, 0.00524, np.radians(0.5)))
     goal = Goal(config.targets)
     rough_height = result(sigmas_m=(0.004, 0.004, 0.06))
-    for motion_s in (40.0, 42.0):
-        progress = goal.add(rough_height, seen(motion_s))
+    progress = told(goal, rough_height, rough_height)
     assert progress.done
     assert progress.axes["z"].target == pytest.approx(0.1)
     strict = Goal(CalibratorConfig(target_axes="x=1mm").targets)
@@ -109,12 +113,11 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
 
 
 def test_the_time_left_only_shrinks_by_one_step_at_a_result():
-    goal, told = Goal(TARGETS), []
+    goal, found = Goal(TARGETS), []
     for motion_s, sigma_m in enumerate((0.03, 0.0142, 0.025, 0.025, 0.02, 0.004, 0.02), 40):
-        told.append(
-            seconds_left(goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s)))
-        )
-    assert [each[1] for each in told] == [180.0, 120.0, 120.0, 120.0, 60.0, 0.0, 60.0]
+        progress = goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s))
+        found.append(seconds_left(progress)[1])
+    assert found == [180.0, 120.0, 120.0, 120.0, 60.0, 0.0, 60.0]
 
 
 def test_faults_of_the_streams_and_failed_solves_are_no_success():
@@ -129,16 +132,13 @@ def test_faults_of_the_streams_and_failed_solves_are_no_success():
 
 
 def test_what_was_measured_by_hand_need_not_be_shown_by_motion():
-    goal = Goal(TARGETS)
     by_hand = result(sigmas_m=(0.004, 0.004, 0.05), verdicts={"z": DofVerdict.PRIOR})
-    goal.add(by_hand, seen(40.0))
-    assert goal.add(by_hand, seen(42.0)).done
+    assert told(Goal(TARGETS), by_hand, by_hand).done
 
 
 def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_worse():
     goal = Goal(TARGETS)
-    goal.add(result(), seen(40.0))
-    goal.add(result(), seen(42.0))
+    told(goal, result(), result())
     best = result(sigmas_m=0.004)
     goal.add(best, seen(60.0))
     for _ in range(5):
@@ -151,8 +151,7 @@ def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_
 
 def test_the_newest_of_equally_good_results_is_kept():
     goal = Goal(TARGETS)
-    for motion_s in (40.0, 42.0):
-        goal.add(result(sigmas_m=0.004), seen(motion_s))
+    told(goal, *[result(sigmas_m=0.004)] * 2)
     for motion_s, sigma_m in ((44.0, 0.0045), (46.0, 0.0049)):
         newest = result(sigmas_m=sigma_m)
         goal.add(newest, seen(motion_s))
@@ -164,8 +163,7 @@ def test_the_newest_of_equally_good_results_is_kept():
 def test_once_done_a_newer_result_need_not_have_moved_long_enough_again():
     """What lasts may show late; without this an old result would be kept for ever."""
     goal = Goal(TARGETS)
-    for motion_s in (40.0, 42.0):
-        goal.add(result(), seen(motion_s))
+    told(goal, result(), result())
     newest = result(noise=lasting(20.0))
     assert goal.add(newest, seen(44.0)).done
     assert goal.best is newest
@@ -250,10 +248,8 @@ def test_only_motion_counts_as_time():
 
 
 def test_positions_alone_are_done_without_a_word_of_the_rotation():
-    goal = Goal(TARGETS)
     hidden = dict.fromkeys(AXES[3:], DofVerdict.UNOBSERVABLE)
     of_positions = result(sigmas_rad=np.inf, verdicts=hidden, measured="positions")
-    for motion_s in (40.0, 42.0, 44.0):
-        told = goal.add(of_positions, seen(motion_s))
-    assert told.done
-    assert told.sentence == "Done: translation known to 5 mm (one sigma). Stop and save."
+    progress = told(Goal(TARGETS), *[of_positions] * 3)
+    assert progress.done
+    assert progress.sentence == "Done: translation known to 5 mm (one sigma). Stop and save."

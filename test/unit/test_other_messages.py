@@ -18,11 +18,8 @@ from hand_eye_calib.io.bags import PoseBag, trajectory_of
 TIMES = np.arange(0, 30, 0.05)
 TRUTH = as_trajectory(smooth_poses(TIMES), rate_hz=20.0)
 P, Q = TRUTH.poses[:, :3, 3], se3.to_quat_xyzw(TRUTH.poses)
-TWIST, FIX, IMU = (
-    "geometry_msgs/msg/TwistStamped",
-    "sensor_msgs/msg/NavSatFix",
-    "sensor_msgs/msg/Imu",
-)
+TWIST = "geometry_msgs/msg/TwistStamped"
+FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
 GEO = "geographic_msgs/msg/GeoPoseStamped"
 JAZZY.register(
@@ -53,17 +50,8 @@ def messages():
         "sensor_msgs/msg/NavSatStatus",
         *((0, 1, 0)[: len(JAZZY.fielddefs["sensor_msgs/msg/NavSatStatus"][1])]),
     )
-    found = {
-        (f"/{name}", type_): []
-        for name, type_ in (
-            ("twist", TWIST),
-            ("fix", FIX),
-            ("imu", IMU),
-            ("px4", PX4),
-            ("array", ARRAY),
-            ("geo", GEO),
-        )
-    }
+    types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
+    found = {key: [] for key in types.items()}
     zero, nine = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9)
     for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
         head, quaternion = header(JAZZY, stamp_ns, "sensor"), made("Quaternion", *Q[k])
@@ -159,11 +147,7 @@ def test_messages_of_json(tmp_path):
         ("/imu+/fix", ConfigError, "measure rates or rotations; asked for are positions"),
         ("/array?t=header.stamp,x=pose.position.x,y=a,z=b", InputError, "has no pose.position.x"),
         ("/array?t", ConfigError, "fields are written NAME=PATH"),
-        (
-            "/array?t=header.stamp,x=header.frame_id,y=header.frame_id,z=header.frame_id",
-            InputError,
-            "float",
-        ),
+        ("/array?t=header.stamp,x=header.frame_id,y=header,z=header", InputError, "float"),
         ("/px4?x=position.0,y=position.1,z=position.2", InputError, "no column for t"),
     ],
 )

@@ -165,23 +165,19 @@ class TestIntegration:
 
 class TestFiles:
     @pytest.mark.parametrize(
-        ("text", "measures", "largest"),
+        ("text", "largest"),
         [
-            (
-                "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]",
-                "auto",
-                1,
-            ),
-            ("t,gyro_x_dps,gyro_y_dps,gyro_z_dps", "auto", np.pi / 180),
-            ("t wx wy wz", "auto", 1),
+            ("#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]", 1),
+            ("t,gyro_x_dps,gyro_y_dps,gyro_z_dps", np.pi / 180),
+            ("t wx wy wz", 1),
         ],
     )
-    def test_columns_of_rates(self, tmp_path, text, measures, largest):
+    def test_columns_of_rates(self, tmp_path, text, largest):
         separator = "," if "," in text else " "
         rows = [separator.join(map(str, (1_700_000_000 + k, 0.0, 0.0, 1.0))) for k in range(3)]
         path = tmp_path / "imu.csv"
         path.write_text("\n".join([text, *rows]))
-        found = read_trajectory_file(path, "auto", stamp_unit="s", measures=measures).trajectory
+        found = read_trajectory_file(path, "auto", stamp_unit="s").trajectory
         assert found.measures == "rates"
         assert np.abs(se3.rotation_log(found.poses[1, :3, :3])).max() == pytest.approx(largest)
 

@@ -86,7 +86,10 @@ def page_of(snapshot, calibration, **more):
     if calibration.verdict is not Verdict.DO_NOT_USE:
         more.setdefault("command", static_transform_command(calibration))
     text = render(calibration, snapshot, **more)
-    return text, Page(text)
+    page = Page(text)
+    assert (page.errors, page.open) == ([], [])
+    assert len(page.ids) == len(set(page.ids))
+    return text, page
 
 
 @pytest.fixture(scope="module")
@@ -105,9 +108,6 @@ def planar():
 def test_page_is_whole_and_stands_alone(drive, request):
     _, _, text, page = request.getfixturevalue(drive)
     assert text.startswith("<!DOCTYPE html>")
-    assert page.errors == []
-    assert page.open == []
-    assert len(page.ids) == len(set(page.ids))
     assert not re.search(r"https?:|//\w|@import", text)
     for tag, attributes in page.elements:
         assert tag not in ("script", "link", "img", "iframe")
@@ -206,8 +206,6 @@ def partial():
 @pytest.mark.parametrize("name", ["positions", "rates"])
 def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, name):
     calibration, text, page = partial[name]
-    assert page.errors == []
-    assert len(page.ids) == len(set(page.ids))
     shown = [*FIGURES]
     shown = [each for each in shown if name != "rates" or each not in ("views", "trajectories")]
     assert [attributes["id"] for attributes in page.all("figure")] == [
@@ -251,8 +249,6 @@ def test_hostile_names_stay_text():
     }
     calibration = dataclasses.replace(calibration, findings=(finding,))
     _, page = page_of(snapshot, calibration, inputs=inputs)
-    assert page.errors == []
-    assert len(page.ids) == len(set(page.ids))
     assert {"script", "img", "em", "u"} & {tag for tag, _ in page.elements} == set()
     for name in (*hostile, "<img src=x>", "</td><script>", "<u>"):
         assert name in page.text

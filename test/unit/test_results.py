@@ -313,15 +313,9 @@ def edited(**changes):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "",
-            "expected format hand_eye_calib/extrinsic, version 1; found format None, version None",
-        ),
+        ("", "hand_eye_calib/extrinsic, version 1; found format None, version None"),
         ("- 1", "found format None, version None"),
-        (
-            edited(version=2),
-            "expected format hand_eye_calib/extrinsic, version 1; found .*, version 2",
-        ),
+        (edited(version=2), "expected format .*, version 1; found .*, version 2"),
         (edited(format="urdf"), "found format urdf"),
         (edited(T_parent_child={}), "the calibration has no 'matrix'"),
         (edited(T_parent_child={"matrix": [[1.0, 0.0]]}), "was changed after it was written"),

@@ -100,20 +100,11 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         (["0 1 2 x 0 0 0 1"], "line 1: expected 8 numbers, .* 'x'"),
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),
         ([f"1e999999999 {POSE}"], "line 1: .* timestamp"),
-        (
-            [f"13173756256617361230 {POSE}"],
-            "line 1: the timestamp 1.31738e.19 is too large for ns; name its unit with",
-        ),
-        (
-            [f"{stamp} {POSE}" for stamp in (0, 33, 66, 99)],
-            "unit of the timestamps is unclear; read as s, the poses are 33 s apart",
-        ),
+        ([f"13173756256617361230 {POSE}"], "line 1: .* 1.31738e.19 is too large for ns; name its"),
+        ([f"{t} {POSE}" for t in (0, 33, 66)], "is unclear; read as s, the poses are 33 s apart"),
         ([f"0 {POSE}", "1 nan 2 3 0 0 0 1"], "line 2: found a value that is not finite"),
         (["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"], "line 3: found a quaternion of length 1.1, ex"),
-        (
-            [f"5 {POSE}", "#", f"5.0 {POSE}"],
-            "line 3: timestamps must increase, found 5.000000000 after 5.000000000",
-        ),
+        ([f"5 {POSE}", "#", f"5.0 {POSE}"], "line 3: timestamps must increase, found 5.0+ after"),
     ],
 )
 def test_an_unusable_line_is_named(file, lines, message):

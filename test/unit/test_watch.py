@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
-from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.watch import Session, qr_code
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.live.state import (
@@ -375,13 +374,10 @@ def test_keys_ask_and_a_reset_takes_two(typed):
         (["--key", "word"], "--key is for --web"),
     ],
 )
-def test_wrong_usage_is_one_line(arguments, text, capsys):
-    try:
-        code = main(["watch", *arguments])
-    except SystemExit as end:
-        code = end.code
+def test_wrong_usage_is_one_line(arguments, text, run):
+    code, _, err = run("watch", *arguments)
     assert code == 2
-    assert text in capsys.readouterr().err
+    assert text in err
 
 
 # ------------------------------------------------------------------------ page
