@@ -106,7 +106,7 @@ def test_an_axis_is_the_same_by_its_own_target():
     ("have_moved", "named", "sentence"),
     [
         ("010", ("drive 2",), "moved: drive 2 differs, the others agree"),
-        ("0011", ("drive 3", "drive 4"), "moved between drive 2 and drive 3: drive 3 and"),
+        ("0011", ("drive 3", "drive 4"), "between drive 2 and drive 3: drive 3 and drive 4"),
         ("01", (), "drive 1 and drive 2 differ; which of them has moved, they do not tell"),
     ],
 )
