@@ -70,15 +70,16 @@ def write_pair(folder, parent, child):
     return paths
 
 
+def messages(stream, trajectory):
+    """What the engine is given for each pose."""
+    positions, quats = trajectory.poses[:, :3, 3].tolist(), se3.to_quat_xyzw(trajectory.poses)
+    poses = zip(trajectory.stamps_ns.tolist(), positions, quats.tolist(), strict=True)
+    return [(stream, *pose) for pose in poses]
+
+
 def feed(calibrator, stream, trajectory):
-    """Give all poses of a trajectory to a calibrator."""
-    for stamp_ns, pose, quat_xyzw in zip(
-        trajectory.stamps_ns.tolist(),
-        trajectory.poses,
-        se3.to_quat_xyzw(trajectory.poses),
-        strict=True,
-    ):
-        calibrator.add_pose(stream, stamp_ns, pose[:3, 3].tolist(), quat_xyzw.tolist())
+    for message in messages(stream, trajectory):
+        calibrator.add_pose(*message)
 
 
 def geodetic(positions, origin):

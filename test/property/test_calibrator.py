@@ -3,34 +3,24 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, messages, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 
 CONFIG = CalibratorConfig(reference="B3", max_gap=0.15)
 
 
-def messages(apart_ns):
+def both(apart_ns):
     """Both at 10 Hz, so far apart; the child lies where the parent is interpolated."""
     parent = as_trajectory(wandering_poses(60))
     between = parent.stamps_ns[:-1] + apart_ns
-    streams = {"parent": parent, "child": Trajectory(between, child_of(parent.at(between)))}
-    return [
-        (stream, stamp_ns, tuple(pose[:3, 3]), tuple(quat))
-        for stream, trajectory in streams.items()
-        for stamp_ns, pose, quat in zip(
-            trajectory.stamps_ns.tolist(),
-            trajectory.poses,
-            se3.to_quat_xyzw(trajectory.poses),
-            strict=True,
-        )
-    ]
+    child = Trajectory(between, child_of(parent.at(between)))
+    return messages("parent", parent) + messages("child", child)
 
 
-MESSAGES, TOGETHER = messages(30_000_000), messages(0)
+MESSAGES, TOGETHER = both(30_000_000), both(0)
 
 
 def estimate(sequence):

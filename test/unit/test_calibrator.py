@@ -94,8 +94,6 @@ def test_time_offset_and_scale_are_applied_to_the_child():
         ({"min_inlier_fraction": 1.5}, "min_inlier_fraction must be at most 1"),
         ({"scale": "big"}, "scale must be none or auto or estimate or a number"),
         ({"time_offset": float("nan")}, "time_offset must be a finite number"),
-        ({"method": "park", "backend": "ipopt"}, "park has no ipopt backend"),
-        ({"method": "auto", "backend": "ipopt"}, "method auto has no ipopt backend"),
     ],
 )
 def test_impossible_options_are_refused(options, message):

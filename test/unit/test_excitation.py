@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, planar_poses, wandering_poses
 
-from hand_eye_calib.assessment.excitation import excitation, what_is_missing
+from hand_eye_calib.assessment.excitation import excitation, helpful_motion, what_is_missing
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -93,6 +93,7 @@ def test_an_arm_is_not_told_to_drive():
         "z cannot be determined from the motion so far: tilt the sensors about x and y, or measure "
         "it by hand"
     )
+    assert helpful_motion(["x"], seen) == "rotations about y help most"
     still = seen_in(se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path))
     assert what_is_missing(still).endswith("rotate the sensors, about all axes")
 

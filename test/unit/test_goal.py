@@ -223,19 +223,6 @@ def test_motion_that_helps_is_about_another_axis(axis, rotation_deg, words):
     assert helpful_motion([axis], seen(40.0, rotation_deg)) == words
 
 
-@pytest.mark.parametrize(
-    ("axis", "rotation_deg", "words"),
-    [
-        ("y", (1, 1, 2), "rotate the sensors, about all axes"),
-        ("z", (1, 2, 90), "tilt the sensors about x and y, or measure it by hand"),
-        ("x", (1, 2, 90), "rotations about y help most"),
-    ],
-)
-def test_nobody_tells_a_robot_arm_to_drive(axis, rotation_deg, words):
-    arm = dataclasses.replace(seen(40.0, rotation_deg), drives=False)
-    assert helpful_motion([axis], arm) == words
-
-
 def test_only_motion_counts_as_time():
     s = np.arange(0.0, 60.0, 0.1)
     moved = np.clip(s - 10.0, 0.0, 20.0)  # parked, 20 s at 1 m/s, parked

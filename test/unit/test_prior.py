@@ -73,14 +73,6 @@ class TestOption:
 
 
 class TestFlatGround:
-    def test_unknown_is_unknown_and_not_invented(self):
-        result = calibrate(*flat_drive(), reference="B10")
-        assert result.status is SolveStatus.UNOBSERVABLE
-        assert result.unobservable() == ["z"]
-        assert abs(result.T_parent_child[2, 3]) < 0.05  # level with the parent, whatever noise says
-        np.testing.assert_allclose(result.T_parent_child[:2, 3], MOUNT[:2, 3], atol=0.05)
-        assert result.reasons[0].what_to_do == "measure it by hand and give prior.z VALUE+/-SIGMA"
-
     def test_prior_fills_in_what_is_unknown(self):
         result = calibrate(*flat_drive(), reference="B10", prior={"z": (1.85, 0.02)})
         assert result.status is SolveStatus.OK

@@ -24,16 +24,10 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 
+RATES_HZ = 20.0, 33.0
 
-def drive(
-    seed=0,
-    seconds=60,
-    parent_hz=20.0,
-    child_hz=33.0,
-    shift_s=0.0,
-    noise=0.0,
-    wander=wandering_poses,
-):
+
+def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=wandering_poses):
     """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is
     the offset to find.
     """
@@ -44,9 +38,9 @@ def drive(
         stamps_ns = np.arange(first_ns, end_ns, round(1e9 / rate_hz))
         return stamps_ns, truth.at(stamps_ns)
 
-    stamps_ns, poses = sampled(parent_hz, start_ns)
+    stamps_ns, poses = sampled(hz[0], start_ns)
     parent = Trajectory(stamps_ns, disturbed(poses, seed + 1, noise, noise))
-    stamps_ns, poses = sampled(child_hz, start_ns + 7_000_000)
+    stamps_ns, poses = sampled(hz[1], start_ns + 7_000_000)
     child = Trajectory(stamps_ns, disturbed(child_of(poses), seed + 2, noise, noise)).shifted(
         -shift_s
     )
@@ -147,7 +141,7 @@ class TestWeakEvidenceIsRefused:
 
 class TestClockRate:
     def test_it_is_found_unasked_and_the_answer_is_as_without(self):
-        parent, child = drive(seconds=300, parent_hz=10.0, child_hz=10.0, noise=0.001)
+        parent, child = drive(seconds=300, hz=(10.0, 10.0), noise=0.001)
         middle_ns = int(child.stamps_ns[len(child) // 2])
         slow = child.shifted(0.0, -75e-6, middle_ns)
         found, plain = calibrate(parent, slow), calibrate(parent, child)
@@ -197,11 +191,8 @@ class TestInTheEngine:
         )
         for part in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
-                feed(
-                    calibrator,
-                    stream,
-                    trajectory[part * len(trajectory) // 8 : (part + 1) * len(trajectory) // 8],
-                )
+                first, last = (k * len(trajectory) // 8 for k in (part, part + 1))
+                feed(calibrator, stream, trajectory[first:last])
         snapshot = calibrator.snapshot()
         assert len(snapshot.kept) > 0
         assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
