@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from hand_eye_calib.assessment.excitation import Excitation
+from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import (
     Calibration,
@@ -83,3 +85,9 @@ def good_calibration(**changes):
         "covariance": np.diag(np.square(sigmas)),
     }
     return calibration(**(values | changes))
+
+
+def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
+    """A motion that shows much."""
+    lever_arms = LeverArms.of(np.zeros((1, 3, 3)))
+    return Excitation(100, np.radians(rotation_deg), lever_arms, 10.0, motion_s)

@@ -72,9 +72,7 @@ def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
     be one stream computed from the other.
     """
     s = np.arange(n_poses) * period_ns * 1e-9
-    turns = np.stack(
-        [0.5 * np.sin(0.7 * s), 0.4 * np.sin(0.9 * s + 1.0), 0.8 * np.sin(0.4 * s)], axis=1
-    )
+    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + [0.0, 1.0, 0.0]) * [0.5, 0.4, 0.8]
     places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))

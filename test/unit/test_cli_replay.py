@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from bag_making import TF, path_message, tf_message, write_messages
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, messages, wandering_poses
 
 from hand_eye_calib.cli.reading import read_journal_of
 from hand_eye_calib.geometry import se3
@@ -52,10 +52,8 @@ def write_session(directory, options, *given):
     }
     writer = JournalWriter(directory, about)
     for stream, (trajectory, _) in streams.items():
-        quats = se3.to_quat_xyzw(trajectory.poses).tolist()
-        positions = trajectory.poses[:, :3, 3].tolist()
-        for message in zip(trajectory.stamps_ns.tolist(), positions, quats, strict=True):
-            writer.add_pose(stream, *message)
+        for message in messages(stream, trajectory):
+            writer.add_pose(*message)
     writer.close()
 
 

@@ -10,10 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from result_making import calibration
+from result_making import calibration, seen
 
-from hand_eye_calib.assessment.excitation import Excitation
-from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.live import cycle as module
@@ -35,12 +33,6 @@ def result(sigmas_m=0.005, **fields):
     dofs = tuple(map(DofObservability, AXES, verdicts, sigmas))
     fields = {"status": SolveStatus.OK, "noise": None, "warnings": (), "findings": ()} | fields
     return dataclasses.replace(calibration(), observability=dofs, **fields)
-
-
-def seen(motion_s):
-    return Excitation(
-        100, np.radians([40.0, 30.0, 60.0]), LeverArms.of(np.zeros((1, 3, 3))), 10.0, motion_s
-    )
 
 
 @pytest.fixture

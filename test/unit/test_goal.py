@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 from result_making import calibration as made
+from result_making import seen
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.excitation import Excitation, excitation, helpful_motion
-from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.assessment.excitation import excitation, helpful_motion
 from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
@@ -31,11 +31,6 @@ def result(sigmas_m=0.005, sigmas_rad=0.001, verdicts=(), **fields):
     )
     fields = {"status": SolveStatus.OK, "noise": None} | fields
     return dataclasses.replace(made(), observability=dofs, **fields)
-
-
-def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
-    lever_arms = LeverArms.of(np.zeros((1, 3, 3)))
-    return Excitation(100, np.radians(rotation_deg), lever_arms, 10.0, motion_s)
 
 
 def told(goal, *results):

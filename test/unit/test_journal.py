@@ -1,14 +1,15 @@
+import itertools
 import json
 
 import numpy as np
 import pytest
 from motions import as_trajectory, child_of, wandering_poses
+from motions import messages as messages_of
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
 from hand_eye_calib.live.journal import DirectoryLock, give, takers
 
@@ -18,18 +19,9 @@ BOTH = {"parent": {}, "child": {}}
 
 def messages(n_poses=60):
     poses = wandering_poses(n_poses)
-    for parent, child in zip(
-        *(_rows(as_trajectory(each)) for each in (poses, child_of(poses))), strict=True
-    ):
-        yield ("parent", *parent)
-        yield ("child", *child)
-
-
-def _rows(trajectory):
-    quats = se3.to_quat_xyzw(trajectory.poses).tolist()
-    return zip(
-        trajectory.stamps_ns.tolist(), trajectory.poses[:, :3, 3].tolist(), quats, strict=True
-    )
+    parent, child = as_trajectory(poses), as_trajectory(child_of(poses))
+    both = zip(messages_of("parent", parent), messages_of("child", child), strict=True)
+    return list(itertools.chain.from_iterable(both))
 
 
 def record(writer, calibrator, sequence, flush_every=25):
@@ -94,7 +86,7 @@ def test_poses_are_read_in_the_order_in_which_they_came_whatever_their_clocks(tm
 
 
 def test_a_session_goes_on_after_the_last_whole_line(tmp_path):
-    calibrator, sequence = Calibrator(CONFIG), list(messages())
+    calibrator, sequence = Calibrator(CONFIG), messages()
     writer = JournalWriter(tmp_path, BOTH)
     record(writer, calibrator, sequence[:60])
     writer.close()

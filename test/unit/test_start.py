@@ -42,6 +42,7 @@ def test_help_loads_no_library(arguments):
     "code",
     [
         "import hand_eye_calib.engine.calibrator",
+        "import hand_eye_calib.live.solving",
         "import hand_eye_calib as hec; hec.Trajectory; hec.Calibration; hec.calibrate",
     ],
 )

@@ -90,18 +90,9 @@ class TestTwoSensorsInOneStream:
 
 def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     seconds = np.arange(400) * 0.05
-    turns = np.stack(
-        [
-            0.3 * np.sin(0.7 * seconds),
-            0.2 * np.sin(0.9 * seconds + 1.0),
-            1.2 * np.sin(0.1 * seconds),
-        ],
-        axis=1,
-    )
-    places = np.stack(
-        [20 * np.sin(0.05 * seconds), 20 * np.sin(0.07 * seconds), 0.5 * np.cos(0.8 * seconds)],
-        axis=1,
-    )
+    turns = np.sin(np.outer(seconds, [0.7, 0.9, 0.1]) + [0.0, 1.0, 0.0]) * [0.3, 0.2, 1.2]
+    places = np.outer(seconds, [0.05, 0.07, 0.8]) + [0.0, 0.0, np.pi / 2]
+    places = np.sin(places) * [20.0, 20.0, 0.5]
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     noisy = disturbed(child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-4, 2e-4)
     parent, child = as_trajectory(poses, 20), as_trajectory(noisy, 20)
