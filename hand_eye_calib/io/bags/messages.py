@@ -319,6 +319,9 @@ def frames_in(data: Buffer, message_type: str, is_ros1: bool) -> set[str]:
 
 # ---- what the messages of a topic measure
 
+# What an IMU or a GNSS receiver says that it does not have, in words.
+_LACKS = {"rates": "angular rates", "rotations": "orientation", "positions": "fix"}
+
 
 class MessageReader:
     """Unpacks the messages of one topic, in their order, as poses: of what is no pose, the other
@@ -401,7 +404,7 @@ class MessageReader:
         except MALFORMED as error:
             raise InputError(f"not a message of type {self._row.name}: {error}") from error
         if not is_usable.all():
-            raise InputError(f"the message has no {self._measures}")
+            raise InputError(f"the message has no {_LACKS.get(self._measures, self._measures)}")
         values = columns.poses[0].tolist()
         frames = columns.world_frames[0], columns.sensor_frames[0]
         return PoseFields(int(columns.stamps_ns[0]), *frames, values[:3], values[3:])
