@@ -106,25 +106,6 @@ class Correlation:
 NO_CORRELATION = Correlation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class AngularRates:
-    """Angular rates of a stream, sampled at equal steps.
-
-    Attributes
-    ----------
-    start_ns : int
-        Stamp of the first window's start.
-    step_s : float
-        From one window's start to the next.
-    values : (M,) array
-        rad/s; NaN for windows that touch a gap.
-    """
-
-    start_ns: int
-    step_s: float
-    values: FloatArray
-
-
 def correlate_rates(
     parent: Trajectory,
     child: Trajectory,
@@ -146,13 +127,6 @@ def correlate_rates(
     -------
     Correlation
         Without any evidence if a stream is too short; see :attr:`Correlation.is_clear`.
-
-    Notes
-    -----
-    Correlation coefficients at all offsets at once by fast Fourier transforms with masks for gaps
-    and ends (Padfield, *Masked object registration in the Fourier domain*, IEEE Transactions on
-    Image Processing, 2012). Offsets are compared by the significance of their coefficient (Fisher's
-    z), so that a short overlap needs a higher coefficient than a long one.
     """
     if min(len(parent), len(child)) < 4:
         return NO_CORRELATION
@@ -162,43 +136,46 @@ def correlate_rates(
     of_parent, of_child = (
         angular_rates(each, window_s, step_s, max_gap_s, of_speed) for each in (parent, child)
     )
-    seen = min(int(np.isfinite(each.values).sum()) for each in (of_parent, of_child))
-    if seen * step_s < _MIN_OVERLAP_S:
+    if min(np.isfinite(each).sum() for each in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
         return NO_CORRELATION
-    lags, coefficients, overlaps = _masked_correlation(
-        *(_compressed(each.values) for each in (of_parent, of_child))
-    )
+    lags, coefficients, overlaps = _masked_correlation(of_parent, of_child)
     durations = overlaps * step_s
-    shorter_s = min(len(of_parent.values), len(of_child.values)) * step_s
+    shorter_s = min(len(of_parent), len(of_child)) * step_s
     enough = durations >= max(_MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S)
     # About one independent sample a second; three degrees of freedom go into the coefficient.
     fisher_z = np.arctanh(np.clip(coefficients, -_ALMOST_ONE, _ALMOST_ONE))
     significance = np.where(enough, fisher_z * np.sqrt(np.maximum(durations - 3, 0)), -np.inf)
-    peak_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
+    peaks, rival = _peaks(significance, lags * step_s, window_s)
+    start_s = (parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
+    offsets_s = [float(start_s + (lags[k] + _vertex(coefficients, k)) * step_s) for k in peaks]
+    return Correlation(
+        offset_s=offsets_s[0],
+        correlation=float(coefficients[peaks[0]]),
+        distinctness=float(significance[peaks[0]] / max(rival, 1.0)),
+        overlap_s=float(durations[peaks[0]]),
+        variation=min(float(np.nanstd(rates)) for rates in (of_parent, of_child)),
+        others_s=tuple(offsets_s[1:]),
+    )
+
+
+def _peaks(
+    significance: FloatArray, lags_s: FloatArray, window_s: float
+) -> tuple[list[int], float]:
+    """Indices of the most significant lags that are apart, and the significance of the second."""
+    apart_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
     left, peaks, heights = significance.copy(), [], []
     for _ in range(_MOST_PEAKS):
         peaks.append(int(np.argmax(left)))
-        heights.append(max(float(left[peaks[-1]]), 1.0))
-        left[np.abs(lags - lags[peaks[-1]]) * step_s <= peak_s] = -np.inf
-    start_s = (of_parent.start_ns - of_child.start_ns) * 1e-9
-    best, *others = (
-        float(start_s + (lags[peak] + _vertex(coefficients, peak)) * step_s) for peak in peaks
-    )
-    return Correlation(
-        offset_s=best,
-        correlation=float(coefficients[peaks[0]]),
-        distinctness=float(significance[peaks[0]] / heights[1]),
-        overlap_s=float(durations[peaks[0]]),
-        variation=min(float(np.nanstd(rate.values)) for rate in (of_parent, of_child)),
-        others_s=tuple(others),
-    )
+        heights.append(float(left[peaks[-1]]))
+        left[np.abs(lags_s - lags_s[peaks[-1]]) <= apart_s] = -np.inf
+    return peaks, heights[1]
 
 
 def angular_rates(
     trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float, of_speed: bool = False
-) -> AngularRates:
-    """Angular rates, or speeds (m/s), over windows of ``window_s`` seconds that start every
-    ``step_s`` seconds.
+) -> FloatArray:
+    """Angular rates (M,), rad/s, or speeds, m/s, over windows of ``window_s`` seconds that start
+    every ``step_s`` seconds; NaN for windows that touch a gap.
     """
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
@@ -214,7 +191,7 @@ def angular_rates(
     first = np.searchsorted(stamps_ns, starts_ns, side="right") - 1
     last = np.minimum(np.searchsorted(stamps_ns, ends_ns), len(stamps_ns) - 1)
     rates[gaps_before[last] > gaps_before[first]] = np.nan
-    return AngularRates(int(stamps_ns[0]), step_s, rates)
+    return rates
 
 
 def _compressed(rates: FloatArray) -> FloatArray:
@@ -227,12 +204,12 @@ def _compressed(rates: FloatArray) -> FloatArray:
 def _masked_correlation(
     first: FloatArray, second: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Lags, correlation coefficients and counts of common samples: first[i + lag] against
+    """Lags, correlation coefficients and counts of common samples of rates: first[i + lag] against
     second[i], NaNs left out.
     """
     size = 1 << (len(first) + len(second) - 1).bit_length()
     spectra = []
-    for signal in (first, second):
+    for signal in (_compressed(first), _compressed(second)):
         mask = np.isfinite(signal)
         filled = np.where(mask, signal, 0.0)
         spectra += [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]

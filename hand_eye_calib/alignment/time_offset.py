@@ -2,6 +2,7 @@
 that changes from second to second.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,6 +75,11 @@ class TimeOffset:
     spread_s: float = np.inf
     rate: ClockRate | None = None
 
+    @property
+    def unexplained(self) -> float:
+        """Share of the motion that the fit leaves unexplained; infinite without one."""
+        return self.fit.unexplained if self.fit else np.inf
+
     def steadied(self, child: Trajectory) -> Trajectory:
         """The child's poses at a constant offset: with stamps freed of a rate that is used."""
         return child.shifted(0.0, self.rate.used, self.rate.at_ns) if self.rate else child
@@ -125,22 +131,24 @@ def estimate_time_offset(
             refine_time_offset(parent, child, replace(correlation, offset_s=at_s), max_gap_s)
             for at_s in {near_s, correlation.offset_s, *correlation.others_s}
         ]
-        left = [each.fit.unexplained if each.fit else np.inf for each in tried]
-        best, least = min(zip(tried, left, strict=True), key=lambda each: each[1])
-        limit = _EXPLAINED_NEAR
-        for each, share in zip(tried, left, strict=True):
-            is_rival = abs(each.seconds - best.seconds) > _FINE_RANGE_S
-            if is_rival and abs(best.seconds) > 2 * _FINE_RANGE_S:
-                limit = min(limit, _FAR_BETTER * share)
-        if least < limit:
+        best = min(tried, key=lambda each: each.unexplained)
+        if best.unexplained < _limit(best, tried):
             return best
-    doubt, motion = correlation.doubt(), "varied turns"
-    if of_speed:
-        doubt, motion = doubt.replace("angular rates", "speeds"), "changes of speed"
+    doubt = correlation.doubt().replace("angular rates", "speeds" if of_speed else "angular rates")
     raise NotEnoughDataError(
-        f"the time offset cannot be estimated: {doubt}; "
-        f"drive more {motion}, or give time_offset in seconds"
+        f"the time offset cannot be estimated: {doubt}; drive with more turns and "
+        "changes of speed, or give time_offset in seconds"
     )
+
+
+def _limit(best: TimeOffset, tried: Sequence[TimeOffset]) -> float:
+    """What the best of some offsets must leave unexplained less than: a share of what any other
+    leaves, unless it is near zero.
+    """
+    if abs(best.seconds) <= 2 * _FINE_RANGE_S:
+        return _EXPLAINED_NEAR
+    rivals = [each for each in tried if abs(each.seconds - best.seconds) > _FINE_RANGE_S]
+    return min([_EXPLAINED_NEAR, *(_FAR_BETTER * each.unexplained for each in rivals)])
 
 
 def refine_time_offset(

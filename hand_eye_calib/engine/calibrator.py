@@ -25,18 +25,10 @@ from hand_eye_calib.engine.snapshot import (
     pair_poses,
 )
 from hand_eye_calib.errors import InputError, NotEnoughDataError
-from hand_eye_calib.geometry.trajectory import (
-    FARTHEST_M,
-    QUATERNION_NORM_TOLERANCE,
-    REACH,
-    far_position,
-)
+from hand_eye_calib.geometry.frames import check_pose
+from hand_eye_calib.geometry.trajectory import REACH
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
 from hand_eye_calib.results.calibration import Calibration
-
-# Bounds of a quaternion's squared length.
-_MIN_NORM2 = (1 - QUATERNION_NORM_TOLERANCE) ** 2
-_MAX_NORM2 = (1 + QUATERNION_NORM_TOLERANCE) ** 2
 
 # Share of the poses that are paired if a buffer is full.
 _PAIRED_IF_FULL = 0.9
@@ -307,8 +299,7 @@ class Calibrator:
         InputError
             If a value is not finite or the quaternion is not of unit length.
         """
-        if not _is_pose(*position, *quat_xyzw):
-            raise _what_is_wrong(position, quat_xyzw)
+        check_pose(*position, *quat_xyzw)
         buffer = self._buffers[stream]
         if buffer.is_full:
             self._make_pairs(_PAIRED_IF_FULL)
@@ -415,23 +406,3 @@ class Calibrator:
                 )
         found = self._time_offset
         return replace(self._config, time_offset=found.seconds) if found else None
-
-
-def _is_pose(x: float, y: float, z: float, qx: float, qy: float, qz: float, qw: float) -> bool:
-    norm2 = qx * qx + qy * qy + qz * qz + qw * qw
-    # NaN fails every comparison.
-    is_near = abs(x) <= FARTHEST_M and abs(y) <= FARTHEST_M and abs(z) <= FARTHEST_M
-    return is_near and _MIN_NORM2 <= norm2 <= _MAX_NORM2
-
-
-def _what_is_wrong(position: Sequence[float], quat_xyzw: Sequence[float]) -> InputError:
-    """The InputError for values that are not a pose."""
-    if not np.isfinite(position).all():
-        return InputError("position ({}, {}, {}) is not finite".format(*position))
-    if np.abs(position).max() > FARTHEST_M:
-        return InputError(far_position(*position))
-    return InputError(
-        "quaternion (x {}, y {}, z {}, w {}) ".format(*quat_xyzw)
-        + f"has length {np.linalg.norm(quat_xyzw):.4g}, expected 1 within "
-        f"{QUATERNION_NORM_TOLERANCE}"
-    )

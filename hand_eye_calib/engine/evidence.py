@@ -108,8 +108,8 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
     for stream in (parent, child):
         window_s = max(3 * step_s, _MIN_WINDOW_S)
         found = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
-        steps = np.arange(len(found.values)) * step_s
-        rates.append(((found.start_ns - start_ns) * 1e-9 + steps, found.values))
+        steps = np.arange(len(found)) * step_s
+        rates.append(((stream.stamps_ns[0] - start_ns) * 1e-9 + steps, found))
         gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))
         edges = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
         spans.append((edges.reshape(-1, 2) - start_ns) * 1e-9)

@@ -29,7 +29,7 @@ def check_pose(*values: float) -> None:
     quaternion that is not of unit length.
     """
     length = math.hypot(*values[3:])
-    if not math.isfinite(sum(values)):
+    if not all(map(math.isfinite, values)):
         raise InputError("the pose has a value that is not finite")
     if abs(length - 1.0) > QUATERNION_NORM_TOLERANCE:
         raise InputError(f"the pose has a quaternion of length {length:.4g}, expected 1")

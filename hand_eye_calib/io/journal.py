@@ -24,10 +24,9 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import other_names
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.files import open_regular, write_atomically
 from hand_eye_calib.io.limits import LONGEST_LINE
-from hand_eye_calib.io.trajectory_files.writing import tum_line, tum_lines
+from hand_eye_calib.io.trajectory_files.writing import tum_line
 
 _FORMAT, _VERSION = "hand_eye_calib/journal", 2
 _STREAMS = ("parent", "child", *other_names())
@@ -46,11 +45,9 @@ class JournalWriter:
         Made if it does not exist.
     about : mapping of str to mappings
         What is known of each stream.
-    poses : mapping of str to Trajectory
-        Poses of the session so far, by stream.
     resumed : Journal, optional
         The session in the directory, if that goes on: what cannot be read at the end of its files
-        is cut off, and ``poses`` are there already.
+        is cut off.
 
     Raises
     ------
@@ -62,23 +59,20 @@ class JournalWriter:
         self,
         directory: str | Path,
         about: About,
-        poses: Mapping[str, Trajectory] | None = None,
         resumed: "Journal | None" = None,
     ) -> None:
         self._directory = Path(directory)
         self._directory.mkdir(parents=True, exist_ok=True)
         if self._directory.is_symlink():
             raise OSError(f"{self._directory} is a symbolic link")
-        poses, known, whole_bytes = poses or {}, dict(about), {}
-        self._parent_poses = len(poses.get("parent", ()))
+        known, whole_bytes, self._parent_poses = dict(about), {}, 0
         if resumed is not None:
             known, whole_bytes = known | resumed.about, resumed.whole_bytes
             self._parent_poses = int((resumed.streams == "parent").sum())
         texts = {}
         for stream in about.keys() - whole_bytes.keys():
             head = {"format": _FORMAT, "version": _VERSION, "stream": stream, **about[stream]}
-            lines = tum_lines(poses[stream]) if stream in poses else []
-            texts[self._path(stream)] = "\n".join([_comment(head), *lines, ""])
+            texts[self._path(stream)] = f"{_comment(head)}\n"
         write_atomically(texts)
         self._about: dict[str, Mapping[str, Any]] = known
         self._pending: dict[str, list[str]] = {stream: [] for stream in known}

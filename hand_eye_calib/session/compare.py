@@ -90,14 +90,9 @@ def compare(
     ----------
     results : sequence of Calibration
     installed : Calibration or Extrinsic, optional
-        What the robot uses now. Without it the results of several recordings of one rig are
-        compared: which one has moved?
+        What the robot uses now. Without it: which of several recordings of one rig has moved?
     names : sequence of str, optional
         What to call the results; numbered by default.
-
-    Returns
-    -------
-    Comparison
 
     Raises
     ------
@@ -113,34 +108,31 @@ def compare(
     if len(called) != len(results) or len(set(called)) != len(called):
         raise InputError(f"expected {len(results)} different names, found {len(called)}")
     calibrations = [each for each in results if isinstance(each, Calibration)]
-    given = [installed] if isinstance(installed, Calibration) else []
-    require_same_frames([*calibrations, *given])
+    require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
     targets = [target_of(axis, each) for each in calibrations[:1] for axis in AXES]
     limits = _TARGETS * np.array(targets or CalibratorConfig().targets)
     stated = [_stated(result, name) for result, name in zip(results, called, strict=True)]
-    if len(stated) < (2 if installed is None else 1):
-        raise InputError("expected two results or more, or one and what is installed")
-    if installed is None:
-        couples = list(itertools.combinations(stated, 2))
-    else:
+    couples = list(itertools.combinations(stated, 2))
+    if installed is not None:
         couples = [(_stated(installed, "installed"), each) for each in stated]
+    if not couples:
+        raise InputError("expected two results or more, or one and what is installed")
     differences = tuple(_difference(*couple, limits) for couple in couples)
     verdict = Change.of_all([each.verdict for each in differences])
-    apart = [each for each in differences if each.verdict is Change.MOVED]
-    moved_names = tuple(each.second for each in apart)
+    moved_names = tuple(each.second for each in differences if each.verdict is Change.MOVED)
     sentence = f"moved: {listing(moved_names)} of {len(stated)}"
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
-    elif not apart:
+    elif not moved_names:
         beside = "another" if installed is None else "what is installed"
         sentence = f"{verdict.value}: none of {len(stated)} differs from {beside}"
     elif installed is None:
-        moved_names, sentence = _who_moved(called, calibrations, apart)
+        moved_names, sentence = _who_moved(called, calibrations, differences)
     return Comparison(differences, moved_names, verdict, sentence)
 
 
 def _who_moved(
-    names: Sequence[str], results: Sequence[Calibration], apart: Sequence[Difference]
+    names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
     """The one without which the others agree; or those from some recording on. Nobody, if neither
     explains the differences.
@@ -154,6 +146,7 @@ def _who_moved(
         if found.kind is Kind.MOVED:
             between = f"{names[found.apart[0] - 1]} and {moved_names[0]}"
             return moved_names, f"moved between {between}: {listing(moved_names)}"
+    apart = [each for each in differences if each.verdict is Change.MOVED]
     pairs = listing([f"{each.first} and {each.second}" for each in apart])
     return (), f"moved: {pairs} differ; which of them has moved, they do not tell"
 

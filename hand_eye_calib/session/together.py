@@ -140,12 +140,7 @@ def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def together(results: Mapping[str, Calibration]) -> Calibration:
-    """One result from the results of recordings of one rig.
-
-    Parameters
-    ----------
-    results : mapping of str to Calibration
-        By the names of the recordings.
+    """One result from the results of recordings of one rig, by the names of those.
 
     Returns
     -------
@@ -169,16 +164,17 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     names = [*fit]
     unfit |= {names[index]: "it does not belong to the others" for index in found.apart}
     used = [each for name, each in fit.items() if name not in unfit]
-    unknown = np.full(6, np.nan)
-    of_axes = dict(zip(names, zip(found.deviations, found.sigmas, strict=True), strict=True))
+    unknown = dict.fromkeys(results, np.full(6, np.nan))
+    deviations = unknown | dict(zip(names, found.deviations, strict=True))
+    sigmas = unknown | dict(zip(names, found.sigmas, strict=True))
     records = tuple(
         Recorded(
             name=name,
             verdict=each.verdict.value,
             headline=each.headline,
             left_out=unfit.get(name, ""),
-            deviations=_by_axis(of_axes.get(name, (unknown, unknown))[0]),
-            sigmas=_by_axis(of_axes.get(name, (unknown, unknown))[1]),
+            deviations=_by_axis(deviations[name]),
+            sigmas=_by_axis(sigmas[name]),
             time_offset_s=each.time_offset_s,
             scale=each.scale,
             n_poses=each.n_poses,
@@ -186,19 +182,15 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         )
         for name, each in results.items()
     )
-    return _joint(
-        used,
-        found,
-        Together(
-            kind=found.kind.value,
-            sentence=found.sentence(names),
-            chi2=found.chi2,
-            dof=found.dof,
-            p_value=found.p_value,
-            scatter=_by_axis(found.scatter),
-            recordings=records,
-        ),
+    evidence = {name: getattr(found, name) for name in ("chi2", "dof", "p_value")}
+    record = Together(
+        **evidence,
+        kind=found.kind.value,
+        sentence=found.sentence(names),
+        scatter=_by_axis(found.scatter),
+        recordings=records,
     )
+    return _joint(used, found, record)
 
 
 def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) -> Agreement:

@@ -106,13 +106,11 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("position", "quat", "message"),
         [
-            ((0, np.nan, 0), (0, 0, 0, 1), r"position \(0, nan, 0\) is not finite"),
-            ((np.inf, 0, 0), (0, 0, 0, 1), "is not finite"),
-            ((0, -1e154, 0), (0, 0, 0, 1), r"is more than 1e\+08 m from the origin"),
+            ((0, np.nan, 0), (0, 0, 0, 1), "not finite"),
             ((1.7e308, 1.7e308, 0), (0, 0, 0, 1), r"is more than 1e\+08 m from the origin"),
-            ((0, 0, 0), (0, 0, 0, 0), "has length 0, expected 1"),
-            ((0, 0, 0), (0.5, 0.5, 0.5, 0.6), "has length 1.05"),
-            ((0, 0, 0), (0, 0, np.nan, 1), "has length nan"),
+            ((0, 0, 0), (0, 0, 0, 0), "of length 0, expected 1"),
+            ((0, 0, 0), (0.5, 0.5, 0.5, 0.6), "of length 1.05"),
+            ((0, 0, 0), (0, 0, np.nan, 1), "not finite"),
         ],
     )
     def test_impossible_poses(self, position, quat, message):

@@ -85,7 +85,7 @@ def test_rhythmic_motion_shows_an_offset_if_the_path_does():
     far = estimate_time_offset(parent, child.shifted(-30.0))
     assert far.seconds == pytest.approx(30.1234, abs=0.002)
     parent, child = drive(noise=0.0002, wander=lambda *what: rocking(*what, drifts=False))
-    with pytest.raises(NotEnoughDataError, match="more varied turns"):
+    with pytest.raises(NotEnoughDataError, match="drive with more turns"):
         estimate_time_offset(parent, child.shifted(-30.0))
 
 
