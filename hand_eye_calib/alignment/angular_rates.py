@@ -145,7 +145,7 @@ def correlate_rates(
     # About one independent sample a second; three degrees of freedom go into the coefficient.
     fisher_z = np.arctanh(np.clip(coefficients, -_ALMOST_ONE, _ALMOST_ONE))
     significance = np.where(enough, fisher_z * np.sqrt(np.maximum(durations - 3, 0)), -np.inf)
-    peaks, rival = _peaks(significance, lags * step_s, window_s)
+    peaks, rival = _peaks(significance, np.multiply(lags, step_s, dtype=float), window_s)
     start_s = (parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
     offsets_s = [float(start_s + (lags[k] + _vertex(coefficients, k)) * step_s) for k in peaks]
     return Correlation(

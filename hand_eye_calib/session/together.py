@@ -142,11 +142,8 @@ def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
 def together(results: Mapping[str, Calibration]) -> Calibration:
     """One result from the results of recordings of one rig, by the names of those.
 
-    Returns
-    -------
-    Calibration
-        Method, frames and targets are those of the recordings. So are the clock offset and the
-        scale if all have the same; otherwise each has its own.
+    Method, frames and targets are those of the recordings. So are the clock offset and the scale if
+    all have the same; otherwise each has its own.
 
     Raises
     ------
