@@ -31,14 +31,9 @@ def test_every_option_is_a_parameter_with_its_description_and_range(start_node, 
         assert descriptor.read_only == meta["read_only"]
         assert descriptor.dynamic_typing == bool(meta["words"])
         assert peer.parameter(name) == FIELDS[name].default
-    assert (
-        peer.describe("threshold").floating_point_range[0].to_value
-        == FIELDS["threshold"].metadata["within"][1]
-    )
-    assert (
-        peer.describe("max_pairs").integer_range[0].from_value
-        == FIELDS["max_pairs"].metadata["within"][0]
-    )
+    threshold, max_pairs = (FIELDS[name].metadata["within"] for name in ("threshold", "max_pairs"))
+    assert peer.describe("threshold").floating_point_range[0].to_value == threshold[1]
+    assert peer.describe("max_pairs").integer_range[0].from_value == max_pairs[0]
     assert ", ".join(METHODS) in peer.describe("method").description
 
 

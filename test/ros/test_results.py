@@ -95,12 +95,8 @@ def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer)
     for stream, trajectory in (("parent", case.parent), ("child", case.child)):
         engine.set_frame(stream, {"parent": "lidar", "child": "camera"}[stream])
         for stamp_ns, T_world_sensor in zip(case.stamps_ns, trajectory.poses, strict=True):
-            engine.add_pose(
-                stream,
-                int(stamp_ns),
-                T_world_sensor[:3, 3].tolist(),
-                se3.to_quat_xyzw(T_world_sensor).tolist(),
-            )
+            quat_xyzw = se3.to_quat_xyzw(T_world_sensor).tolist()
+            engine.add_pose(stream, int(stamp_ns), T_world_sensor[:3, 3].tolist(), quat_xyzw)
     offline = engine.estimate()
 
     start_node(
@@ -117,12 +113,9 @@ def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer)
         f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
         in answer.message
     )
-    assert translation_error_m(matrix(extrinsic), case.T_parent_child) == pytest.approx(
-        0.20, abs=0.01
-    )
-    assert rotation_error_deg(matrix(extrinsic), case.T_parent_child) == pytest.approx(
-        0.23, abs=0.01
-    )
+    both = matrix(extrinsic), case.T_parent_child
+    errors = translation_error_m(*both), rotation_error_deg(*both)
+    assert errors == pytest.approx((0.20, 0.23), abs=0.01)
 
 
 def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, peer):

@@ -151,12 +151,8 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
     np.testing.assert_allclose(
         from_files["T_parent_child"]["matrix"], from_bag["T_parent_child"]["matrix"], atol=1e-12
     )
-    assert from_files["inputs"]["child"] == {
-        "file": files[1],
-        "poses": 120,
-        "first_stamp_ns": START_NS,
-        "last_stamp_ns": START_NS + 11_900_000_000,
-    }
+    stamps = {"first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000}
+    assert from_files["inputs"]["child"] == {"file": files[1], "poses": 120, **stamps}
     # two files are used whole, a stream is bounded
     options = [each["inputs"]["options"] for each in (from_files, from_bag)]
     assert [each.pop("max_pairs") for each in options] == [120, 5000]
@@ -166,17 +162,10 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
 def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     out_dir = tmp_path / "result"
     code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
-    wrote = [
-        f"hand_eye_calib: note: wrote {out_dir / name}\n"
-        for name in ("extrinsic.yaml", "report.html")
-    ]
-    assert (code, err) == (0, "".join(wrote))
-    assert sorted(path.name for path in out_dir.iterdir()) == [
-        "extrinsic.urdf.xacro",
-        "extrinsic.yaml",
-        "report.html",
-        "static_transform.launch.py",
-    ]
+    wrote = f"hand_eye_calib: note: wrote {out_dir}/"
+    assert (code, err) == (0, f"{wrote}extrinsic.yaml\n{wrote}report.html\n")
+    files = ["extrinsic.urdf.xacro", "extrinsic.yaml", "report.html", "static_transform.launch.py"]
+    assert sorted(path.name for path in out_dir.iterdir()) == files
     assert run("info", out_dir) == (0, text, "")
     document = json.loads(run("info", out_dir / "extrinsic.yaml", "--json")[1])
     assert document == load_result(out_dir).to_dict()

@@ -166,10 +166,8 @@ def test_the_command_refuses_a_contradiction(tmp_path, capsys):
     assert captured.out.startswith("DO NOT USE: the prior on x is ")
     assert "static_transform" not in captured.out
     assert load_result(tmp_path / "out").status is SolveStatus.CONTRADICTED
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "extrinsic.yaml",
-        "report.html",
-    ]
+    files = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert files == ["extrinsic.yaml", "report.html"]
 
 
 def test_what_nobody_knows_keeps_its_variance():

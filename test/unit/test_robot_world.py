@@ -98,16 +98,8 @@ def test_two_stops_are_too_few(random, n):
 
 
 class TestUndetermined:
-    @staticmethod
-    def unknown(stops):
-        """Which of six directions along and about the parent's axes are not determined."""
-        fit = solve(stops)
-        to_parent = np.kron(np.eye(2), fit.Ts_parent_child[0][:3, :3])
-        return np.linalg.norm(to_parent @ fit.undetermined(), axis=1) > 0.3
-
     def test_rotations_about_all_axes_determine_everything(self, random):
-        _, _, stops = recording(random, 15)
-        assert not self.unknown(stops).any()
+        assert solve(recording(random, 15)[2]).undetermined().shape == (6, 0)
 
     @pytest.mark.parametrize("seed", range(10))
     @pytest.mark.parametrize("motion", ["one_axis", "no_rotation", "one_axis_unmoved"])
@@ -125,7 +117,6 @@ class TestUndetermined:
         X, _, stops = recording(random, 25, Ts_world_parent=A, levels=levels)
         fit = solve(stops)
         unknown = np.kron(np.eye(2), fit.Ts_parent_child[0][:3, :3]) @ fit.undetermined()
-        along = np.eye(3) if motion == "no_rotation" else axis[None]
         along = np.eye(3) if motion == "no_rotation" else axis[None]
         assert np.linalg.norm(along @ unknown[:3], axis=1).min() > 0.98
         if motion == "one_axis":

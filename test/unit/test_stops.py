@@ -18,7 +18,7 @@ NOISE = np.repeat([0.0005, 0.001], 3)
 
 @pytest.fixture
 def random():
-    return np.random.default_rng()
+    return np.random.default_rng(0)
 
 
 def arm(random, n=25, is_in_hand=True, turn_rad=(0.5, 0.5, 0.5)):
