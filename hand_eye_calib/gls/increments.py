@@ -41,6 +41,9 @@ SYSTEMATIC = ("scale", "bias", "time")
 SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
 N_SYSTEMATIC = 8
 
+# Steps count as noise until they differ from their neighbours by so many times its variance.
+_CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
+
 SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
 
 
@@ -53,17 +56,26 @@ class Steps:
     raw : (n, 3) array
     smooth : (n, 3) array
         With the mean velocity of the steps two before and two after.
+    variance : float
+        Of what they differ by, as a rule.
     """
 
     raw: FloatArray
     smooth: FloatArray
+    variance: float
 
     @classmethod
     def of(cls, raw: FloatArray, intervals_s: FloatArray) -> Steps:
         """From steps over these intervals."""
         rates = raw / intervals_s[:, None]
         around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
-        return cls(raw, 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None])
+        smooth = 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None]
+        return cls(raw, smooth, median((raw - smooth) ** 2))
+
+    def cleaned(self, noise_m: float) -> FloatArray:
+        """Smooth steps (n, 3), as far as what they differ by may be noise."""
+        believed = max(1.0 - _CAUTION * noise_m**2 / max(self.variance, _LEAST_VARIANCE), 0.0)
+        return self.smooth + believed * (self.raw - self.smooth)
 
 
 @dataclass(frozen=True)
@@ -140,14 +152,23 @@ class Course:
         return Course(self.twists[index], self.path[index], self.along[index])
 
 
-def course_of(streams: Streams, T_parent_child: FloatArray) -> Course:
-    """Course of both sensors; the child's steps are the mean of what both streams say."""
+def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.inf) -> Course:
+    """Course of both sensors; the child's steps are the mean of what both streams say.
+
+    Parameters
+    ----------
+    streams : Streams
+    T_parent_child : (4, 4) array
+    noise_m : float
+        Standard deviation per axis of the noise of a step. The smaller it is beside what steps
+        differ from their neighbours by, the more they are believed themselves.
+    """
     of_parent, of_child = streams.steps
     rotation, lever_arm = T_parent_child[:3, :3], T_parent_child[:3, 3]
     chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
     as_child = (chords + of_parent.raw) @ rotation
-    step = Steps.of(0.5 * (of_child.raw + as_child), np.diff(streams.stamps_s)).smooth
-    metres_c = np.linalg.norm(of_child.smooth, axis=1)
+    step = Steps.of(0.5 * (of_child.raw + as_child), np.diff(streams.stamps_s)).cleaned(noise_m)
+    metres_c = np.linalg.norm(of_child.cleaned(noise_m), axis=1)
     axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,

@@ -227,6 +227,10 @@ class NoiseModel:
         levels[3:5] = np.maximum(levels[3:5], total + np.log(_AUDIBLE_WALK))
         return levels
 
+    def step_noise(self, levels: FloatArray) -> float:
+        """Standard deviation per axis (m) of white noise and walk of a typical step."""
+        return float(np.exp(0.5 * _whole(levels)[0]))
+
     def with_lasting(
         self, processes: Sequence[Slow], levels: FloatArray
     ) -> tuple[NoiseModel, FloatArray]:

@@ -115,7 +115,7 @@ def noise(problem: Problem, fit: Fit) -> Fit:
         fit,
         levels=found.levels,
         T=T,
-        course=course_of(problem.streams, T),
+        course=course_of(problem.streams, T, fit.model.step_noise(found.levels)),
         n_evaluations=fit.n_evaluations + found.n_evaluations,
     )
 
