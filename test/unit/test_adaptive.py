@@ -76,6 +76,11 @@ def systematic(parent, nuisance, parameters):
     return parent, child
 
 
+def with_noise(streams, seed):
+    """Both streams with white noise of a millimetre and a milliradian."""
+    return [disturbed(each, seed + 100 * k, 1e-3, 1e-3) for k, each in enumerate(streams, 1)]
+
+
 def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=None):
     course = course_of(streams, T_PARENT_CHILD)
     given = np.zeros(N_SYSTEMATIC) if parameters is None else parameters
@@ -204,6 +209,10 @@ def solved_drives():
     return [(drive, estimator.solve(stamps(150), *drive)) for drive in drives]
 
 
+def drift_of(noise):
+    return noise.translation_drift_m_per_pose, noise.rotation_drift_rad_per_pose
+
+
 @pytest.mark.parametrize(
     ("white", "drift"), [((0.004, 0.006), (0.0, 0.0)), ((0.001, 0.001), (0.004, 0.003))]
 )
@@ -212,14 +221,8 @@ def test_the_noise_levels_are_recovered(white, drift):
     for seed in range(8):
         parent, child = noisy_drive(seed, white=white, drift=drift)
         levels = estimator.solve(stamps(150), parent, child, systematic=()).noise
-        found.append(
-            [
-                levels.translation_white_m,
-                levels.rotation_white_rad,
-                levels.translation_drift_m_per_pose,
-                levels.rotation_drift_rad_per_pose,
-            ]
-        )
+        white_found = levels.translation_white_m, levels.rotation_white_rad
+        found.append([*white_found, *drift_of(levels)])
     median = np.median(found, axis=0)
     expected = np.r_[np.sqrt(2) * np.array(white), drift]
     strong = expected > 0.5 * expected.max()
@@ -231,8 +234,7 @@ def test_the_walk_of_a_long_recording_is_found_from_bursts_far_apart():
     drift = (0.001, 0.0005)
     parent, child = noisy_drive(1, 5_000, white=(0.002, 0.001), drift=drift)
     levels = estimator.solve(stamps(5_000), parent, child, systematic=()).noise
-    found = (levels.translation_drift_m_per_pose, levels.rotation_drift_rad_per_pose)
-    np.testing.assert_allclose(found, drift, rtol=0.3)
+    np.testing.assert_allclose(drift_of(levels), drift, rtol=0.3)
 
 
 def lasting(seed, n_poses, sigmas, tau_poses):
@@ -314,12 +316,9 @@ def test_it_beats_dnl_where_the_noise_is_white(solved_drives):
 
     errors = []
     for drive, solution in solved_drives[:15]:
-        answers = [solution.T_parent_child]
-        answers += [
-            dnl.solve(motion_pairs(*drive, reference)).T_parent_child
-            for reference in ("B1", "B5", "B20")
-        ]
-        errors.append([np.linalg.norm(T[:3, 3] - T_PARENT_CHILD[:3, 3]) for T in answers])
+        others = [dnl.solve(motion_pairs(*drive, reference)) for reference in ("B1", "B5", "B20")]
+        Ts = np.array([answer.T_parent_child for answer in (solution, *others)])
+        errors.append(np.linalg.norm(Ts[:, :3, 3] - T_PARENT_CHILD[:3, 3], axis=1))
     adaptive, *others = np.median(errors, axis=0)
     assert adaptive < 0.8 * min(others)
 
@@ -328,12 +327,8 @@ def test_it_beats_dnl_where_the_noise_is_white(solved_drives):
 def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
     chosen, parameters = [], []
     for seed in range(6):
-        parent, child = systematic(wandering_poses(300, seed), nuisance, VALUES[nuisance])
-        solution = estimator.solve(
-            stamps(300),
-            disturbed(parent, 100 + seed, 1e-3, 1e-3),
-            disturbed(child, 200 + seed, 1e-3, 1e-3),
-        )
+        streams = systematic(wandering_poses(300, seed), nuisance, VALUES[nuisance])
+        solution = estimator.solve(stamps(300), *with_noise(streams, seed))
         chosen.append(solution.systematic)
         parameters.append(solution.parameters[parameters_of(nuisance)])
     assert chosen.count(nuisance) >= 5
@@ -344,30 +339,23 @@ def test_a_lag_is_not_taken_for_a_lever():
     errors = []
     for seed in range(6):
         parent = wandering_poses(300, seed)
-        child = late(child_of(parent), 0.02)
-        noisy = disturbed(parent, 100 + seed, 1e-3, 1e-3), disturbed(child, 200 + seed, 1e-3, 1e-3)
+        noisy = with_noise((parent, late(child_of(parent), 0.02)), seed)
         answers = [
             estimator.solve(stamps(300), *noisy, systematic=models) for models in ((), SYSTEMATIC)
         ]
         assert answers[1].time_offset_s == pytest.approx(-0.02, abs=1e-3)
         said = " ".join(answers[1].describe(stamps(300)).in_words)
         assert re.search(r"the child's stamps are (19|20|21)\.\d \+/- 0\.\d+ ms late", said)
-        errors.append(
-            [
-                np.linalg.norm(answer.T_parent_child[:3, 3] - T_PARENT_CHILD[:3, 3])
-                for answer in answers
-            ]
-        )
+        Ts = np.array([answer.T_parent_child for answer in answers])
+        errors.append(np.linalg.norm(Ts[:, :3, 3] - T_PARENT_CHILD[:3, 3], axis=1))
     without, with_lag = np.median(errors, axis=0)
     assert with_lag < 0.3 * without
 
 
 def test_on_flat_ground_no_sideways_slip_is_assumed():
     # It could not be told from a child that is mounted askew; forwards and upwards it can.
-    parent, child = systematic(planar_poses(400), "bias", [0.0, 0.05, 0.0])
-    solution = estimator.solve(
-        stamps(400), disturbed(parent, 1, 1e-3, 1e-3), disturbed(child, 2, 1e-3, 1e-3)
-    )
+    streams = systematic(planar_poses(400), "bias", [0.0, 0.05, 0.0])
+    solution = estimator.solve(stamps(400), *with_noise(streams, 1))
     assert abs(solution.bias[1]) < 1e-3
 
 
@@ -483,16 +471,14 @@ def test_flat_ground_hides_the_height_and_only_that(level):
     parent, child = disturbed(parent, 1, level, level), disturbed(child_of(parent), 2, level, level)
     solution = estimator.solve(stamps(200), parent, child)
     assessment = assess_adaptive(PosePairs(stamps(200), parent, child), solution)
-    hidden = [
-        dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE
-    ]
-    assert hidden == ["z"]
+    verdicts = {dof.name: dof.verdict for dof in assessment.observability}
+    assert [axis for axis in verdicts if verdicts[axis] is DofVerdict.UNOBSERVABLE] == ["z"]
     np.testing.assert_allclose(solution.T_parent_child[:2, 3], T_PARENT_CHILD[:2, 3], atol=0.01)
 
 
 def test_no_motion_at_all_is_no_number():
     still = np.repeat(np.eye(4)[None], 40, axis=0)
-    parent, child = disturbed(still, 1, 1e-3, 1e-3), disturbed(child_of(still), 2, 1e-3, 1e-3)
+    parent, child = with_noise((still, child_of(still)), 1)
     solution = estimator.solve(stamps(40), parent, child)
     assert np.isfinite(solution.T_parent_child).all()
     assessment = assess_adaptive(PosePairs(stamps(40), parent, child), solution)

@@ -65,15 +65,9 @@ def result(parent="imu", child="camera", **changes):
 
 def unknown(*axes):
     """What makes some axes unobservable."""
-    return {
-        "status": SolveStatus.UNOBSERVABLE,
-        "observability": tuple(
-            DofObservability(
-                name, DofVerdict.UNOBSERVABLE if name in axes else DofVerdict.OBSERVED, 0.001
-            )
-            for name in NAMES
-        ),
-    }
+    verdicts = [DofVerdict.UNOBSERVABLE if name in axes else DofVerdict.OBSERVED for name in NAMES]
+    dofs = tuple(map(DofObservability, NAMES, verdicts, [0.001] * 6))
+    return {"status": SolveStatus.UNOBSERVABLE, "observability": dofs}
 
 
 def document(text):

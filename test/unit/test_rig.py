@@ -130,13 +130,10 @@ def test_a_sensor_of_any_name_stays_below_the_directory(found, tmp_path):
 
 
 def test_topics_of_a_bag(rig, tmp_path, capsys):
-    streams = {
-        f"/{name}/odometry": (
-            dataclasses.replace(trajectory, sensor_frame=f"{name}_link", world_frame="odom"),
-            "nav_msgs/msg/Odometry",
-        )
-        for name, trajectory in trajectories_of(rig).items()
-    }
+    streams = {}
+    for name, each in trajectories_of(rig).items():
+        named = dataclasses.replace(each, sensor_frame=f"{name}_link", world_frame="odom")
+        streams[f"/{name}/odometry"] = named, "nav_msgs/msg/Odometry"
     bag = str(tmp_path / "bag")
     write_bag(bag, streams)
     assert main(["replay", bag, "--json", "--topics", *streams]) == 0

@@ -104,13 +104,8 @@ def test_kept_pairs_are_put_right_like_poses(streams):
     parent, child, expected = streams
     child = written_otherwise(child, REPAIRS[0])
     snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
-    kept = replace(
-        snapshot,
-        kept=snapshot.pose_pairs(),
-        buffered_parent=parent[:0],
-        buffered_child=child[:0],
-        paired_at="child",
-    )
+    nothing = {"buffered_parent": parent[:0], "buffered_child": child[:0]}
+    kept = replace(snapshot, kept=snapshot.pose_pairs(), paired_at="child", **nothing)
     found = with_options(kept, {"child_invert": "poses"})
     np.testing.assert_allclose(found.estimate().T_parent_child, expected, atol=1e-9)
     shifted = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})

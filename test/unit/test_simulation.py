@@ -192,23 +192,18 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
     """RMS error of the poses, both sensors: median over the runs, ours and published."""
     clean = published_runs(published_folder, "noise/noise_0.000000")
     noisy = published_runs(published_folder, level)
-    theirs = np.array(
-        [
-            [rms(*pair) for pair in zip(*sensors, strict=True)]
-            for sensors in zip(noisy, clean, strict=True)
-        ]
-    )
-    ours = np.array(
-        [
-            [rms(drive.parent.poses, base.parent.poses), rms(drive.child.poses, base.child.poses)]
-            for drive, base in (
-                (simulate_drive(run, noise=config), clean_drive(run)) for run in range(100)
-            )
-        ]
-    )
+    theirs = [list(map(rms, *sensors)) for sensors in zip(noisy, clean, strict=True)]
+    ours = [
+        list(map(rms, both(simulate_drive(run, noise=config)), both(clean_drive(run))))
+        for run in range(100)
+    ]
     np.testing.assert_allclose(
         np.median(ours, axis=0), np.median(theirs, axis=0), rtol=0.25, atol=1e-9
     )
+
+
+def both(drive):
+    return drive.parent.poses, drive.child.poses
 
 
 # --- the command ----------------------------------------------------------------------

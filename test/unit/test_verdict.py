@@ -41,14 +41,9 @@ def test_the_page_has_the_rules_of_the_code():
 def observed(sigma_m=0.003, sigma_rad=0.001, **changes):
     """Verdicts of six axes; ``changes`` names axes with another sigma (inf: unobservable)."""
     sigmas = dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3).tolist(), strict=True)) | changes
-    return tuple(
-        DofObservability(
-            name,
-            DofVerdict.OBSERVED if np.isfinite(sigma) else DofVerdict.UNOBSERVABLE,
-            sigma,
-        )
-        for name, sigma in sigmas.items()
-    )
+    seen, hidden, values = DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE, sigmas.values()
+    verdicts = [seen if sigma < np.inf else hidden for sigma in values]
+    return tuple(map(DofObservability, sigmas, verdicts, values))
 
 
 def good(**changes):
