@@ -17,7 +17,7 @@ from hand_eye_calib.option import check_value as check_value
 from hand_eye_calib.option import did_you_mean as did_you_mean
 from hand_eye_calib.option import option as option
 from hand_eye_calib.option import option_name as option_name
-from hand_eye_calib.text import AXIS_UNITS, check_frames, parse_prior, parse_targets
+from hand_eye_calib.text import AXIS_UNITS, parse_prior, parse_targets, split_frames
 
 REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
@@ -43,7 +43,7 @@ def _tf_source(stream: str) -> Any:
         f"Take the poses of the {stream} sensor from /tf and /tf_static instead of {stream}_odom: "
         "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
         read_only=True,
-        parse=check_frames,
+        parse=split_frames,
     )
 
 
@@ -316,11 +316,6 @@ class CalibratorConfig(OptionSet):
         single = parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
         return tuple(single.get(axis, of_unit[unit]) for axis, unit in AXIS_UNITS.items())
-
-    @property
-    def odometry_share(self) -> float:
-        """Share of both streams that are odometry."""
-        return 0.5 * [self.parent_kind, self.child_kind].count("odometry")
 
     def target_fields(self) -> dict[str, Any]:
         """The targets as the fields of a result."""

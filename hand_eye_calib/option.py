@@ -87,7 +87,7 @@ def check_value(field: OptionField, value: object) -> OptionValue:
             )
         if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
             raise ConfigError(f"{name} must be {meta['form']}; got {shown_value(value)}")
-        if meta["parse"] is not None:
+        if meta["parse"] is not None and value:
             meta["parse"](name, value)
         return value
     if words and isinstance(value, str):

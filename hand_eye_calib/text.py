@@ -257,8 +257,8 @@ def _above_0(name: str, text: str, axis: str) -> float:
     return value
 
 
-def split_frames(text: str, where: str = "") -> tuple[str, str]:
-    """The fixed frame and the sensor's frame of ``WORLD:SENSOR``, named in a message by ``where``.
+def split_frames(name: str, text: str) -> tuple[str, str]:
+    """The fixed frame and the sensor's frame of ``WORLD:SENSOR``, the value of an option.
 
     Raises
     ------
@@ -268,13 +268,7 @@ def split_frames(text: str, where: str = "") -> tuple[str, str]:
     frames = [frame.strip().lstrip("/") for frame in text.split(":")]
     if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
         raise ConfigError(
-            f"{where}expected two frames as WORLD:SENSOR, such as odom:lidar; "
+            f"{name} must be two frames as WORLD:SENSOR, such as odom:lidar; "
             f"got {shown_value(text)}"
         )
     return frames[0], frames[1]
-
-
-def check_frames(name: str, text: str) -> None:
-    """Raise ConfigError, with the name of the option, for a text that is no WORLD:SENSOR."""
-    if text:
-        split_frames(text, f"{name}: ")

@@ -11,13 +11,12 @@ import numpy as np
 import pandas as pd
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.assessment import metrics
-from hand_eye_calib.assessment.metrics import Errors
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, dnlo
 from hand_eye_calib.solvers.registry import Method
 from reproduction import ali_as_published
+from reproduction.metrics import Errors, errors
 from reproduction.published import KITTI, LEVELS, REFERENCES, Case, path_to
 from reproduction.sources import Source
 
@@ -88,7 +87,7 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
     pairs = case.pairs(reference)
     solve = ali_as_published.solve if method == ALI_AS_PUBLISHED else Method(method).solve
     solution = solve(pairs)
-    errors = metrics.errors(pairs, solution.T_parent_child, case.T_parent_child)
+    found = errors(pairs, solution.T_parent_child, case.T_parent_child)
     row = {
         "dataset": case.dataset,
         "level": case.level,
@@ -97,7 +96,7 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
         "reference": reference,
         "converged": solution.converged,
         "T_parent_child": solution.T_parent_child.ravel().tolist(),
-        **dict(zip(METRICS, in_m_and_deg(errors), strict=True)),
+        **dict(zip(METRICS, in_m_and_deg(found), strict=True)),
         "objective": solution.objective,
     }
     result = case.results.get((published_name(method), reference))

@@ -288,7 +288,7 @@ def add_verbose_argument(parser: argparse._ActionsContainer) -> None:
 
 @argument_type
 def _frames(text: str) -> str:
-    return ":".join(split_frames(text))
+    return ":".join(split_frames("it", text))
 
 
 def _path(text: str) -> Path | str:

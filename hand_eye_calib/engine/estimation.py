@@ -83,13 +83,14 @@ class Solved:
         fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), config.prior())
         residuals = residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns)
         scale, offset = self.scale, self.time_offset
+        odometries = [config.parent_kind, config.child_kind].count("odometry")
         result = calibration_of(
             fused,
             residuals,
             config,
             status=fused.status(self.solution.converged),
             T_method=T_method,
-            floor=None if self.is_beside else config.odometry_share * self._floor(),
+            floor=None if self.is_beside else odometries / 2 * self._floor(),
             objective=self.solution.objective,
             proved_global=self.proved_global,
             method=self.method,

@@ -218,11 +218,6 @@ class Trajectory:
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
         """Part of the trajectory: a slice, mask or increasing index array."""
-        if isinstance(index, int | np.integer):
-            raise TypeError(
-                "index a Trajectory with a slice, mask or index array; "
-                "single poses are trajectory.poses[i]"
-            )
         stamps_ns, poses = self.stamps_ns[index], self.poses[index]
         return replace(self, stamps_ns=stamps_ns, poses=poses)
 

@@ -45,14 +45,6 @@ def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
     return axes[0].T @ axes
 
 
-def wrong_latitude(lat: float, lon: float) -> str:
-    """What is wrong with a latitude beyond the pole, beside a longitude that may be a latitude."""
-    return (
-        f"found latitude {lat:.7g} and longitude {lon:.7g}, and no latitude is beyond 90 deg: they "
-        "seem to be swapped; swap them at their source"
-    )
-
-
 def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
     """Positions (N, 3) along the axes of the earth, from its centre (m)."""
     sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)

@@ -45,7 +45,7 @@ class TfSource(NamedTuple):
         ConfigError
             If these are not two different frames.
         """
-        return cls(*split_frames(text))
+        return cls(*split_frames("a transform", text))
 
 
 class PoseFields(NamedTuple):

@@ -275,7 +275,7 @@ def test_transforms_that_do_not_lead_there(tmp_path, new_bag, edges, message):
 
 @pytest.mark.parametrize("text", ["odom", "odom:", ":lidar", "a:b:c", "odom:odom", "odom:/odom"])
 def test_frames_that_are_not_a_pair(text):
-    with pytest.raises(ConfigError, match="expected two frames as WORLD:SENSOR"):
+    with pytest.raises(ConfigError, match="must be two frames as WORLD:SENSOR"):
         TfSource.parse(text)
 
 

@@ -119,7 +119,7 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["bag", "--parent-tf", "odom"], "--parent-tf: expected two frames as WORLD:SENSOR"),
+        (["bag", "--parent-tf", "odom"], "--parent-tf: it must be two frames as WORLD:SENSOR"),
         (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
         (["bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
         (["bag", "--batch", "fleet.yaml"], "--batch cannot be combined with PATH or --list"),

@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hand_eye_calib.assessment import metrics
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.solvers import park
-from reproduction import comparison, results, runner
+from reproduction import comparison, metrics, results, runner
 from reproduction.__main__ import EXPERIMENTS, GROUPS, main
 from reproduction.published import LEVELS, RECTIFIED, REFERENCES, find_folder
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, Cell, solve_cell, table_of

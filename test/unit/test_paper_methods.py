@@ -8,12 +8,13 @@ from motions import child_of, disturbed, wandering_poses
 from scipy.optimize import approx_fprime, check_grad, minimize
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.assessment.metrics import absolute_errors, relative_errors
+from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import ali, park, zhuang
 from reproduction import ali_as_published, published
+from reproduction.metrics import relative_errors
 
 TRUTH = se3.exp(np.array([0.4, -0.2, 0.7, 0.9, -0.5, 1.1]))
 

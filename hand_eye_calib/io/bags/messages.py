@@ -18,7 +18,7 @@ from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.fields import FIELDS
 from hand_eye_calib.io.bags.poses import PoseColumns
-from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin, wrong_latitude
+from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin
 from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.io.transforms import PoseFields
 
@@ -382,7 +382,10 @@ class MessageReader:
             return values[rows]
         beyond = values[np.abs(values[:, 0]) > POLE_DEG]
         if len(beyond):
-            raise InputError(wrong_latitude(*beyond[0, :2]))
+            raise InputError(
+                "found latitude {:.7g} and longitude {:.7g}: no latitude is beyond 90 deg; they "
+                "seem to be swapped, swap them at their source".format(*beyond[0])
+            )
         lat, lon = np.radians(values[rows, :2]).T
         return self._origin.local(lat, lon, values[rows, 2])
 

@@ -47,17 +47,12 @@ def write_trajectory(
             raise ConfigError(f"trajectories are written in one of {known}; got {format!r}")
         return write_bag(path, {topic: (trajectory, "nav_msgs/msg/Odometry")}, format)
     try:
-        text = "\n".join([f"# {TUM_COLUMNS}", *tum_lines(trajectory), ""])
-        write_atomically({Path(path): text})
+        quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
+        values = np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1).tolist()
+        lines = map(tum_line, trajectory.stamps_ns.tolist(), values)
+        write_atomically({Path(path): "\n".join([f"# {TUM_COLUMNS}", *lines, ""])})
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
-
-
-def tum_lines(trajectory: Trajectory) -> list[str]:
-    """A line of text for each pose."""
-    quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
-    values = np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1).tolist()
-    return [*map(tum_line, trajectory.stamps_ns.tolist(), values)]
 
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:

@@ -1,0 +1,40 @@
+"""Error metrics of Välimäki et al. 2023, section 3.3. Metres and radians."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.metrics import absolute_errors
+from hand_eye_calib.pairing.motion_pairs import MotionPairs
+
+
+class Errors(NamedTuple):
+    """Mean relative translation (m) and rotation errors (rad) over the motion pairs, which need no
+    ground truth and do not tell which of two calibrations is nearer to it; and absolute ones
+    against the ground truth.
+    """
+
+    e_rt: float
+    e_rR: float
+    e_at: float
+    e_aR: float
+
+
+def errors(
+    pairs: MotionPairs, T_parent_child: FloatArray, truth_T_parent_child: FloatArray
+) -> Errors:
+    """All four metrics of a calibration."""
+    return Errors(
+        *relative_errors(pairs, T_parent_child),
+        *absolute_errors(T_parent_child, truth_T_parent_child),
+    )
+
+
+def relative_errors(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[float, float]:
+    """Mean relative errors e_rt (m) and e_rR (rad), eqs 6 and 7, over at least one motion pair."""
+    translation, rotation = pairs.residuals(T_parent_child)
+    return (
+        float(np.linalg.norm(translation, axis=1).mean()),
+        float(np.linalg.norm(rotation, axis=1).mean()),
+    )
