@@ -9,8 +9,8 @@ from hand_eye_calib.geometry import se3
 def absolute_errors(
     T_parent_child: FloatArray, truth_T_parent_child: FloatArray
 ) -> tuple[float, float]:
-    """Absolute errors e_at (m) and e_aR (rad) of a transform (4, 4) against the true one: eqs 8 and 9
-    of Välimäki et al. 2023.
+    """Absolute errors e_at (m) and e_aR (rad) of a transform (4, 4) against the true one: eqs 8 and
+    9 of Välimäki et al. 2023.
     """
     translation = np.linalg.norm(truth_T_parent_child[:3, 3] - T_parent_child[:3, 3])
     rotation = se3.rotation_angle(T_parent_child[:3, :3].T @ truth_T_parent_child[:3, :3])

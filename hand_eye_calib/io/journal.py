@@ -63,8 +63,6 @@ class JournalWriter:
     ) -> None:
         self._directory = Path(directory)
         self._directory.mkdir(parents=True, exist_ok=True)
-        if self._directory.is_symlink():
-            raise OSError(f"{self._directory} is a symbolic link")
         known, whole_bytes, self._parent_poses = dict(about), {}, 0
         if resumed is not None:
             known, whole_bytes = known | resumed.about, resumed.whole_bytes
@@ -78,10 +76,8 @@ class JournalWriter:
         self._pending: dict[str, list[str]] = {stream: [] for stream in known}
         self._files: dict[str, BinaryIO] = {}
         for stream in known:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-            descriptor = os.open(self._path(stream), flags)
             # Unbuffered: what is flushed is with the operating system and survives this process.
-            self._files[stream] = open(descriptor, "ab", buffering=0)  # noqa: SIM115
+            self._files[stream] = open(self._path(stream), "ab", buffering=0)  # noqa: SIM115
             if stream in whole_bytes:
                 self._files[stream].truncate(whole_bytes[stream])
         self.describe(about)
@@ -148,8 +144,6 @@ class Journal:
         x y z (m), qx qy qz qw.
     whole_bytes : dict of str to int
         Bytes of each stream's file up to the end of the last line that could be read.
-    lost_bytes : int
-        Bytes after those, of all files; 0 after a clean end.
     """
 
     about: dict[str, dict[str, Any]]
@@ -157,7 +151,6 @@ class Journal:
     stamps_ns: IntArray
     poses: FloatArray
     whole_bytes: dict[str, int]
-    lost_bytes: int
 
 
 def read_journal(directory: str | Path) -> Journal:
@@ -180,7 +173,6 @@ def read_journal(directory: str | Path) -> Journal:
         stamps_ns=np.concatenate([each.stamps_ns for each in found.values()])[order],
         poses=np.concatenate([np.reshape(each.poses, (-1, 7)) for each in found.values()])[order],
         whole_bytes={stream: each.whole_bytes for stream, each in found.items()},
-        lost_bytes=sum(each.lost_bytes for each in found.values()),
     )
 
 
@@ -191,7 +183,7 @@ class _File:
         self.about: dict[str, Any] = {}
         # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
         self.stamps_ns, self.poses, self.arrived = array("q"), array("d"), array("d")
-        self.whole_bytes = self.lost_bytes = 0
+        self.whole_bytes = 0
 
     def add(self, line: bytes) -> None:
         """Read a line. Raises ValueError, TypeError, OverflowError or RecursionError."""
@@ -220,7 +212,6 @@ def _read_file(path: Path) -> _File:
                 except (ValueError, TypeError, OverflowError, RecursionError):
                     break
                 found.whole_bytes += len(line)
-            found.lost_bytes = os.fstat(file.fileno()).st_size - found.whole_bytes
     except OSError as error:
         raise InputError(f"cannot read the session journal {path}: {error.strerror}") from None
     if found.about.get("format") != _FORMAT:
