@@ -65,14 +65,12 @@ def recordings_of(seed, count, unknown_z=False):
 def outcome(name, vehicle, T, covariance, day=0):
     """What a batch keeps of a recording."""
     sigmas = np.sqrt(np.diag(covariance)).tolist()
+    dofs = tuple(map(DofObservability, AXES, [DofVerdict.OBSERVED] * 6, sigmas))
     found = calibration(
         T_parent_child=T,
         covariance=covariance,
         status=SolveStatus.OK,
-        observability=tuple(
-            DofObservability(axis, DofVerdict.OBSERVED, sigma)
-            for axis, sigma in zip(AXES, sigmas, strict=True)
-        ),
+        observability=dofs,
         warnings=(),
         child_frame="camera",
     )

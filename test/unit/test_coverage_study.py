@@ -163,13 +163,8 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
 
 
 def _calibration(T_parent_child, covariance, scale):
-    return calibration(
-        T_parent_child=T_parent_child,
-        covariance=covariance,
-        status=SolveStatus.OK,
-        observability=(),
-        scale=scale,
-    )
+    known = {"T_parent_child": T_parent_child, "covariance": covariance, "scale": scale}
+    return calibration(**known, status=SolveStatus.OK, observability=())
 
 
 def test_coverage_with_the_floor_is_told_apart():

@@ -111,9 +111,8 @@ class TestOptionsOfCalibrate:
         long = hec.Trajectory(np.arange(1_000_000), poses)
         config = offline_config(long, long, {})
         assert config.max_pairs == 100_000
-        assert "100,000 pose pairs are used at most" in " ".join(
-            whole_snapshot(config, long, long).warnings
-        )
+        said = " ".join(whole_snapshot(config, long, long).warnings)
+        assert "100,000 pose pairs are used at most" in said
         assert offline_config(long, long, {"max_pairs": 2_000_000}).max_pairs == 2_000_000
 
     def test_progress_is_told_and_changes_nothing(self):
@@ -121,13 +120,8 @@ class TestOptionsOfCalibrate:
         told = []
         tell = lambda share, step: told.append((share, step))  # noqa: E731
         result = hec.calibrate(parent, child, reference="B1", progress=tell)
-        assert [step for _, step in told] == [
-            "time offset",
-            "pairing",
-            "solving",
-            "checking the streams",
-            "done",
-        ]
+        steps = ["time offset", "pairing", "solving", "checking the streams", "done"]
+        assert [step for _, step in told] == steps
         assert sorted(told) == told
         assert (told[0][0], told[-1][0]) == (0.0, 1.0)
         again = hec.calibrate(parent, child, reference="B1")

@@ -255,12 +255,8 @@ def test_files_of_the_package_exist(page):
 def with_tables_of_the_code(text):
     """The page with both parameter tables as they must be."""
     tables = iter([parameter_table(CalibratorConfig), parameter_table(NodeConfig)])
-    return re.sub(
-        r"^\| Name \| Default \|.*\n(\|.*\n)*",
-        lambda _: next(tables) + "\n",
-        text,
-        flags=re.MULTILINE,
-    )
+    old = re.compile(r"^\| Name \| Default \|.*\n(\|.*\n)*", re.MULTILINE)
+    return old.sub(lambda _: next(tables) + "\n", text)
 
 
 if __name__ == "__main__":

@@ -248,15 +248,9 @@ def test_an_unknown_axis_is_nothing_that_a_robot_takes(tmp_path):
 def test_an_unknown_rotation_is_nothing_that_a_robot_takes(tmp_path):
     known = good_calibration()
     unknown = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
-    save_result(
-        dataclasses.replace(
-            known,
-            T_parent_child=np.eye(4),
-            observability=(*known.observability[:5], unknown),
-            covariance=np.diag([1e-6] * 5 + [np.inf]),
-        ),
-        tmp_path,
-    )
+    changes = {"T_parent_child": np.eye(4), "covariance": np.diag([1e-6] * 5 + [np.inf])}
+    changes["observability"] = (*known.observability[:5], unknown)
+    save_result(dataclasses.replace(known, **changes), tmp_path)
     xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
     assert re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
     assert "'--yaw', 'MEASURE_YAW_BY_HAND'" in launch

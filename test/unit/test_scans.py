@@ -63,14 +63,8 @@ def scans(body, T_body_lidar, count, rng):
     """Per scan: points (N, 3) and times (N,) since its first ray."""
     azimuth = -2.0 * np.pi * np.arange(COLUMNS) / COLUMNS
     level = np.cos(ELEVATIONS)
-    rays = np.stack(
-        [
-            np.outer(np.cos(azimuth), level),
-            np.outer(np.sin(azimuth), level),
-            np.tile(np.sin(ELEVATIONS), (COLUMNS, 1)),
-        ],
-        axis=-1,
-    )
+    x, y = np.outer(np.cos(azimuth), level), np.outer(np.sin(azimuth), level)
+    rays = np.stack([x, y, np.tile(np.sin(ELEVATIONS), (COLUMNS, 1))], axis=-1)
     since = np.arange(COLUMNS) / COLUMNS / RATE
     for number in range(count):
         Ts = body.poses(number / RATE + since) @ T_body_lidar
@@ -83,14 +77,9 @@ def scans(body, T_body_lidar, count, rng):
 def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
     """As drivers write it: rings of points with their times, ``time`` in s or ``t`` in ns."""
     kind = {"time": (7, "<f4", 1.0), "t": (6, "<u4", 1e9)}[of_time]
-    layout = np.dtype(
-        {
-            "names": ["x", "y", "z", of_time],
-            "formats": ["<f4"] * 3 + [kind[1]],
-            "offsets": [0, 4, 8, 18],
-            "itemsize": 24,
-        }
-    )
+    formats, offsets = ["<f4", "<f4", "<f4", kind[1]], [0, 4, 8, 18]
+    named = {"names": ["x", "y", "z", of_time], "formats": formats, "offsets": offsets}
+    layout = np.dtype({**named, "itemsize": 24})
     rows = np.zeros(len(points), layout)
     for axis, values in zip("xyz", points.T, strict=True):
         rows[axis] = values

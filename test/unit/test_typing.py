@@ -82,21 +82,16 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
         cwd=ROOT,
     )
     failed = {int(line.split(":")[1]) for line in done.stdout.splitlines() if ": error:" in line}
-    wrong = {
-        number
-        for number, line in enumerate(PROGRAM.splitlines(), start=1)
-        if line.endswith("# wrong")
-    }
-    assert failed == wrong, done.stdout + done.stderr
+    lines = enumerate(PROGRAM.splitlines(), start=1)
+    assert failed == {number for number, line in lines if line.endswith("# wrong")}, (
+        done.stdout + done.stderr
+    )
 
 
 def test_type_checkers_see_the_names_that_exist():
     tree = ast.parse((ROOT / "hand_eye_calib" / "__init__.py").read_text(encoding="utf-8"))
-    (block,) = (
-        node
-        for node in tree.body
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-    )
+    conditions = [node for node in tree.body if isinstance(node, ast.If)]
+    (block,) = (node for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING")
     seen = {
         alias.asname or alias.name: (node.module, alias.name)
         for node in block.body
