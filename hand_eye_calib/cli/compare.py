@@ -48,11 +48,11 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError(f"{path}: {result.status.failure}; there is nothing to compare")
     installed = None
     if arguments.installed:
-        from hand_eye_calib.io.installed import read_installed
+        from hand_eye_calib.io.installed import open_installed
 
         frames = results[0].parent_frame, results[0].child_frame
         with waiting_for(f"reading {arguments.installed}"):
-            installed = read_installed(arguments.installed, *frames)
+            installed = open_installed(arguments.installed)(*frames)
     names = told_apart(arguments.results)
     if len({*names}) < len(names):
         raise InputError(f"expected different results; got {', '.join(names)}")

@@ -88,12 +88,12 @@ def _with_robot(
     """
     installed, base = arguments.installed, arguments.base_frame
     if installed:
-        from hand_eye_calib.io.installed import read_installed
+        from hand_eye_calib.io.installed import open_installed
         from hand_eye_calib.session.compare import with_comparison
 
         frames = calibration.parent_frame, calibration.child_frame
         with waiting_for(f"reading {installed}"):
-            calibration = with_comparison(calibration, read_installed(installed, *frames))
+            calibration = with_comparison(calibration, open_installed(installed)(*frames))
     if not base:
         return calibration
     if installed and Path(installed).suffix == ".urdf":

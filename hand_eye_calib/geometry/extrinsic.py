@@ -42,12 +42,6 @@ class Extrinsic:
         rpy = se3.rotation_to_rpy(self.T_parent_child[:3, :3])
         return np.r_[self.T_parent_child[:3, 3], rpy]
 
-    @property
-    def covariance_in_parent(self) -> FloatArray:
-        """(6, 6) array: covariance of the errors along and about the axes of the parent's frame."""
-        to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
-        return np.asarray(to_parent @ self.covariance @ to_parent.T)
-
 
 def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
     """Standard deviations (3,) of roll, pitch and yaw, rad, to first order.

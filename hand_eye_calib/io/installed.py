@@ -32,21 +32,9 @@ _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib", ".npy")
 _EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(FORMATS)
 
 
-def read_installed(text: str, parent_frame: str, child_frame: str) -> Extrinsic:
-    """The installed pose of the child sensor in the parent sensor's frame; ``text`` and what is
-    raised are as of :func:`open_installed`.
-
-    Raises
-    ------
-    InputError
-        If it does not have these frames.
-    """
-    return open_installed(text)(parent_frame, child_frame)
-
-
 def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     """Read what is installed before the sensors' frames are known: the parent's and the child's
-    give the pose of the child sensor in the parent sensor's frame, as :func:`read_installed`.
+    give the pose of the child sensor in the parent sensor's frame, or an InputError.
 
     Parameters
     ----------

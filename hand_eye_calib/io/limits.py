@@ -20,8 +20,6 @@ SMALLEST_UNPACKED = 64 * _MIB
 LARGEST_RATIO = 256
 #: Bytes of the name of a topic, a type or a frame.
 LONGEST_NAME = 1_024
-#: Frames in the transform tree of a bag.
-MOST_FRAMES = 10_000
 #: A block of messages is passed on when it has reached this many bytes.
 BLOCK_BYTES = 4 * _MIB
 
@@ -31,8 +29,6 @@ BLOCK_BYTES = 4 * _MIB
 LARGEST_YAML = 1 * _MIB
 #: Levels of nesting.
 DEEPEST_YAML = 32
-#: Values of a YAML file.
-MOST_YAML_VALUES = 100_000
 
 # ---- trajectory files
 
@@ -40,8 +36,6 @@ MOST_YAML_VALUES = 100_000
 LARGEST_TEXT = 512 * _MIB
 #: Characters of one line.
 LONGEST_LINE = 65_536
-#: Columns of a csv file.
-MOST_COLUMNS = 1_000
 
 
 class ReadingMemory:

@@ -19,6 +19,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_YAML
+from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
@@ -75,7 +76,11 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     (40, 4, 4)
     """
     path = Path(path)
-    document = _stacks(path) if path.suffix == ".npz" else _document(path)
+    document: Any
+    if path.suffix == ".npz":
+        document = _stacks(path)
+    else:
+        document = parse_foreign_yaml(read_text(path, _EXPECTED, LARGEST_YAML), str(path))
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
@@ -99,12 +104,6 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
             raise InputError(f"{path}, sample {number}: {error}") from None
     Ts_base_hand = se3.inverse(robot) if is_inverse else np.stack(robot)
     return ArmSamples(Ts_base_hand, np.stack(tracking), frames)
-
-
-def _document(path: Path) -> Any:
-    from hand_eye_calib.io.yaml_files import parse_foreign_yaml
-
-    return parse_foreign_yaml(read_text(path, _EXPECTED, LARGEST_YAML), str(path))
 
 
 def _stacks(path: Path) -> list[Any]:

@@ -12,7 +12,6 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, check_pose
-from hand_eye_calib.io.limits import MOST_FRAMES
 from hand_eye_calib.text import split_frames
 
 # An edge's stamps that jump back by more begin a new session (ns).
@@ -108,14 +107,12 @@ class TfStream:
         Raises
         ------
         InputError
-            If it is no pose, its frame has another parent already, or there are too many frames.
+            If it is no pose, or its frame has another parent already.
         """
         frame, edges = transform.sensor_frame or "", self._tree.edges
         before = edges[frame].is_static if frame in edges else None
         pose = _matrices(_checked(transform)) if is_static else None
         is_fixed = self._tree.add(transform.world_frame, frame, pose, is_static).is_static
-        if len(edges) > MOST_FRAMES:
-            raise InputError(f"the transforms have more than {MOST_FRAMES} frames")
         if before != is_fixed:
             self._find_chain()
         if frame in self._moving and not is_static:
@@ -158,7 +155,7 @@ class TfStream:
         if not edge or stamp_ns > edge[-1][0]:
             edge.append((stamp_ns, row))
         if not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
-            self._slowest = max(self._moving, key=lambda name: _interval_ns(self._moving[name]))
+            self._slowest = max(self._moving, key=self._interval_ns)
         if not self._slowest:
             return
         # The poses at the waiting stamps of the slowest edge that no other edge keeps waiting.
@@ -171,10 +168,8 @@ class TfStream:
             if len(known) == len(rows):
                 yield at_ns, {self._slowest: row, **known}
 
-
-def _interval_ns(edge: _MovingEdge) -> float:
-    """Median time between transforms."""
-    return float(np.median(np.diff([stamp_ns for stamp_ns, _ in edge])))
+    def _interval_ns(self, frame: str) -> float:
+        return float(np.median(np.diff([stamp_ns for stamp_ns, _ in self._moving[frame]])))
 
 
 def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:

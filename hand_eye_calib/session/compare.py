@@ -174,15 +174,15 @@ class _Stated(NamedTuple):
 
 def _stated(given: Calibration | Extrinsic, name: str) -> _Stated:
     X, floor, hidden = given.T_parent_child, np.zeros((6, 6)), np.zeros(6, dtype=bool)
+    to_parent = np.kron(np.eye(2), X[:3, :3])
     if isinstance(given, Calibration):
         if given.floor is not None:
-            to_parent = np.kron(np.eye(2), X[:3, :3])
             floor = to_parent @ given.floor @ to_parent.T
         hidden = np.array([dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability])
         given = Extrinsic(X, name, given.covariance, is_calibration=True)
     unknown = np.diag(UNKNOWN**2)
     is_known = bool(np.isfinite(given.covariance).all())
-    covariance = given.covariance_in_parent if is_known else unknown
+    covariance = to_parent @ given.covariance @ to_parent.T if is_known else unknown
     covariance = covariance + np.where(hidden, unknown, 0.0)
     scatter = scatter_of_recordings(covariance) if given.is_calibration else np.zeros((6, 6))
     return _Stated(name, given, covariance, scatter, floor)

@@ -13,7 +13,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import EXPORT_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.installed import read_installed
+from hand_eye_calib.io.installed import open_installed
 from hand_eye_calib.io.results import save_result
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.exports import FORMATS, arranged, role_of
@@ -142,10 +142,10 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_d
     assert "Assumed" not in text
 
     (tmp_path / "foreign.yaml").write_text(text)
-    found = read_installed(str(tmp_path / "foreign.yaml"), parent, child)
+    found = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
     np.testing.assert_allclose(found.T_parent_child, calibration.T_parent_child, atol=1e-9)
     if role_of(child) != role_of(parent) and name not in ("nuscenes", "driveworks"):
-        found = read_installed(str(tmp_path / "foreign.yaml"), child, parent)
+        found = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
         np.testing.assert_allclose(found.T_parent_child, calibration.T_child_parent, atol=1e-9)
 
 
@@ -238,7 +238,7 @@ def test_a_file_that_does_not_say_it_is_refused_in_one_line(text, message, tmp_p
     path = tmp_path / "foreign.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as error:
-        read_installed(str(path), "imu", "lidar")
+        open_installed(str(path))("imu", "lidar")
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
 
@@ -249,7 +249,7 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
     path.write_text(
         yaml.safe_dump({"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}})
     )
-    found = read_installed(str(path), "imu", "cam1").T_parent_child
+    found = open_installed(str(path))("imu", "cam1").T_parent_child
     np.testing.assert_allclose(found, se3.inverse(moved))
 
 

@@ -48,7 +48,6 @@ HOSTILE_YAML = {
     "set": ("n: !!set {a, b}", "the tag"),
     "twice": ("a: 1\nb: 2\na: 3", "the key 'a' appears twice, line 3"),
     "list as a key": ("? [a, b]\n: 1", "unhashable key"),
-    "too many values": ("[" + "1," * 100_001 + "]", "it has more than 100000 values"),
     "two documents": ("a: 1\n---\nb: 2", "is not YAML"),
     "control characters": ("a: \x01", "is not YAML"),
     "too large": ("# " + "x" * (1 << 20), "larger than 1048576 bytes"),

@@ -7,7 +7,7 @@ from bag_making import TF, tf_message, write_messages
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree
-from hand_eye_calib.io.installed import read_installed
+from hand_eye_calib.io.installed import open_installed
 from hand_eye_calib.io.urdf import read_urdf
 
 URDF = """<?xml version="1.0" encoding="utf-8"?>
@@ -70,14 +70,14 @@ def test_a_loop_of_frames_is_refused():
 
 
 def test_installed_from_numbers_and_descriptions(urdf):
-    numbers = read_installed("-50cm 0 -1 0 0.1 0deg", "lidar", "camera")
-    drawn = read_installed(str(urdf), "lidar", "camera")
+    numbers = open_installed("-50cm 0 -1 0 0.1 0deg")("lidar", "camera")
+    drawn = open_installed(str(urdf))("lidar", "camera")
     np.testing.assert_allclose(numbers.T_parent_child, drawn.T_parent_child, atol=1e-12)
     assert not numbers.covariance.any()
     with pytest.raises(ConfigError, match="file that exists"):
-        read_installed("robot.urdf", "lidar", "camera")
+        open_installed("robot.urdf")("lidar", "camera")
     with pytest.raises(InputError, match="no frame 'radar'"):
-        read_installed(str(urdf), "lidar", "radar")
+        open_installed(str(urdf))("lidar", "radar")
 
 
 class TestBag:
@@ -95,14 +95,14 @@ class TestBag:
         bag = self.bag(
             tmp_path, ("base", "lidar", T), ("base", "camera", T), ("base", "camera", T @ T)
         )
-        found = read_installed(str(bag), "lidar", "camera")
+        found = open_installed(str(bag))("lidar", "camera")
         np.testing.assert_allclose(found.T_parent_child, T, atol=1e-12)
         with pytest.raises(InputError, match="no frame 'radar' in the bag's transforms"):
-            read_installed(str(bag), "lidar", "radar")
+            open_installed(str(bag))("lidar", "radar")
 
     def test_a_transform_that_is_none_is_left_out(self, tmp_path):
         T = np.eye(4)
         T[0, 3] = np.nan
         bag = self.bag(tmp_path, ("base", "lidar", T))
         with pytest.raises(InputError, match="no frame 'base'"):
-            read_installed(str(bag), "base", "lidar")
+            open_installed(str(bag))("base", "lidar")

@@ -19,7 +19,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE, MOST_COLUMNS
+from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
@@ -410,8 +410,6 @@ def table_of(
     InputError
         If a column is missing, or a line cannot be used.
     """
-    if len(names) > MOST_COLUMNS:
-        raise InputError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
     expected = f"{len(names)} columns: {listed(names)}"
     table = Table(path, expected, choose_columns(path, names, measures), tuple(names))
     return table.fill(lines, cells_of, len(names))
