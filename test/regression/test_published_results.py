@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from published_data import simulated
 
-from hand_eye_calib.assessment.metrics import errors
 from hand_eye_calib.solvers import ali, zhuang
+from reproduction.metrics import errors
 
 
 @pytest.mark.parametrize(
