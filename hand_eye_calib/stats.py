@@ -4,10 +4,8 @@ The quantiles of NumPy import ``numpy.ma`` in a tenth of the time of NumPy itsel
 distributions of SciPy take longer to import than a comparison: so both are here, in numbers.
 """
 
-from typing import TypeVar
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hand_eye_calib.arrays import FloatArray
 
@@ -32,7 +30,6 @@ NINE_TIMES_OUT_OF_TEN = 1.281552
 STUDENT = 4.0
 
 _MAX_STEPS = 20
-_Number = TypeVar("_Number", np.int64, np.float64)
 
 
 def median(values: ArrayLike) -> float:
@@ -60,17 +57,6 @@ def quantile(values: ArrayLike, share: float) -> float:
     high = min(low + 1, len(flat) - 1)
     parted = np.partition(flat, (low, high))
     return float(parted[low] + (rank - low) * (parted[high] - parted[low]))
-
-
-def distinct(values: NDArray[_Number]) -> NDArray[_Number]:
-    """The different values of an array, one at least, in rising order, as ``numpy.unique``."""
-    ordered = np.sort(values, axis=None)
-    return ordered[np.append(True, ordered[1:] != ordered[:-1])]
-
-
-def robust_sigma(vectors: FloatArray) -> float:
-    """Standard deviation per axis of normal vectors (K, 3), from their median length."""
-    return median(np.linalg.norm(vectors, axis=1)) / MEDIAN_LENGTH
 
 
 def student_weights(squared: FloatArray, dimension: int = 6) -> FloatArray:

@@ -10,7 +10,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import find_leap
-from hand_eye_calib.stats import distinct, median, quantile
+from hand_eye_calib.stats import median, quantile
 
 # Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
 _PATH_STEP_S = 0.2
@@ -260,7 +260,7 @@ def _grid_step(values: FloatArray) -> float:
     step = float(differences.min())
     multiples = differences / step
     # Steady motion has equal steps, too, but not many different ones.
-    different = len(distinct(np.round(multiples)))
+    different = len(np.unique(np.round(multiples)))
     if different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
         return 0.0
     off = np.abs(multiples - np.round(multiples))

@@ -25,7 +25,6 @@ from hand_eye_calib.gls.noise_model import ROTATION, NoiseModel
 from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged
 from hand_eye_calib.gls.state_space import WHITE, Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING, Tuning
-from hand_eye_calib.stats import distinct
 
 
 @dataclass(frozen=True)
@@ -186,4 +185,4 @@ def sample(n_poses: int, most: int) -> IntArray | None:
     burst = np.array(TUNING.burst)
     offsets = burst[2 * len(burst) * n_poses // most > burst]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(burst)).astype(int)
-    return distinct((starts[:, None] + offsets).ravel())
+    return np.unique(starts[:, None] + offsets)

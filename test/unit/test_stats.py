@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi, chi2, norm
 
 from hand_eye_calib import stats
-from hand_eye_calib.stats import distinct, median, quantile
+from hand_eye_calib.stats import median, quantile
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 10, 11])
@@ -18,11 +18,6 @@ def test_they_are_those_of_numpy(size):
 
 def test_the_median_of_nothing_is_not_a_number():
     assert np.isnan(median([]))
-
-
-@pytest.mark.parametrize("values", [[3, 1, 3, 2, 1], [[0.5, 0.25], [0.5, -1.0]], [7]])
-def test_each_different_value_is_there_once(values):
-    assert distinct(np.array(values)).tolist() == np.unique(values).tolist()
 
 
 def test_the_numbers_are_those_of_scipy():
