@@ -25,15 +25,15 @@ def poses_of_a_lidar(times_s: np.ndarray) -> np.ndarray:
 
 
 def main() -> hec.Calibration:
-    """Calibrate two arrays, one of them with the scalar of its quaternions first."""
+    """Calibrate two arrays, one of them of matrices, one of rows as in a TUM file."""
     stamps_s = 1_700_000_000 + np.arange(0, 60, 0.1)
     lidar = poses_of_a_lidar(stamps_s - stamps_s[0])
     camera = lidar @ T_LIDAR_CAMERA
-    quats_wxyz = np.roll(Rotation.from_matrix(camera[:, :3, :3]).as_quat(), 1, axis=1)
-    rows = np.column_stack([stamps_s, camera[:, :3, 3], quats_wxyz])
+    quats_xyzw = Rotation.from_matrix(camera[:, :3, :3]).as_quat()
+    rows = np.column_stack([stamps_s, camera[:, :3, 3], quats_xyzw])
 
     parent = hec.read_trajectory(lidar, times=stamps_s)
-    child = hec.read_trajectory(rows, columns="t,x,y,z,qw,qx,qy,qz")
+    child = hec.read_trajectory(rows)
     result = hec.calibrate(parent, child)
     print(result)
     return result
