@@ -14,24 +14,23 @@ from source_code import SOURCE, imports_of, room_of
 
 ROOT = SOURCE.parent
 
-# What may not be exceeded: the sizes of the day on which several recordings, exports, formats of
-# other programs, images and scans came in. The goals, with all of them inside, are: 30,000 lines,
-# 19,000 of code, 400 constants, no file above 500 lines, 10 functions above 50, 450 functions in 50
-# files entered by ``calibrate a b``; 7,000 lines of reproduction, 19,000 of tests, 35,000 words.
+# What may not be exceeded: the sizes of today, which may only be lowered. The goals are: 30,000
+# lines, 19,000 of code, 400 constants, 10 functions above 50 lines, 450 functions in 50 files
+# entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
-    "lines": 40_700,
-    "lines of code": 26_000,
-    "numeric constants": 790,
+    "lines": 34_300,
+    "lines of code": 22_050,
+    "numeric constants": 715,
     "files above 500 lines": 0,
-    "functions above 50 lines": 20,
+    "functions above 50 lines": 13,
     "rooms": 30,
     "floors": 17,
-    "arrows between rooms": 187,
-    "functions entered by calibrate": 835,
-    "files entered by calibrate": 94,
-    "lines of reproduction": 8_600,
-    "lines of tests": 23_750,
-    "words of documentation": 42_900,
+    "arrows between rooms": 186,
+    "functions entered by calibrate": 760,
+    "files entered by calibrate": 90,
+    "lines of reproduction": 7_000,
+    "lines of tests": 20_970,
+    "words of documentation": 35_000,
 }
 
 _LONG_FILE, _LONG_FUNCTION = 500, 50
