@@ -19,7 +19,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_YAML
-from hand_eye_calib.io.yaml_files import parse_foreign_yaml
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
@@ -80,6 +79,8 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     if path.suffix == ".npz":
         document = _stacks(path)
     else:
+        from hand_eye_calib.io.yaml_files import parse_foreign_yaml
+
         document = parse_foreign_yaml(read_text(path, _EXPECTED, LARGEST_YAML), str(path))
     frames: dict[str, str] = {}
     is_inverse = False

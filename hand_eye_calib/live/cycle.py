@@ -256,8 +256,9 @@ def _why_kept(kept: Calibration, newest: Calibration) -> str:
 def describe(calibration: Calibration) -> str:
     """One line for a log: whose pose in whose frame, how good, from how much."""
     xyz, rpy = _pose_in_words(calibration)
-    sigmas_mm = ", ".join(_sigma(1000 * value, 1) for value in calibration.sigmas_with_floor[:3])
-    sigmas_deg = ", ".join(_sigma(value, 3) for value in np.degrees(calibration.sigmas_rpy))
+    sigmas = calibration.sigmas_printed
+    sigmas_mm = ", ".join(_sigma(1000 * value, 1) for value in sigmas[:3])
+    sigmas_deg = ", ".join(_sigma(value, 3) for value in np.degrees(sigmas[3:]))
     backend = " ipopt" * (calibration.backend == "ipopt")
     return (
         f"{calibration.headline}. {calibration.child_frame} in {calibration.parent_frame}: "

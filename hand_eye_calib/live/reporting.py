@@ -98,7 +98,7 @@ def _judged(cycle: SolveCycle, accepts_poses: bool, refused: str, stale: str) ->
 def _result_state(result: Calibration, age_s: float, clock_ns: int) -> ResultState:
     T = result.T_parent_child
     pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
-    sigmas = np.concatenate([result.sigmas[:3], result.sigmas_rpy])
+    sigmas = result.sigmas_printed
     same = ("parent_frame", "child_frame", "warnings", "n_poses", "time_offset_s",
             "time_offset_sigma_s", "scale", "scale_sigma")  # fmt: skip
     return ResultState(

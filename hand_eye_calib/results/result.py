@@ -243,6 +243,14 @@ class Result:
         return sigmas_rpy(self.T_parent_child, self.covariance)
 
     @property
+    def sigmas_printed(self) -> FloatArray:
+        """(6,) array: standard deviations, common-mode uncertainty included, of the printed x, y, z
+        (m), roll, pitch and yaw (rad); infinite if one is unknown.
+        """
+        of_angles = sigmas_rpy(self.T_parent_child, self.covariance_with_floor)
+        return np.concatenate([self.sigmas_with_floor[:3], of_angles])
+
+    @property
     def covariance_with_floor(self) -> FloatArray:
         """(6, 6) array: covariance and common-mode uncertainty together."""
         return self.covariance + self._floor
