@@ -18,7 +18,7 @@ ROOT = SOURCE.parent
 # lines, 19,000 of code, 400 constants, 10 functions above 50 lines, 450 functions in 50 files
 # entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
-    "lines": 34_300,
+    "lines": 34_320,
     "lines of code": 22_050,
     "numeric constants": 715,
     "files above 500 lines": 0,
