@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.report.figures import Drawn
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.style import (
     BAD,
@@ -86,14 +87,15 @@ def render_batch(
 def _vehicle(name: str, result: Calibration, number: int) -> dict[str, Any]:
     assert result.together is not None, "the result of a vehicle is of several recordings"
     row = row_of_result(result.to_dict())
-    figure = {
-        "name": f"vehicle-{number}",
-        "title": "Each recording against the common extrinsic",
-        "said": "Difference of each recording from the common value along and about the parent's "
-        "axes, with its standard deviation. The band is two standard deviations of the common "
-        "value. Squares do not belong to the others.",
-        "svg": draw_trend(result, number) if number <= _MOST_FIGURES else None,
-    }
+    figures = []
+    if number <= _MOST_FIGURES:
+        said = (
+            "Difference of each recording from the common value along and about the parent's axes, "
+            "with its standard deviation. The band is two standard deviations of the common value. "
+            "Squares do not belong to the others."
+        )
+        title, svg = "Each recording against the common extrinsic", draw_trend(result, number)
+        figures = [Drawn(f"vehicle-{number}", title, said, svg)]
     return {
         "title": name,
         "frames": f"{result.child_frame} in {result.parent_frame}",
@@ -109,7 +111,7 @@ def _vehicle(name: str, result: Calibration, number: int) -> dict[str, Any]:
         "values": list(
             zip([f"{axis}, {unit}" for axis, unit in _AXES.items()], _values(row), strict=True)
         ),
-        "figures": [figure] if figure["svg"] else [],
+        "figures": figures,
     }
 
 

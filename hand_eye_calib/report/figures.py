@@ -49,7 +49,7 @@ _WHAT_COINCIDES = {
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure of a page: ``name`` of its element, title, caption and SVG (empty: not drawn)."""
+    """A figure of a page: ``name`` of its element, title, caption and SVG."""
 
     name: str
     title: str
