@@ -25,27 +25,26 @@ FLOOR_SCALE = 0.01
 _MIN_INFORMATION = 1e-6
 
 
-def common_mode_floor(
-    by_scale: FloatArray, scale_variance: float, lasting_m: float = 0.0
-) -> FloatArray:
-    """Covariance (6, 6) of xi = (rho, phi) that the floor stands for, in the child sensor's frame.
+def common_mode_floor(lasting_m: float = 0.0) -> FloatArray:
+    """Covariance (6, 6) of xi = (rho, phi) that the floor stands for, in the child sensor's frame,
+    with a scale that is part of the model; ``lasting_m`` is the standard deviation per axis of
+    errors of the translation that last.
+    """
+    return np.diag(np.repeat([FLOOR_TRANSLATION**2 + lasting_m**2, FLOOR_ROTATION**2], 3))
+
+
+def open_scale_floor(by_scale: FloatArray, scale_variance: float) -> FloatArray:
+    """What a scale outside the model adds to the floor (6, 6).
 
     Parameters
     ----------
     by_scale : (6,) array
         Derivative of the answer by the logarithm of the scale of the child's path.
     scale_variance : float
-        Of that scale, by the data alone; zero if it is part of the model.
-    lasting_m : float
-        Standard deviation per axis of errors of the translation that last.
+        Of that scale, by the data alone.
     """
-    open_variance = 0.0
-    if scale_variance > 0.0:
-        open_variance = 1.0 / (1.0 / FLOOR_SCALE**2 + 1.0 / scale_variance)
-    floor = open_variance * np.outer(by_scale, by_scale)
-    floor[:3, :3] += (FLOOR_TRANSLATION**2 + lasting_m**2) * np.eye(3)
-    floor[3:, 3:] += FLOOR_ROTATION**2 * np.eye(3)
-    return floor
+    open_variance = FLOOR_SCALE**2 * scale_variance / (FLOOR_SCALE**2 + scale_variance)
+    return open_variance * np.outer(by_scale, by_scale)
 
 
 def floor_of_pairs(
@@ -70,4 +69,4 @@ def floor_of_pairs(
     of_scale = max(float(products[6, 6] - pushed @ by_scale), 1e-30)
     overlap = float(np.mean(pairs.j - pairs.i)) if len(pairs) else 1.0
     variance = overlap * products[7, 7] / max(3.0 * float(weights.sum()) - 7.0, 1.0)
-    return common_mode_floor(by_scale, float(max(variance, 1e-30) / of_scale))
+    return common_mode_floor() + open_scale_floor(by_scale, float(variance / of_scale))

@@ -125,7 +125,7 @@ class Solved:
         if (found := self.adaptive) is None:
             return floor_of_pairs(self.pairs, self.weights, self.solution.T_parent_child)
         lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
-        return common_mode_floor(np.zeros(6), 0.0, math.hypot(*lasting))
+        return common_mode_floor(math.hypot(*lasting))
 
 
 def calibration_of(

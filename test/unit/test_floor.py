@@ -11,6 +11,7 @@ from hand_eye_calib.assessment.floor import (
     FLOOR_TRANSLATION,
     common_mode_floor,
     floor_of_pairs,
+    open_scale_floor,
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -34,7 +35,7 @@ class TestFloor:
         T = answers[0].T_parent_child
         floor = floor_of_pairs(pairs, answers[0].weights, T)
         by_scale = se3.log(se3.inverse(T) @ answers[1].T_parent_child)
-        of_scale = floor - common_mode_floor(np.zeros(6), 0.0)
+        of_scale = floor - common_mode_floor()
         direction = by_scale / np.linalg.norm(by_scale)
         assert direction @ of_scale @ direction > 0.99 * np.trace(of_scale)
         # These poses know the scale far better than one per cent.
@@ -42,15 +43,15 @@ class TestFloor:
 
     def test_the_scale_is_as_open_as_the_data_leave_it(self):
         by_scale = np.r_[2.0, np.zeros(5)]
-        fixed = common_mode_floor(np.zeros(6), 0.0)
+        fixed = common_mode_floor()
         np.testing.assert_allclose(np.diag(fixed)[:3], FLOOR_TRANSLATION**2)
         np.testing.assert_allclose(np.diag(fixed)[3:], FLOOR_ROTATION**2)
         for variance, expected in ((1e6, 0.02), (0.01**2, 0.02 / np.sqrt(2)), (0.0, 0.0)):
-            found = common_mode_floor(by_scale, variance) - fixed
+            found = open_scale_floor(by_scale, variance)
             assert np.sqrt(found[0, 0]) == pytest.approx(expected, rel=1e-3)
 
     def test_errors_that_last_belong_to_it(self):
-        found = np.sqrt(np.diag(common_mode_floor(np.zeros(6), 0.0, lasting_m=0.012)))
+        found = np.sqrt(np.diag(common_mode_floor(lasting_m=0.012)))
         np.testing.assert_allclose(found[:3], 0.013)
 
     def test_exact_poses_have_none(self):
