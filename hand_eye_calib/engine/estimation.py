@@ -13,7 +13,7 @@ from hand_eye_calib.alignment.scale import Scale, ScaleInUse, child_scaled, sett
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes
-from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs
+from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs, usual_speed
 from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
@@ -48,6 +48,8 @@ class Solved:
         The adaptive estimator's solution, if there is one: with method adaptive this one.
     stamps_ns, config, scale, time_offset
         What was solved; the time offset if it was estimated.
+    speed_m_s : float
+        Usual speed of the parent sensor.
     is_beside : bool
         It is only to be compared with a result: without a floor.
     """
@@ -68,6 +70,7 @@ class Solved:
     model: AdaptiveSolution | None = None
     scale: ScaleInUse = ScaleInUse()
     time_offset: TimeOffset | None = None
+    speed_m_s: float = 0.0
     is_beside: bool = False
 
     @property
@@ -123,9 +126,10 @@ class Solved:
     def _floor(self) -> FloatArray:
         """Common-mode floor (6, 6) of errors of two odometries."""
         if (found := self.adaptive) is None:
-            return floor_of_pairs(self.pairs, self.weights, self.solution.T_parent_child)
+            T_parent_child = self.solution.T_parent_child
+            return floor_of_pairs(self.pairs, self.weights, T_parent_child, self.speed_m_s)
         lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
-        return common_mode_floor(math.hypot(*lasting))
+        return common_mode_floor(self.speed_m_s, math.hypot(*lasting))
 
 
 def calibration_of(
@@ -207,6 +211,7 @@ def solve_poses(
         config=config,
         scale=scale,
         time_offset=time_offset,
+        speed_m_s=usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3]),
         is_beside=is_beside,
     )
 

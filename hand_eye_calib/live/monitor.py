@@ -240,7 +240,8 @@ class MountMonitor:
         child = np.concatenate([each.Ts_childi_childj for _, each in learned])
         index = np.arange(len(parent))
         pairs = MotionPairs(parent, child, index, index + 1)
-        floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed)
+        speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1))) / (_LAG_NS * 1e-9)
+        floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed, speed_m_s)
         floor += shift_covariance(1e-3, 1e-4)  # never singular
         self._covariance = self._covariance + floor
         self._wander = _WANDER**2 * floor
