@@ -95,13 +95,13 @@ def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
         yield name, Method(name).solve(pairs)
     park = Method("park").solve(pairs)
     Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), park.weights)
-    minimum = quadratic_form.minimise(Q, park.T_parent_child[None, :3, :3])
-    yield "dnl from park", replace(park, T_parent_child=minimum.T_parent_child[0])
+    Ts, *_ = quadratic_form.minimise(Q, park.T_parent_child[None, :3, :3])
+    yield "dnl from park", replace(park, T_parent_child=Ts[0])
 
 
 def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatArray]:
-    value = float(quadratic_form.minimise(Q, T_parent_child[None, :3, :3]).value[0])
-    minimum = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
-    for T, other in zip(minimum.T_parent_child, minimum.value, strict=True):
+    value = float(quadratic_form.minimise(Q, T_parent_child[None, :3, :3])[1][0])
+    Ts, values, _, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
+    for T, other in zip(Ts, values, strict=True):
         if other > value * (1 + _HIGHER) + 1e-9 * np.trace(Q):
             yield T

@@ -13,7 +13,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
-from hand_eye_calib.solvers.dnl import start_rotations
+from hand_eye_calib.solvers.dnl import lowest
 from hand_eye_calib.solvers.park import squared_translation_residual
 from hand_eye_calib.solvers.solution import Solution
 
@@ -21,8 +21,7 @@ from hand_eye_calib.solvers.solution import Solution
 def solve(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, of K >= 1 pairs."""
     rows = residual_rows(pairs)
-    minimum = quadratic_form.minimise(rows.T @ rows, start_rotations(pairs))
-    T, converged, iterations = minimum.lowest()
+    T, converged, iterations = lowest(rows.T @ rows, pairs)
     objective = squared_translation_residual(pairs, T)
     return Solution(T, objective, converged, iterations, np.ones(len(pairs)))
 

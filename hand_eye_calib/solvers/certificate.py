@@ -14,9 +14,12 @@ alone is then constant, and what is left is a Newton iteration in 14 variables w
 9.
 """
 
+from functools import cache
+
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.solvers import quadratic_form
 
 # The bound may exceed the minimum by this share of it, and by this share of the form's mean
@@ -40,23 +43,18 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
     T_parent_child : (4, 4) array
         Near a local minimum.
     """
-    minimum = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
-    nearest = minimum.T_parent_child[0]
-    M = _turned(quadratic_form.without_translation(Q[None])[0][0], nearest[:3, :3])
+    Ts, values, _, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
+    # The form of S in R = rotation S, so that S is the identity at the minimum.
+    turn = np.eye(10)
+    turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))
+    M = turn.T @ quadratic_form.without_translation(Q[None])[0][0] @ turn
     scale = max(float(np.trace(M)) / len(M), np.finfo(float).tiny)
-    tolerance = _RELATIVE * max(float(minimum.value[0]), 0.0) / scale + _ROUNDING
+    tolerance = _RELATIVE * max(float(values[0]), 0.0) / scale + _ROUNDING
     lowest = _highest_lowest_eigenvalue(M / scale, enough=-0.25 * tolerance)
     # |x|^2 is 4 for every rotation.
     gap = 4.0 * max(-lowest, 0.0)
-    gap += max(float(quadratic_form.decrease(Q, T_parent_child, nearest)), 0.0) / scale
+    gap += max(float(quadratic_form.decrease(Q, T_parent_child, Ts[0])), 0.0) / scale
     return gap <= tolerance
-
-
-def _turned(M: FloatArray, rotation: FloatArray) -> FloatArray:
-    """The form of S in R = rotation S, so that S is the identity at the minimum."""
-    turn = np.eye(10)
-    turn[:9, :9] = np.kron(rotation, np.eye(3))
-    return turn.T @ M @ turn
 
 
 def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
@@ -65,17 +63,20 @@ def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
     A barrier method: minimise t with ``Z + t`` positive definite where it is not zero by
     construction.
     """
-    Z = M - np.tensordot(_STATIONARY @ (M @ _IDENTITY), _EQUATIONS, 1)
-    free = _BESIDE.T @ Z @ _BESIDE
+    identity, beside, equations, stationary, of_free = _tables()
+    Z = M - np.tensordot(stationary @ (M @ identity), equations, 1)
+    free = beside.T @ Z @ beside
+    derivatives = np.concatenate([beside.T @ of_free @ beside, np.eye(9)[None]])
     shift = max(-float(np.linalg.eigvalsh(free)[0]), 0.0) + 0.1
-    unknowns, weight = np.append(np.zeros(len(_FREE)), shift), 1.0
+    unknowns, weight = np.append(np.zeros(len(of_free)), shift), 1.0
     best = float(np.linalg.eigvalsh(Z)[0])
     for _ in range(_MAX_STEPS):
         if best >= enough:
             break
-        step, decrement = _newton_step(free, unknowns, weight)
+        solved = np.linalg.solve(free + np.tensordot(unknowns, derivatives, 1), derivatives)
+        step, decrement = _newton_step(solved, weight)
         unknowns = unknowns + step
-        lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], _FREE_WHOLE, 1))[0]
+        lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], of_free, 1))[0]
         best = max(best, float(lowest))
         if decrement < 0.5:
             if len(free) / weight < _CLOSE:
@@ -84,9 +85,10 @@ def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
     return best
 
 
-def _newton_step(free: FloatArray, unknowns: FloatArray, weight: float) -> tuple[FloatArray, float]:
-    """A Newton step of ``weight t - log det`` that stays inside, and the Newton decrement."""
-    solved = np.linalg.solve(free + np.tensordot(unknowns, _FREE_AND_SHIFT, 1), _FREE_AND_SHIFT)
+def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
+    """A Newton step of ``weight t - log det`` that stays inside, and the Newton decrement, by the
+    derivatives (15, 9, 9) of the matrix, its inverse times them.
+    """
     gradient = -np.trace(solved, axis1=1, axis2=2)
     gradient[-1] += weight
     hessian = np.einsum("iab,jba->ij", solved, solved)
@@ -99,37 +101,29 @@ def _newton_step(free: FloatArray, unknowns: FloatArray, weight: float) -> tuple
     return step * min(1.0, max(inside, 1.0 / (1.0 + decrement))), decrement
 
 
-def _equations() -> FloatArray:
-    """Symmetric matrices (21, 10, 10) of the equations, independent of each other; the last
-    variable's is among them.
+@cache
+def _tables() -> tuple[FloatArray, ...]:
+    """(vec I, 1) (10,), and the directions (10, 9) beside it; symmetric matrices (21, 10, 10) of
+    the equations, independent of each other, the last variable's among them; the multipliers
+    (21, 10) that make ``Z x = 0`` for a given ``M x``, and the matrices (14, 10, 10) that keep it.
     """
-    found = [np.diag([0.0] * 9 + [1.0])]
-    transposed = np.append(np.arange(9).reshape(3, 3).T.ravel(), 9)
-    for a in range(3):
-        for b in range(3):
-            orthonormal, right_handed = np.zeros((2, 10, 10))
-            for k in range(3):
-                orthonormal[3 * a + k, 3 * b + k] += 1.0
-            orthonormal[9, 9] = -float(a == b)
-            # Rows: r_(a+1) x r_(a+2) = r_a, component b.
-            next_row, last_row = 3 * ((a + 1) % 3), 3 * ((a + 2) % 3)
-            right_handed[next_row + (b + 1) % 3, last_row + (b + 2) % 3] = 1.0
-            right_handed[next_row + (b + 2) % 3, last_row + (b + 1) % 3] = -1.0
-            right_handed[3 * a + b, 9] = -1.0
-            for A in (orthonormal, right_handed):
-                found += [A + A.T, (A + A.T)[np.ix_(transposed, transposed)]]
-    _, singular, rows = np.linalg.svd(np.reshape(found, (len(found), 100)))
-    return rows[: int((singular > 1e-9).sum())].reshape(-1, 10, 10)
-
-
-# (vec I, 1), and the directions (10, 9) beside it.
-_IDENTITY = np.append(np.eye(3).ravel(), 1.0)
-_BESIDE = np.linalg.svd(_IDENTITY[None])[2][1:].T
-_EQUATIONS = _equations()
-_AT_IDENTITY = (_EQUATIONS @ _IDENTITY).T
-# Multipliers (21, 10) that make ``Z x = 0`` for a given ``M x``, and those (14, 21) that keep it.
-_STATIONARY = np.linalg.pinv(_AT_IDENTITY)
-_KEPT = np.linalg.svd(_AT_IDENTITY)[2][np.linalg.matrix_rank(_AT_IDENTITY) :]
-_FREE_WHOLE = np.tensordot(_KEPT, _EQUATIONS, 1)
-_FREE = _BESIDE.T @ _FREE_WHOLE @ _BESIDE
-_FREE_AND_SHIFT = np.concatenate([_FREE, np.eye(9)[None]])
+    # The equations are all that hold for many rotations.
+    rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(200, 3)))
+    x = np.append(rotations.reshape(-1, 9), np.ones((200, 1)), axis=1)
+    upper = np.triu_indices(10)
+    _, singular, rows = np.linalg.svd(x[:, upper[0]] * x[:, upper[1]])
+    equations = np.zeros((21, 10, 10))
+    equations[:20, *upper] = rows[singular < 1e-9]
+    equations += np.swapaxes(equations, 1, 2)
+    equations[20, 9, 9] = 1.0
+    identity = np.append(np.eye(3).ravel(), 1.0)
+    beside = np.linalg.svd(identity[None])[2][1:].T
+    at_identity = (equations @ identity).T
+    kept = np.linalg.svd(at_identity)[2][np.linalg.matrix_rank(at_identity) :]
+    return (
+        identity,
+        beside,
+        equations,
+        np.linalg.pinv(at_identity),
+        np.tensordot(kept, equations, 1),
+    )

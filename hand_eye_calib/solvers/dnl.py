@@ -8,19 +8,23 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.solution import Solution
 
-# Rotations by pi about each axis, after none.
-_HALF_TURNS = np.array(
-    [np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], dtype=float
-)
-
 
 def solve(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |A X - X B|_F^2`` over X, of K >= 1 pairs."""
     coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
     Q = quadratic_form.weighted_sum(coefficients, weights)
-    T, converged, iterations = quadratic_form.minimise(Q, start_rotations(pairs)).lowest()
+    T, converged, iterations = lowest(Q, pairs)
     objective = float(quadratic_form.costs(coefficients, T).sum())
     return Solution(T, objective, converged, iterations, weights)
+
+
+def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool, int]:
+    """The lowest minimum (4, 4) of a form (13, 13) of pairs, whether the iteration settled there,
+    and its steps.
+    """
+    Ts, values, converged, iterations = quadratic_form.minimise(Q, start_rotations(pairs))
+    best = int(np.argmin(values))
+    return Ts[best], bool(converged[best]), iterations
 
 
 def solve_without(pairs: MotionPairs, solution: Solution, left_out: BoolArray) -> FloatArray:
@@ -28,11 +32,10 @@ def solve_without(pairs: MotionPairs, solution: Solution, left_out: BoolArray) -
     resampling; returns the transforms (B, 4, 4).
     """
     coefficients = quadratic_form.coefficients(pairs)
-    forms = np.stack(
-        [quadratic_form.weighted_sum(coefficients, kept) for kept in (~left_out).astype(float)]
-    )
+    kept = (~left_out).astype(float)
+    forms = np.stack([quadratic_form.weighted_sum(coefficients, weights) for weights in kept])
     starts = np.repeat(solution.T_parent_child[None, :3, :3], len(left_out), axis=0)
-    return quadratic_form.minimise(forms, starts).T_parent_child
+    return quadratic_form.minimise(forms, starts)[0]
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
@@ -52,4 +55,6 @@ def start_rotations(pairs: MotionPairs) -> FloatArray:
     axes_child = se3.vee(pairs.Ts_childi_childj)
     left, _, right = np.linalg.svd(axes_parent.T @ axes_child)
     aligned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return aligned @ _HALF_TURNS
+    return aligned @ [
+        np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
+    ]

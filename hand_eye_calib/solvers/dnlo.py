@@ -20,6 +20,7 @@ come from a fixed seed: the same pairs in the same order give the same answer.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -78,7 +79,8 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
         ``objective`` is eq. (5) with the outliers' c included; ``weights`` are alpha.
     """
     searched = pairs[_searched(len(pairs))]
-    T = _search(searched, threshold, min_inlier_fraction * len(searched))
+    floor = min_inlier_fraction * len(searched)
+    T = _Search(quadratic_form.condense(searched), threshold, floor).best(searched)
     return _improved(pairs, T, threshold, min_inlier_fraction * len(pairs))
 
 
@@ -136,21 +138,23 @@ def solve_without(
     condensed, some = quadratic_form.condense(pairs), _searched(len(pairs))
     # Of all that is found near the full answer and by annealing: one row's answer may suit another
     # row better than its own.
-    rows, searched = left_out[:, some], condensed[some]
+    rows = left_out[:, some]
     fewest = min_inlier_fraction * float((~rows).sum(axis=1).min())
+    search = _Search(condensed[some], threshold, fewest)
     everything = near
     for _ in range(_STEPS_OVER_ALL):
-        everything = _refit(searched, (~rows).astype(float), everything)
-    annealed = _anneal(searched, everything, threshold, fewest, rows)
-    starts, twice = np.concatenate([near, annealed]), np.tile(rows, (2, 1))
-    candidates, _ = _settle(searched, starts, threshold, fewest, _SETTLED, twice)
-    costs = _costs(searched, candidates)
+        everything = search.refit((~rows).astype(float), everything)
+    starts, twice = np.concatenate([near, search.anneal(everything, rows)]), np.tile(rows, (2, 1))
+    candidates, _ = search.settle(starts, _SETTLED, twice)
+    costs = search.costs(candidates)
     rival = candidates[[np.argmin(truncate(costs[:, ~row], threshold, fewest)[1]) for row in rows]]
     # The sample may be wrong about which of two minima is lower: all pairs decide between the best
     # and the one nearby.
-    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    whole = _Search(
+        condensed, threshold, min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    )
     rivals, twice = np.concatenate([near, rival]), np.tile(left_out, (2, 1))
-    answers, objectives = _settle(condensed, rivals, threshold, fewest, _CONVERGED, twice)
+    answers, objectives = whole.settle(rivals, _CONVERGED, twice)
     nearby, other = np.split(answers, 2)
     return np.where(np.less(*np.split(objectives, 2))[:, None, None], nearby, other)
 
@@ -185,119 +189,102 @@ def _searched(n_pairs: int) -> slice | IntArray:
     return np.linspace(0, n_pairs - 1, _MAX_SEARCHED).astype(int)
 
 
-def _search(pairs: MotionPairs, threshold: float, floor: float) -> FloatArray:
-    """The annealed answer (4, 4), or a better rival."""
-    condensed = quadratic_form.condense(pairs)
-    total = condensed.sum(axis=0)
-    Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
-    for _ in range(_STEPS_OVER_ALL):
-        Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
-    near_all = Ts[[int(np.argmin(_costs(total[None], Ts)))]]
-    annealed = _anneal(condensed, near_all, threshold, floor)
-    best, objective = _settle(condensed, annealed, threshold, floor)
-    random = np.random.default_rng(0)
-    for _ in range(_MAX_GENERATIONS):
-        rivals = _rivals(condensed, best, threshold, floor, random)
-        rivals, objectives = _settle(condensed, rivals, threshold, floor)
-        before = objective
-        for kind, enough in ((slice(_FOLLOWED), 1.0), (slice(_FOLLOWED, None), _DECISIVE)):
-            first = [(kind.start or 0) + int(np.argmin(objectives[kind]))]
-            if objectives[first] < enough * objective:
-                best, objective = rivals[first], objectives[first]
-        if objective >= before * (1 - _HARDLY):
-            break
-    return best[0]
-
-
-def _rivals(
-    condensed: FloatArray,
-    T: FloatArray,
-    threshold: float,
-    floor: float,
-    random: np.random.Generator,
-) -> FloatArray:
-    """The most promising minima (6, 4, 4): three over random parts of the inliers of T (1, 4, 4),
-    then three over small random subsets.
+@dataclass(frozen=True)
+class _Search:
+    """A search over condensed pairs (K, 91) with the threshold c and the floor d. Pairs that are
+    left out, (S, K) bool arrays, are so at each of S transforms.
     """
-    n_pairs = len(condensed)
-    started = 4 * (1 + _STARTED_PAIRS // (4 * n_pairs))
-    inliers, _ = truncate(_costs(condensed, T), threshold, floor)
-    near = np.repeat(_INLIER_SHARES, started // 2)[:, None] * inliers
-    anywhere = np.repeat(_SUBSET_SIZES, started // 4)[:, None] * np.full(n_pairs, 1 / n_pairs)
-    chances = np.concatenate([near, anywhere])
-    weights = (random.random(chances.shape) < chances).astype(float)
-    Ts = np.repeat(T, len(weights), axis=0)
-    for _ in range(_FIRST_ROUNDS):
-        Ts = _refit(condensed, weights, Ts)
-        weights, objectives = truncate(_costs(condensed, Ts), threshold, floor)
-    promising = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")[:, :_FOLLOWED]
-    return Ts[(promising + [[0], [started]]).ravel()]
 
+    condensed: FloatArray
+    threshold: float
+    floor: float
 
-def _anneal(
-    condensed: FloatArray,
-    Ts: FloatArray,
-    threshold: float,
-    floor: float,
-    left_out: BoolArray | None = None,
-) -> FloatArray:
-    """Graduated non-convexity from each start (S, 4, 4), with the truncation at c or at the d-th
-    smallest cost, whichever is larger.
-    """
-    last = max(math.ceil(floor) - 1, 0)
+    def costs(self, Ts: FloatArray, left_out: BoolArray | None = None) -> FloatArray:
+        """Costs (S, K) of all pairs at each transform (S, 4, 4)."""
+        costs: FloatArray = quadratic_form.monomials(Ts) @ self.condensed.T
+        if left_out is not None:
+            costs[left_out] = _NEVER
+        return costs
 
-    def costs_and_cut(Ts: FloatArray) -> tuple[FloatArray, FloatArray]:
-        costs = _costs(condensed, Ts, left_out)
-        return costs, np.maximum(threshold, np.partition(costs, last)[:, last])
+    def refit(self, weights: FloatArray, Ts: FloatArray) -> FloatArray:
+        """Gauss-Newton step (S, 4, 4) from each transform with its weights (S, K)."""
+        forms = quadratic_form.expand(weights @ self.condensed)
+        return quadratic_form.gauss_newton_step(forms, Ts)
 
-    costs, cut = costs_and_cut(Ts)
-    largest = np.max(costs, axis=1, initial=0.0, where=costs < _NEVER)
-    sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
-    while sharpness.min() < _SHARP:
-        cuts = (cut * sharpness * (sharpness + 1))[:, None]
-        ratio = np.sqrt(cuts / np.maximum(costs, 1e-300)) - sharpness[:, None]
-        Ts = _refit(condensed, ratio.clip(0.0, 1.0), Ts)
-        costs, cut = costs_and_cut(Ts)
-        sharpness = sharpness * _SHARPENING
-    return Ts
+    def best(self, pairs: MotionPairs) -> FloatArray:
+        """The annealed answer (4, 4), or a better rival."""
+        total = self.condensed.sum(axis=0)
+        Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
+        for _ in range(_STEPS_OVER_ALL):
+            Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
+        near_all = Ts[[int(np.argmin(quadratic_form.monomials(Ts) @ total))]]
+        best, objective = self.settle(self.anneal(near_all))
+        random = np.random.default_rng(0)
+        for _ in range(_MAX_GENERATIONS):
+            rivals, objectives = self.settle(self._rivals(best, random))
+            before = objective
+            for kind, enough in ((slice(_FOLLOWED), 1.0), (slice(_FOLLOWED, None), _DECISIVE)):
+                first = [(kind.start or 0) + int(np.argmin(objectives[kind]))]
+                if objectives[first] < enough * objective:
+                    best, objective = rivals[first], objectives[first]
+            if objective >= before * (1 - _HARDLY):
+                break
+        return best[0]
 
+    def _rivals(self, T: FloatArray, random: np.random.Generator) -> FloatArray:
+        """The most promising minima (6, 4, 4): three over random parts of the inliers of T
+        (1, 4, 4), then three over small random subsets.
+        """
+        n_pairs = len(self.condensed)
+        started = 4 * (1 + _STARTED_PAIRS // (4 * n_pairs))
+        inliers, _ = truncate(self.costs(T), self.threshold, self.floor)
+        near = np.repeat(_INLIER_SHARES, started // 2)[:, None] * inliers
+        anywhere = np.repeat(_SUBSET_SIZES, started // 4)[:, None] * np.full(n_pairs, 1 / n_pairs)
+        chances = np.concatenate([near, anywhere])
+        weights = (random.random(chances.shape) < chances).astype(float)
+        Ts = np.repeat(T, len(weights), axis=0)
+        for _ in range(_FIRST_ROUNDS):
+            Ts = self.refit(weights, Ts)
+            weights, objectives = truncate(self.costs(Ts), self.threshold, self.floor)
+        order = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")
+        return Ts[(order[:, :_FOLLOWED] + [[0], [started]]).ravel()]
 
-def _costs(
-    condensed: FloatArray, Ts_parent_child: FloatArray, left_out: BoolArray | None = None
-) -> FloatArray:
-    """Costs (S, K) of all pairs at each transform (S, 4, 4)."""
-    costs: FloatArray = quadratic_form.monomials(Ts_parent_child) @ condensed.T
-    if left_out is not None:
-        costs[left_out] = _NEVER
-    return costs
+    def anneal(self, Ts: FloatArray, left_out: BoolArray | None = None) -> FloatArray:
+        """Graduated non-convexity from each start (S, 4, 4), with the truncation at c or at the
+        d-th smallest cost, whichever is larger.
+        """
+        last = max(math.ceil(self.floor) - 1, 0)
+        sharpness = np.zeros(len(Ts))
+        while True:
+            costs = self.costs(Ts, left_out)
+            cut = np.maximum(self.threshold, np.partition(costs, last)[:, last])
+            if not sharpness.any():
+                largest = np.max(costs, axis=1, initial=0.0, where=costs < _NEVER)
+                sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
+            if sharpness.min() >= _SHARP:
+                return Ts
+            cuts = (cut * sharpness * (sharpness + 1))[:, None]
+            ratio = np.sqrt(cuts / np.maximum(costs, 1e-300)) - sharpness[:, None]
+            Ts = self.refit(ratio.clip(0.0, 1.0), Ts)
+            sharpness = sharpness * _SHARPENING
 
-
-def _refit(condensed: FloatArray, weights: FloatArray, Ts: FloatArray) -> FloatArray:
-    """Gauss-Newton step (S, 4, 4) from each transform with its weights (S, K)."""
-    return quadratic_form.gauss_newton_step(quadratic_form.expand(weights @ condensed), Ts)
-
-
-def _settle(
-    condensed: FloatArray,
-    Ts: FloatArray,
-    threshold: float,
-    floor: float,
-    tolerance: float = _SETTLED,
-    left_out: BoolArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Take Gauss-Newton steps and new weights in turn until no objective falls; returns the best
-    transforms (S, 4, 4) and their objectives (S,). Those that have converged wait for the others.
-    """
-    weights, objectives = truncate(_costs(condensed, Ts, left_out), threshold, floor)
-    Ts, falling = Ts.copy(), np.arange(len(Ts))
-    for _ in range(_MAX_ROUNDS):
-        Ts_new, before = _refit(condensed, weights, Ts[falling]), objectives[falling]
-        costs = _costs(condensed, Ts_new, None if left_out is None else left_out[falling])
-        weights, objectives_new = truncate(costs, threshold, floor)
-        better = objectives_new < before
-        Ts[falling[better]], objectives[falling[better]] = Ts_new[better], objectives_new[better]
-        if (objectives_new >= before * (1 - tolerance)).all():
-            break
-        still = objectives_new < before * (1 - _CONVERGED)
-        falling, weights = falling[still], weights[still]
-    return Ts, objectives
+    def settle(
+        self, Ts: FloatArray, tolerance: float = _SETTLED, left_out: BoolArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Take Gauss-Newton steps and new weights in turn until no objective falls; returns the
+        best transforms (S, 4, 4) and their objectives (S,). Those that have converged wait for the
+        others.
+        """
+        weights, objectives = truncate(self.costs(Ts, left_out), self.threshold, self.floor)
+        Ts, falling = Ts.copy(), np.arange(len(Ts))
+        for _ in range(_MAX_ROUNDS):
+            Ts_new, before = self.refit(weights, Ts[falling]), objectives[falling]
+            costs = self.costs(Ts_new, None if left_out is None else left_out[falling])
+            weights, new = truncate(costs, self.threshold, self.floor)
+            better = new < before
+            Ts[falling[better]], objectives[falling[better]] = Ts_new[better], new[better]
+            if (new >= before * (1 - tolerance)).all():
+                break
+            still = new < before * (1 - _CONVERGED)
+            falling, weights = falling[still], weights[still]
+        return Ts, objectives

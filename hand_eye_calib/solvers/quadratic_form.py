@@ -14,35 +14,13 @@ products of u with a constant array. Subtracting the identity first keeps the di
 motions.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 
 DIMENSION = 13
-_ROWS, _COLUMNS = np.triu_indices(DIMENSION)
-_UPPER = _ROWS * DIMENSION + _COLUMNS
-_MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
-_TRIANGLE_OF_SQUARE = np.empty((DIMENSION, DIMENSION), dtype=int)
-_TRIANGLE_OF_SQUARE[_ROWS, _COLUMNS] = _TRIANGLE_OF_SQUARE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
-_TRANSLATION, _REST = slice(9, 12), np.append(np.arange(9), 12)
-
-# Positions of x in the sixteen entries of X: x = X.ravel()[_X_IN_T].
-_X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
-# X[i, j] = _ENTRY[i, j] @ x
-_ENTRY: FloatArray = np.zeros((16, DIMENSION))
-_ENTRY[_X_IN_T, np.arange(DIMENSION)] = 1.0
-_ENTRY = _ENTRY.reshape(4, 4, DIMENSION)
-# (24, 12, 13): factor of coefficient u of a pair times variable m of x in residual (i, j).
-_RESIDUAL = np.concatenate(
-    [
-        np.einsum("il,kjm->ikljm", np.eye(3), _ENTRY).reshape(12, 12, DIMENSION),
-        -np.einsum("jl,ikm->kjilm", np.eye(4), _ENTRY[:3, :3]).reshape(12, 12, DIMENSION),
-    ]
-)
 
 # Pairs per block, so that the intermediate arrays stay in the cache of the processor.
 _BLOCK, _SUMMED_BLOCK = 128, 1024
@@ -51,22 +29,50 @@ _BLOCK, _SUMMED_BLOCK = 128, 1024
 # zero.
 _RANK_TOLERANCE = 1e-10
 
-_MAX_NEWTON_STEPS = 60
-_STEP_TOLERANCE = 1e-12
+_MAX_NEWTON_STEPS, _STEP_TOLERANCE = 60, 1e-12
+
+
+def _tables() -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Arrays that the forms are made of.
+
+    Positions (13,) of x in the sixteen entries of X. Factors (24, 12, 13) of coefficient u of a
+    pair times variable m of x in residual (i, j). D (6, 16) of ``X D``, the derivative of X along
+    each tangent (rho, phi). What X.ravel() times gives x of X D for all six, then x (16, 91).
+    """
+    x_in_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
+    entry = np.zeros((16, DIMENSION))  # X[i, j] = entry[i, j] @ x
+    entry[x_in_T, np.arange(DIMENSION)] = 1.0
+    entry = entry.reshape(4, 4, DIMENSION)
+    of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry)
+    of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3])
+    residual = np.concatenate([each.reshape(12, 12, DIMENSION) for each in (of_parent, of_child)])
+    twists = np.zeros((6, 4, 4))
+    twists[[0, 1, 2], [0, 1, 2], 3] = 1.0
+    twists[3:, :3, :3] = _GENERATORS
+    tangents = np.einsum("in,dkl->nkdil", np.eye(4), np.concatenate([twists, np.eye(4)[None]]))
+    tangents = tangents.reshape(16, 7, 16)[:, :, x_in_T].reshape(16, 7 * DIMENSION)
+    return x_in_T, residual, twists.reshape(6, 16), tangents
+
+
+_ROWS, _COLUMNS = np.triu_indices(DIMENSION)
+_TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
+_TRIANGLE[_ROWS, _COLUMNS] = _TRIANGLE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
 _GENERATORS = se3.skew(np.eye(3))
+_X_IN_T, _RESIDUAL, _TWISTS, _TANGENTS = _tables()
 
 
 def condense(pairs: MotionPairs) -> FloatArray:
     """Upper triangles (K, 91) of every pair's Q_k, in the order of ``numpy.triu_indices(13)``:
     ``condensed @ monomials(X)`` gives all costs.
     """
-    condensed, u = np.empty((len(pairs), len(_UPPER))), coefficients(pairs)
+    condensed, u = np.empty((len(pairs), len(_ROWS))), coefficients(pairs)
+    upper = _ROWS * DIMENSION + _COLUMNS
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, start + _BLOCK)
         residuals = (u[block] @ _RESIDUAL.reshape(24, -1)).reshape(-1, 12, DIMENSION)
         # numpy multiplies two arrays of small matrices faster than it squares one.
         forms = np.swapaxes(residuals, 1, 2) @ residuals.copy()
-        condensed[block] = forms.reshape(-1, DIMENSION**2).take(_UPPER, axis=1)
+        condensed[block] = forms.reshape(-1, DIMENSION**2).take(upper, axis=1)
     return condensed
 
 
@@ -74,14 +80,9 @@ def coefficients(pairs: MotionPairs) -> FloatArray:
     """Coefficients (K, 24) that the residuals are linear in: the top three rows of A - I, then of
     B - I, of each pair.
     """
-    rows = [Ts.reshape(-1, 16)[:, :12] for Ts in (pairs.Ts_parenti_parentj, pairs.Ts_childi_childj)]
-    found = np.concatenate(rows, axis=1)
-    for one in _ONES:  # by column: numpy is slow with many short rows
-        found[:, one] -= 1.0
-    return found
-
-
-_ONES = np.flatnonzero(np.tile(np.eye(4)[:3].ravel(), 2))
+    both = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
+    moved = [(Ts[:, :3] - np.eye(4)[:3]).reshape(-1, 12) for Ts in both]
+    return np.concatenate(moved, axis=1)
 
 
 def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
@@ -122,52 +123,19 @@ def monomials(T_parent_child: FloatArray) -> FloatArray:
     """Products ``x_i x_j`` (..., 91) of two variables of transforms (..., 4, 4), doubled off the
     diagonal, which map condensed forms to costs.
     """
-    entries = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
-    return entries.take(_X_IN_T[_ROWS], axis=-1) * (
-        entries.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY
-    )
+    x = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,)).take(_X_IN_T, axis=-1)
+    doubled = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+    return x.take(_ROWS, axis=-1) * (x.take(_COLUMNS, axis=-1) * doubled)
 
 
 def expand(condensed: FloatArray) -> FloatArray:
     """Symmetric (..., 13, 13) matrices from upper triangles (..., 91)."""
-    return condensed.take(_TRIANGLE_OF_SQUARE, axis=-1)
+    return condensed.take(_TRIANGLE, axis=-1)
 
 
-def _pseudo_inverse(matrices: FloatArray) -> FloatArray:
-    """Inverses (B, n, n) of symmetric matrices on the directions that are more than rounding."""
-    values, vectors = np.linalg.eigh(matrices)
-    seen = values > _RANK_TOLERANCE * np.maximum(values[..., -1:], np.finfo(float).tiny)
-    inverse_values = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
-    return (vectors * inverse_values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-
-
-@dataclass(frozen=True)
-class Minimum:
-    """Minima of B forms.
-
-    Attributes
-    ----------
-    T_parent_child : (B, 4, 4) array
-    value : (B,) array
-        Of the forms, there.
-    converged : (B,) bool array
-        Whether Newton's iteration settled.
-    iterations : int
-        Of the one that took longest.
-    """
-
-    T_parent_child: FloatArray
-    value: FloatArray
-    converged: BoolArray
-    iterations: int
-
-    def lowest(self) -> tuple[FloatArray, bool, int]:
-        """The lowest minimum (4, 4), whether it converged, and the iterations."""
-        best = int(np.argmin(self.value))
-        return self.T_parent_child[best], bool(self.converged[best]), self.iterations
-
-
-def minimise(Q: FloatArray, rotation_start: FloatArray) -> Minimum:
+def minimise(
+    Q: FloatArray, rotation_start: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray, int]:
     """Minimise ``x^T Q x`` over SE(3), from several rotations or for several forms at once.
 
     The translation is eliminated exactly. The rest is a quadratic function of the nine entries of
@@ -177,11 +145,15 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> Minimum:
     ----------
     Q : (13, 13) or (B, 13, 13) array
     rotation_start : (B, 3, 3) array
+
+    Returns
+    -------
+    (B, 4, 4), (B,), (B,) bool arrays, int
+        Transforms, the forms there, whether the iteration settled, and its steps.
     """
     rotation = np.array(rotation_start, dtype=float)
-    reduced, to_translation = without_translation(
-        np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
-    )
+    Q = np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
+    reduced, to_translation = without_translation(Q)
     constant = reduced[:, 9, 9]
     value, gradient, hessian = _derivatives(reduced, rotation)
     damping = np.zeros(len(rotation))
@@ -208,18 +180,22 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> Minimum:
         value = np.where(better, trial_value, value)
     vectors = np.append(rotation.reshape(-1, 9), np.ones((len(rotation), 1)), axis=1)
     translation = -(to_translation @ vectors[:, :, None])[:, :, 0]
-    T_parent_child = se3.from_rotation_translation(rotation, translation)
-    return Minimum(T_parent_child, value + constant, converged, iterations)
+    Ts = se3.from_rotation_translation(rotation, translation)
+    return Ts, value + constant, converged, iterations
 
 
 def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Forms (B, 10, 10) of ``(vec R, 1)`` at the best translation for R, and what gives minus that,
     m, times ``(vec R, 1)`` (B, 3, 10).
     """
-    translation_rest = Q[:, _TRANSLATION][:, :, _REST]
-    gain = _pseudo_inverse(Q[:, _TRANSLATION, _TRANSLATION])
+    of_rest = np.append(np.arange(9), 12)
+    translation_rest = Q[:, 9:12][:, :, of_rest]
+    values, vectors = np.linalg.eigh(Q[:, 9:12, 9:12])
+    seen = values > _RANK_TOLERANCE * np.maximum(values[:, -1:], np.finfo(float).tiny)
+    inverse_values = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    gain = (vectors * inverse_values[:, None]) @ np.swapaxes(vectors, 1, 2)
     eliminated = np.swapaxes(translation_rest, 1, 2) @ gain @ translation_rest
-    return Q[:, _REST[:, None], _REST] - eliminated, gain @ translation_rest
+    return Q[:, of_rest[:, None], of_rest] - eliminated, gain @ translation_rest
 
 
 def _newton_step(
@@ -258,18 +234,7 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     # Cayley's map: a rotation, equal to the exponential up to second order, and faster.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
     shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
-    return Ts_parent_child @ (_IDENTITY + shrink * (twist + 0.5 * twist @ twist))
-
-
-_IDENTITY = np.eye(4)
-# (6, 16): a tangent (rho, phi) times this gives D of ``X D``, the derivative of X along it.
-_TWISTS: FloatArray = np.zeros((6, 4, 4))
-_TWISTS[[0, 1, 2], [0, 1, 2], 3] = 1.0
-_TWISTS[3:, :3, :3] = _GENERATORS
-# (16, 91): X.ravel() times this gives x of X D for all six tangents, then x of X.
-_TANGENTS = np.einsum("in,dkl->nkdil", np.eye(4), np.concatenate([_TWISTS, np.eye(4)[None]]))
-_TANGENTS = _TANGENTS.reshape(16, 7, 16)[:, :, _X_IN_T].reshape(16, 7 * DIMENSION)
-_TWISTS = _TWISTS.reshape(6, 16)
+    return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
 
 
 def _derivatives(

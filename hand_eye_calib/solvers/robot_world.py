@@ -25,12 +25,9 @@ _TAILS = 12.0
 # are normal) under heavy tails of so many degrees of freedom, which few outliers do not widen.
 _OUTLIER, _OUTLIER_TAILS = 36.0, 3.0
 
-# Rounds of weights, levels and a Gauss-Newton step; steps below this many standard deviations end
-# them.
-_ROUNDS, _SMALL_STEP = 60, 1e-4
-
-# Rounds of the fit that finds the outliers.
-_ROUGH_ROUNDS = 8
+# Rounds of weights, levels and a Gauss-Newton step, of the fit that finds the outliers and of that
+# without them; steps below this many standard deviations end them.
+_ROUGH_ROUNDS, _ROUNDS, _SMALL_STEP = 8, 60, 1e-4
 
 # Starts from so many stops each: two in three are clean with a tenth of outliers.
 _STARTS, _START_STOPS = 12, 5
@@ -48,8 +45,6 @@ _UNKNOWN = 1e3
 # Errors of stops that follow each other may last: the sums of the scores over so many parts of the
 # recording show it.
 _PARTS = 6
-
-_WHERE = ("child", "child_world")
 
 
 @dataclass(frozen=True)
@@ -80,14 +75,9 @@ class Stops:
     def __len__(self) -> int:
         return len(self.child)
 
-    def take(self, which: IntArray | BoolArray) -> "Stops":
-        """Some of the stops."""
-        return Stops(
-            self.Ts_world_parent[which],
-            self.Ts_world_child[which],
-            self.child[which],
-            self.world[which],
-        )
+    def __getitem__(self, which: IntArray | BoolArray) -> "Stops":
+        columns = self.Ts_world_parent, self.Ts_world_child, self.child, self.world
+        return Stops(*(each[which] for each in columns))
 
 
 @dataclass(frozen=True)
@@ -109,9 +99,6 @@ class RobotWorld:
         Weight of each stop, 1 for the errors that the levels expect and less for larger ones.
     level_m, level_rad : float
         Standard deviations of the errors of a stop's position and rotation, per axis.
-    where : str
-        The frame in which errors of position and rotation are independent: "child" or
-        "child_world" (a target whose pose a camera measured).
     log_likelihood : float
     converged : bool
     """
@@ -123,7 +110,6 @@ class RobotWorld:
     weights: FloatArray
     level_m: float
     level_rad: float
-    where: str
     log_likelihood: float
     converged: bool
 
@@ -158,8 +144,9 @@ def solve(stops: Stops) -> RobotWorld:
     Starts in closed form: rotations by M. Shah, *Solving the robot-world/hand-eye calibration
     problem using the Kronecker product*, Journal of Mechanisms and Robotics 5(3), 2013, eq. 18,
     then translations by linear least squares. Then the errors ``Log(B_i^-1 Z^-1 A_i X)``, moved
-    into the frame in which they are likeliest, follow a Student-t distribution with one level for
-    positions and one for rotations.
+    into the frame in which they are likeliest, the child's or that of its world (a target whose
+    pose a camera measured), follow a Student-t distribution with one level for positions and one
+    for rotations.
     """
     n_children, n_worlds = 1 + int(stops.child.max(initial=0)), 1 + int(stops.world.max(initial=0))
     counts = np.zeros((n_children, n_worlds), dtype=np.int64)
@@ -169,8 +156,15 @@ def solve(stops: Stops) -> RobotWorld:
             f"{len(stops)} stops are too few: at least {MIN_STOPS} of each sensor, with rotations "
             "about two axes, are necessary; 15 or more are better"
         )
-    starts = _starts(stops, counts)
-    return max((_in_one_frame(stops, *starts, where) for where in _WHERE), key=_likelihood)
+    starts, fits = _starts(stops, counts), []
+    for in_world in (False, True):
+        rough = _fit(stops, *starts, in_world, _OUTLIER_TAILS, _ROUGH_ROUNDS)
+        kept, weights = rough.weights > 0.0, np.zeros(len(stops))
+        Xs, Zs = rough.Ts_parent_child, rough.Ts_world_world
+        fit = _fit(stops[kept], Xs, Zs, in_world, _TAILS, _ROUNDS)
+        weights[kept] = fit.weights
+        fits.append(replace(fit, weights=weights))
+    return max(fits, key=_likelihood)
 
 
 def _likelihood(fit: RobotWorld) -> float:
@@ -178,16 +172,6 @@ def _likelihood(fit: RobotWorld) -> float:
     left_out = float(np.sum(fit.weights == 0.0))
     levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
     return fit.log_likelihood - 0.5 * left_out * (levels + _OUTLIER)
-
-
-def _in_one_frame(stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str) -> RobotWorld:
-    """Fit without outliers."""
-    rough = _fit(stops, Xs, Zs, where, _OUTLIER_TAILS, _ROUGH_ROUNDS)
-    kept, Xs, Zs = rough.weights > 0.0, rough.Ts_parent_child, rough.Ts_world_world
-    fit = _fit(stops.take(kept), Xs, Zs, where, _TAILS, _ROUNDS)
-    weights = np.zeros(len(stops))
-    weights[kept] = fit.weights
-    return replace(fit, weights=weights)
 
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
@@ -215,7 +199,7 @@ def _robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
     choices = [np.arange(len(stops))]
     if len(stops) > 2 * _START_STOPS:
         choices += [random.choice(len(stops), _START_STOPS, replace=False) for _ in range(_STARTS)]
-    candidates = [_closed_form(stops.take(choice)) for choice in choices]
+    candidates = [_closed_form(stops[choice]) for choice in choices]
     X, Z = (np.stack(each)[:, None] for each in zip(*candidates, strict=True))
     errors = se3.inverse(stops.Ts_world_child) @ se3.inverse(Z) @ stops.Ts_world_parent @ X
     return candidates[int(np.argmin(_logs_of_medians(errors)))]
@@ -229,24 +213,22 @@ def _starts(stops: Stops, counts: IntArray) -> tuple[FloatArray, FloatArray]:
     NotEnoughDataError
         If some of them share no stops, directly or through others, with the rest.
     """
-    Xs = np.zeros((counts.shape[0], 4, 4))
-    Zs = np.zeros((counts.shape[1], 4, 4))
-    child, world = (int(k) for k in np.unravel_index(np.argmax(counts), counts.shape))
-    of_pair = stops.take((stops.child == child) & (stops.world == world))
-    Xs[child], Zs[world] = _robust_start(of_pair)
-    has_X, has_Z = np.arange(len(Xs)) == child, np.arange(len(Zs)) == world
+    Xs, Zs = (np.zeros((count, 4, 4)) for count in counts.shape)
+    has_X, has_Z = (np.zeros(count, dtype=bool) for count in counts.shape)
     while not (has_X.all() and has_Z.all()):
-        # Pairs of which one side is known.
-        near = np.where(has_X[:, None] ^ has_Z, counts, 0)
+        # Pairs of which one side is known; first, of all.
+        near = np.where(has_X[:, None] ^ has_Z, counts, 0) if has_X.any() else counts
         if not near.any():
             raise NotEnoughDataError("the stops of some sensors or targets are tied to no others")
         child, world = (int(k) for k in np.unravel_index(np.argmax(near), near.shape))
-        pair = stops.take((stops.child == child) & (stops.world == world))
+        pair = stops[(stops.child == child) & (stops.world == world)]
         A, B = pair.Ts_world_parent, pair.Ts_world_child
         if has_X[child]:
             Zs[world] = _most_central(A @ Xs[child] @ se3.inverse(B))
-        else:
+        elif has_Z[world]:
             Xs[child] = _most_central(se3.inverse(A) @ Zs[world] @ B)
+        else:
+            Xs[child], Zs[world] = _robust_start(pair)
         has_X[child] = has_Z[world] = True
     return Xs, Zs
 
@@ -266,70 +248,49 @@ def _logs_of_medians(errors: FloatArray) -> FloatArray:
 
 
 def _linearise(
-    stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Errors (N, 6), their derivatives (N, 6, 12) by one X and one Z, and which values (N, 12) of
-    all X and Z these are.
+    stops: Stops, Xs: FloatArray, Zs: FloatArray, in_world: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (N, 6), in the frames of the children or of their worlds, and their derivatives
+    (N, 6, 12) by the X and the Z of each.
     """
-    n = len(stops)
     predicted = se3.inverse(Zs[stops.world]) @ stops.Ts_world_parent @ Xs[stops.child]
     errors = se3.log(se3.inverse(stops.Ts_world_child) @ predicted)
-    jacobian = np.concatenate(
-        [np.broadcast_to(np.eye(6), (n, 6, 6)), -se3.adjoint(se3.inverse(predicted))], axis=2
-    )
-    if where == "child_world":
+    by_X = np.broadcast_to(np.eye(6), (len(stops), 6, 6))
+    jacobian = np.concatenate([by_X, -se3.adjoint(se3.inverse(predicted))], axis=2)
+    if in_world:
         moved = se3.adjoint(stops.Ts_world_child)
         errors, jacobian = (moved @ errors[..., None])[..., 0], moved @ jacobian
-    blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
-    columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
-    return errors, jacobian, columns
-
-
-def _normal(
-    errors: FloatArray, jacobian: FloatArray, columns: IntArray, scale: FloatArray, n_values: int
-) -> tuple[FloatArray, FloatArray]:
-    """Information (n_values, n_values), and the gradient (N, 12) of each stop, of scaled errors."""
-    rows, errors = scale[..., None] * jacobian, scale * errors
-    information = np.zeros((n_values, n_values))
-    pairs, of_pair = np.unique(columns[:, [0, 6]], axis=0, return_inverse=True)
-    for k in range(len(pairs)):
-        which = np.flatnonzero(of_pair.ravel() == k)
-        own, values = rows[which].reshape(-1, 12), columns[which[0]]
-        information[np.ix_(values, values)] += own.T @ own
-    return information, np.einsum("nki,nk->ni", rows, errors)
-
-
-def _added(gradients: FloatArray, columns: IntArray, n_values: int) -> FloatArray:
-    """Sum (n_values,) of the gradients of stops."""
-    return np.asarray(np.bincount(columns.ravel(), gradients.ravel(), n_values), dtype=float)
-
-
-def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) -> float:
-    """Factor on the covariance, at least 1, for errors that last from stop to stop."""
-    n_parts = min(_PARTS, len(columns))
-    parts = np.array_split(np.arange(len(columns)), n_parts)
-    sums = np.stack([_added(gradients[k], columns[k], len(information)) for k in parts])
-    spread = float(np.trace(np.linalg.pinv(information, hermitian=True) @ (sums.T @ sums)))
-    return max(1.0, spread / (len(information) * (1.0 - 1.0 / n_parts)))
+    return errors, jacobian
 
 
 def _fit(
-    stops: Stops, Xs: FloatArray, Zs: FloatArray, where: str, tails: float, rounds: int
+    stops: Stops, Xs: FloatArray, Zs: FloatArray, in_world: bool, tails: float, rounds: int
 ) -> RobotWorld:
     """Weights, levels and Gauss-Newton steps in turn."""
     n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
+    blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
+    columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
+    cells = n_values * columns[:, :, None] + columns[:, None]
+
+    def information_of(rows: FloatArray) -> FloatArray:
+        products = np.swapaxes(rows, 1, 2) @ rows
+        whole = np.bincount(cells.ravel(), products.ravel(), n_values**2)
+        return whole.reshape(n_values, n_values)
+
     # Values that the errors are fitted with make them smaller.
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)
     weights, converged = np.ones(n), False
     for _ in range(rounds):
-        linear = errors, _, columns = _linearise(stops, Xs, Zs, where)
+        errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         variances = np.maximum(weights @ squared / n_free, _SMALLEST_VARIANCE)
         distance = squared @ (1.0 / variances)
         weights = (tails + 6.0) / (tails + distance)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
-        information, gradients = _normal(*linear, scale, n_values)
-        gradient = _added(gradients, columns, n_values)
+        rows = scale[..., None] * jacobian
+        information = information_of(rows)
+        gradients = np.einsum("nki,nk->ni", rows, scale * errors)
+        gradient = np.bincount(columns.ravel(), gradients.ravel(), n_values)
         step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0]
         steps = step.reshape(-1, 6)
         Xs, Zs = Xs @ se3.exp(steps[: len(Xs)]), Zs @ se3.exp(steps[len(Xs) :])
@@ -339,24 +300,25 @@ def _fit(
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
     # modeling using the t distribution*, JASA 84, 1989, section 4.
     share = (tails + 6.0) / (tails + 8.0)
-    scale = np.sqrt(np.full((n, 1), share) * np.repeat(1.0 / variances, 3))
-    fisher, _ = _normal(*linear, scale, n_values)
+    fisher = information_of(np.sqrt(share * np.repeat(1.0 / variances, 3))[:, None] * jacobian)
     weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), n_values // 6) / _UNKNOWN**2)
-    covariance = np.linalg.inv(fisher + weak)
     log_likelihood = (
         -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
     )
-    lasting = _lasting(gradients, columns, information)
-    level_m, level_rad = (float(level) for level in np.sqrt(variances))
+    # Errors that last from stop to stop.
+    parts = np.array_split(np.arange(n), min(_PARTS, n))
+    sums = [np.bincount(columns[k].ravel(), gradients[k].ravel(), n_values) for k in parts]
+    inverse = np.linalg.pinv(information, hermitian=True)
+    spread = float(np.einsum("ki,ij,kj->", sums, inverse, sums))
+    lasting = max(1.0, spread / (n_values * (1.0 - 1.0 / len(parts))))
     return RobotWorld(
-        Xs,
-        Zs,
-        np.asarray(covariance * lasting, dtype=float),
-        fisher,
-        np.asarray(np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0), dtype=float),
-        level_m,
-        level_rad,
-        where,
-        float(log_likelihood),
-        converged,
+        Ts_parent_child=Xs,
+        Ts_world_world=Zs,
+        covariance=np.linalg.inv(fisher + weak) * lasting,
+        information=fisher,
+        weights=np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0),
+        level_m=float(np.sqrt(variances[0])),
+        level_rad=float(np.sqrt(variances[1])),
+        log_likelihood=float(log_likelihood),
+        converged=converged,
     )

@@ -31,9 +31,8 @@ def form_of(pairs, solution):
 
 def false_minimum(Q, T_parent_child):
     """The highest local minimum from rotations by pi beside the global one, and how much higher."""
-    minimum = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
-    worst = int(np.argmax(minimum.value))
-    T = minimum.T_parent_child[worst]
+    Ts, values, _, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
+    T = Ts[np.argmax(values)]
     return T, float(quadratic_form.decrease(Q, T, T_parent_child))
 
 
