@@ -27,19 +27,15 @@ except ImportError as error:
 _Expression: TypeAlias = Any
 
 _IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-# Rotation vector and translation to start from; at zero the rotation angle has no derivative.
-_START = np.repeat([1e-6, 0.0], 3)
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
     """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
     pose = casadi.MX.sym("pose", 6)
     problem = {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))}
-    solver = casadi.nlpsol("dnl", "ipopt", problem, _IPOPT_OPTIONS)
-    answer = solver(x0=_START)
-    T_parent_child = _transform(answer["x"])
+    T_parent_child, settled, steps = _minimum(problem, 0)
     objective = float(dnl.pair_costs(pairs, T_parent_child).sum())
-    return _solution(solver, T_parent_child, objective, np.ones(len(pairs)))
+    return Solution(T_parent_child, objective, settled, steps, np.ones(len(pairs)))
 
 
 def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
@@ -55,17 +51,28 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
         "f": casadi.dot(alpha, costs) + threshold * casadi.sum1(1 - alpha),
         "g": casadi.sum1(alpha),
     }
-    solver = casadi.nlpsol("dnlo", "ipopt", problem, _IPOPT_OPTIONS)
-    answer = solver(
-        x0=np.r_[_START, np.ones(n_pairs)],
+    T_parent_child, settled, steps = _minimum(
+        problem,
+        n_pairs,
         lbx=np.r_[np.full(6, -np.inf), np.zeros(n_pairs)],
         ubx=np.r_[np.full(6, np.inf), np.ones(n_pairs)],
         lbg=floor,
         ubg=np.inf,
     )
-    T_parent_child = _transform(answer["x"])
     weights, objective = dnlo.truncate(dnl.pair_costs(pairs, T_parent_child), threshold, floor)
-    return _solution(solver, T_parent_child, float(objective), weights)
+    return Solution(T_parent_child, float(objective), settled, steps, weights)
+
+
+def _minimum(
+    problem: dict[str, _Expression], n_weights: int, **bounds: Any
+) -> tuple[FloatArray, bool, int]:
+    """X (4, 4), whether Ipopt settled, and its iterations, from the identity and weights 1."""
+    solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
+    # At zero the rotation angle has no derivative.
+    answer = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
+    pose, stats = np.array(answer["x"]).ravel()[:6], solver.stats()
+    T_parent_child = se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
+    return T_parent_child, bool(stats["success"]), int(stats["iter_count"])
 
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
@@ -95,17 +102,3 @@ def _rodrigues(rotation_vector: _Expression) -> _Expression:
     angle = casadi.norm_2(rotation_vector)
     cross = casadi.skew(rotation_vector / angle)
     return casadi.SX.eye(3) + casadi.sin(angle) * cross + (1 - casadi.cos(angle)) * cross @ cross
-
-
-def _transform(x: _Expression) -> FloatArray:
-    """X (4, 4) of the unknowns."""
-    pose = np.array(x).ravel()[:6]
-    return se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
-
-
-def _solution(
-    solver: _Expression, T_parent_child: FloatArray, objective: float, weights: FloatArray
-) -> Solution:
-    stats = solver.stats()
-    settled, iterations = bool(stats["success"]), int(stats["iter_count"])
-    return Solution(T_parent_child, objective, settled, iterations, weights)

@@ -16,8 +16,9 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers.solution import Solution
 
-# Singular values of the translation problem below this share of the largest are rounding.
-_RANK_TOLERANCE = 1e-12
+# Singular values below this share of the largest are rounding: directions that the motion does not
+# reveal; they are not changed.
+RANK_TOLERANCE = 1e-12
 
 
 def solve(pairs: MotionPairs) -> Solution:
@@ -29,7 +30,7 @@ def solve(pairs: MotionPairs) -> Solution:
     # (R_A - I) t = R t_B - t_A; 0 along directions that no rotation reveals.
     moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
     target = pairs.Ts_childi_childj[:, :3, 3] @ rotation.T - pairs.Ts_parenti_parentj[:, :3, 3]
-    found = np.linalg.lstsq(moved.reshape(-1, 3), target.ravel(), rcond=_RANK_TOLERANCE)
+    found = np.linalg.lstsq(moved.reshape(-1, 3), target.ravel(), rcond=RANK_TOLERANCE)
     T_parent_child = se3.from_rotation_translation(rotation, found[0])
     objective = squared_translation_residual(pairs, T_parent_child)
     return Solution(T_parent_child, objective, True, 1, np.ones(len(pairs)))

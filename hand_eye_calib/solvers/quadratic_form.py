@@ -40,9 +40,9 @@ def _tables() -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     each tangent (rho, phi). What X.ravel() times gives x of X D for all six, then x (16, 91).
     """
     x_in_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
-    entry = np.zeros((16, DIMENSION))  # X[i, j] = entry[i, j] @ x
-    entry[x_in_T, np.arange(DIMENSION)] = 1.0
-    entry = entry.reshape(4, 4, DIMENSION)
+    flat = np.zeros((16, DIMENSION))
+    flat[x_in_T, np.arange(DIMENSION)] = 1.0
+    entry = flat.reshape(4, 4, DIMENSION)  # X[i, j] = entry[i, j] @ x
     of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry)
     of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3])
     residual = np.concatenate([each.reshape(12, 12, DIMENSION) for each in (of_parent, of_child)])
@@ -87,13 +87,8 @@ def coefficients(pairs: MotionPairs) -> FloatArray:
 
 def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
     """Costs ``|A X - X B|_F^2`` (K,) at one X, from the :func:`coefficients` of the pairs."""
-    residual = _RESIDUAL @ T_parent_child.ravel()[_X_IN_T]
-    found = np.empty(len(coefficients))
-    for start in range(0, len(coefficients), _SUMMED_BLOCK):
-        block = slice(start, start + _SUMMED_BLOCK)
-        residuals = coefficients[block] @ residual
-        np.einsum("ki,ki->k", residuals, residuals, out=found[block])
-    return found
+    residuals = coefficients @ (_RESIDUAL @ T_parent_child.ravel()[_X_IN_T])
+    return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
 
 
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """The solvers of AX = XB by the name of their method, with the options they take."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
@@ -13,21 +13,16 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, quadratic_form, zhuang
 from hand_eye_calib.solvers.solution import Solution
 
-# ``solve(pairs, *rejection)``; for rejection see Method.rejection.
-_SOLVE: dict[str, Callable[..., Solution]] = {
-    "dnlo": dnlo.solve,
-    "dnl": dnl.solve,
-    "park": park.solve,
-    "taylor": park.solve,
-    "zhuang": zhuang.solve,
-    "ali": ali.solve,
-}
-
-# ``solve_without(pairs, solution, left_out, *rejection)`` of the methods whose cost is the
-# quadratic form: they are quicker from a solution than from nothing.
-_SOLVE_WITHOUT: dict[str, Callable[..., FloatArray]] = {
-    "dnlo": dnlo.solve_without,
-    "dnl": dnl.solve_without,
+# Each has ``solve(pairs, *rejection)``; for rejection see Method.rejection. Those whose cost is the
+# quadratic form have ``solve_without(pairs, solution, left_out, *rejection)``, too: it is quicker
+# from a solution than from nothing.
+_SOLVERS: dict[str, ModuleType] = {
+    "dnlo": dnlo,
+    "dnl": dnl,
+    "park": park,
+    "taylor": park,
+    "zhuang": zhuang,
+    "ali": ali,
 }
 
 
@@ -58,8 +53,8 @@ class Method:
     backend: str = CalibratorConfig.backend
 
     def __post_init__(self) -> None:
-        if self.name not in _SOLVE:
-            raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVE)}")
+        if self.name not in _SOLVERS:
+            raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}")
         METHODS[self.name].require_backend(self.backend)
 
     @property
@@ -80,18 +75,19 @@ class Method:
             raise NotEnoughDataError(
                 "no motion pairs: there are too few common poses for the chosen reference"
             )
-        if self.backend == "fast":
-            return _SOLVE[self.name](pairs, *self.rejection)
-        from hand_eye_calib.solvers import ipopt  # takes a second
+        solve = _SOLVERS[self.name].solve
+        if self.backend == "ipopt":
+            from hand_eye_calib.solvers import ipopt  # takes a second
 
-        solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
-        return solve(pairs, *self.rejection)
+            solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
+        solution: Solution = solve(pairs, *self.rejection)
+        return solution
 
     def proved_global(self, pairs: MotionPairs, solution: Solution) -> str:
         """Whether a solution is proved to be the global minimum over the pairs it counts: "yes",
         "no", or "not tried" for methods that have no proof.
         """
-        if self.name not in _SOLVE_WITHOUT:
+        if self.name not in ("dnl", "dnlo"):
             return "not tried"
         Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
         return "yes" if certificate.is_global(Q, solution.T_parent_child) else "no"
@@ -102,6 +98,7 @@ class Method:
         """Answers (B, 4, 4) near a solution for all K pairs, without those in each row of
         ``left_out`` (B, K), for resampling.
         """
-        if self.name in _SOLVE_WITHOUT:
-            return _SOLVE_WITHOUT[self.name](pairs, solution, left_out, *self.rejection)
+        if self.name in ("dnl", "dnlo"):
+            solver = _SOLVERS[self.name]
+            return np.asarray(solver.solve_without(pairs, solution, left_out, *self.rejection))
         return np.stack([self.solve(pairs[~row]).T_parent_child for row in left_out])

@@ -76,8 +76,8 @@ class Stops:
         return len(self.child)
 
     def __getitem__(self, which: IntArray | BoolArray) -> "Stops":
-        columns = self.Ts_world_parent, self.Ts_world_child, self.child, self.world
-        return Stops(*(each[which] for each in columns))
+        A, B = self.Ts_world_parent[which], self.Ts_world_child[which]
+        return Stops(A, B, self.child[which], self.world[which])
 
 
 @dataclass(frozen=True)
@@ -263,6 +263,16 @@ def _linearise(
     return errors, jacobian
 
 
+def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) -> float:
+    """Factor on the covariance, at least 1, for errors that last from stop to stop."""
+    n, n_values = len(columns), len(information)
+    parts = np.array_split(np.arange(n), min(_PARTS, n))
+    sums = [np.bincount(columns[k].ravel(), gradients[k].ravel(), n_values) for k in parts]
+    inverse = np.linalg.pinv(information, hermitian=True)
+    spread = float(np.einsum("ki,ij,kj->", sums, inverse, sums))
+    return max(1.0, spread / (n_values * (1.0 - 1.0 / len(parts))))
+
+
 def _fit(
     stops: Stops, Xs: FloatArray, Zs: FloatArray, in_world: bool, tails: float, rounds: int
 ) -> RobotWorld:
@@ -274,7 +284,7 @@ def _fit(
 
     def information_of(rows: FloatArray) -> FloatArray:
         products = np.swapaxes(rows, 1, 2) @ rows
-        whole = np.bincount(cells.ravel(), products.ravel(), n_values**2)
+        whole = np.bincount(cells.ravel(), products.ravel(), n_values**2).astype(float)
         return whole.reshape(n_values, n_values)
 
     # Values that the errors are fitted with make them smaller.
@@ -305,16 +315,11 @@ def _fit(
     log_likelihood = (
         -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
     )
-    # Errors that last from stop to stop.
-    parts = np.array_split(np.arange(n), min(_PARTS, n))
-    sums = [np.bincount(columns[k].ravel(), gradients[k].ravel(), n_values) for k in parts]
-    inverse = np.linalg.pinv(information, hermitian=True)
-    spread = float(np.einsum("ki,ij,kj->", sums, inverse, sums))
-    lasting = max(1.0, spread / (n_values * (1.0 - 1.0 / len(parts))))
+    covariance = np.linalg.inv(fisher + weak) * _lasting(gradients, columns, information)
     return RobotWorld(
         Ts_parent_child=Xs,
         Ts_world_world=Zs,
-        covariance=np.linalg.inv(fisher + weak) * lasting,
+        covariance=np.asarray(covariance, dtype=float),
         information=fisher,
         weights=np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0),
         level_m=float(np.sqrt(variances[0])),

@@ -28,16 +28,10 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import park
 from hand_eye_calib.solvers.solution import Solution
 
-_MAX_ITERATIONS = 500
-_STEP_TOLERANCE = 1e-8
-
-# Singular values of the Jacobian below this share of the largest are directions that the motion
-# does not reveal; they are not changed.
-_RANK_TOLERANCE = 1e-12
+_MAX_ITERATIONS, _STEP_TOLERANCE = 500, 1e-8
 
 # A minimum is lower by at least this share of the cost, and by residuals of this share of the data.
-_LOWER = 1e-6
-_ROUNDING = 1e-12
+_LOWER, _ROUNDING = 1e-6, 1e-12
 
 
 def solve(pairs: MotionPairs) -> Solution:
@@ -67,7 +61,7 @@ def _gauss_newton(
         iterations += 1
         products, derivative = _products(parameters)
         rows, values = residual_of_products @ derivative, -residual_of_products @ products
-        step = np.linalg.lstsq(rows, values, rcond=_RANK_TOLERANCE)[0]
+        step = np.linalg.lstsq(rows, values, rcond=park.RANK_TOLERANCE)[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
     residuals = residual_of_products @ _products(parameters)[0]
@@ -106,7 +100,7 @@ def _axes(rotation: FloatArray) -> FloatArray:
     """Unit rotation axes (K, 3); (0, 0, 1) without rotation."""
     rotvec = se3.rotation_log(rotation)
     angle = np.linalg.norm(rotvec, axis=1, keepdims=True)
-    return np.where(angle > 0.0, rotvec / np.where(angle > 0.0, angle, 1.0), [0.0, 0.0, 1.0])
+    return np.divide(rotvec, angle, np.tile([0.0, 0.0, 1.0], (len(angle), 1)), where=angle > 0.0)
 
 
 def _rotation(z: FloatArray) -> FloatArray:
