@@ -109,7 +109,7 @@ def measured_node(report, arguments):
     to end.
     """
     from hand_eye_calib.live import cycle
-    from hand_eye_calib.live.processes import SolvingProcess
+    from hand_eye_calib.live.solving import SolvingProcess
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
     from hand_eye_calib.ros.inputs import TopicInput
     from hand_eye_calib.ros.node import main

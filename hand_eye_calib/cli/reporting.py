@@ -88,15 +88,14 @@ def save_text(path: Path, text: str) -> None:
 def write_session() -> None:
     """Write the pages of a session into the directory that is the only argument of this process.
 
-    It reads the result from standard input, as ``live/saving.py`` writes it. The results of
-    further child sensors go to standard output.
+    It reads the result from standard input, as ``live/saving.py`` writes it.
     """
     os.nice(15)  # every other program goes first
     result: SessionResult = pickle.load(sys.stdin.buffer)
     directory = Path(sys.argv[1])
     try:
         if result.others:
-            pickle.dump(_session_rig(directory / "rig", result), sys.stdout.buffer)
+            _session_rig(directory / "rig", result)
         if result.with_report:
             from hand_eye_calib.engine.run import review
             from hand_eye_calib.io.results import save_result
@@ -110,9 +109,8 @@ def write_session() -> None:
         sys.exit(fail(error, 1))
 
 
-def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
-    """Solve for all sensors of a session together, and write the files and the page; returns the
-    results of the further child sensors.
+def _session_rig(directory: Path, result: "SessionResult") -> None:
+    """Solve for all sensors of a session together, and write the files and the page.
 
     A time offset and a scale in numbers are the child's, which has them; the others have none.
     """
@@ -140,4 +138,3 @@ def _session_rig(directory: Path, result: "SessionResult") -> list[Calibration]:
     inputs = {**result.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
     write_report(directory, lambda: rendered_rig(rig, rig.sensors))
-    return [*rig.calibrations[1:]]

@@ -7,16 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.assessment.excitation import Excitation, what_is_missing
+from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.log import ONCE_S, NodeLog
-from hand_eye_calib.live.processes import SolvingProcess
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.solving import Answer, Checked, Failure, FailureKind, Job
+from hand_eye_calib.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
+from hand_eye_calib.live.state import (
+    Broadcast,
+    ExtrinsicState,
+    Level,
+    ProgressState,
+    ResultState,
+    by_axis,
+)
 from hand_eye_calib.live.stream_checks import StreamChecks
-from hand_eye_calib.results.calibration import Calibration, SolveStatus
+from hand_eye_calib.plain import plain
+from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
+from hand_eye_calib.results.records import Comparison
 from hand_eye_calib.session.goal import Goal
 from hand_eye_calib.text import amount
 
@@ -26,8 +35,8 @@ OnSolved = Callable[[bool, str], None]
 # The line about the result, and the sentence that says what to do now, are logged so often (s).
 _SAID_EVERY_S = 60.0
 
-# What the motion does not determine is worth a warning after so many seconds of it.
-_ENOUGH_MOTION_S = 30.0
+# The streams are checked at most this often (s), which costs a second or two each time.
+_CHECK_PERIOD_S = 30.0
 
 
 class SolveCycle:
@@ -52,12 +61,9 @@ class SolveCycle:
     is_solving : bool
     result : Calibration or None
         The session's result, which is told, published, saved and broadcast: the newest usable one;
-        once the goal is reached, the one kept, whose warnings say why the newest is not. The
-        newest was found at ``solved_at_s`` (steady time).
+        once the goal is reached, the one kept, whose warnings say why the newest is not.
     snapshot : Snapshot or None
         The poses and options that gave that result.
-    seen, failure
-        How the sensors have moved, and what went wrong, as of the last solve.
     """
 
     def __init__(
@@ -70,7 +76,7 @@ class SolveCycle:
         targets: Sequence[float],
     ) -> None:
         self.is_solving = False
-        self.checks, self.goal = StreamChecks(), Goal(targets)
+        self.checks, self.goal = StreamChecks(log), Goal(targets)
         self._session, self._log = session, log
         self._complete, self._publish = complete, publish
         self._rest_until_s = 0.0
@@ -83,28 +89,22 @@ class SolveCycle:
         """Begin a new session: no result yet."""
         self.result: Calibration | None = None
         self.snapshot: Snapshot | None = None
-        self.solved_at_s: float | None = None
-        self.seen: Excitation | None = None
-        self.failure: Failure | None = None
+        self._solved_at_s = 0.0
+        self._seen = NO_MOTION
+        self._failure: Failure | None = None
         self._certain: dict[str, Any] = {}
         self._told: tuple[str, ...] = ()
+        self._is_unchecked, self._check_due_s = False, 0.0
         self.checks.restart()
         self.goal.restart()
 
     def follow(self, targets: Sequence[float]) -> None:
-        """Options have changed: start over with a goal of these targets."""
+        """Options have changed: start over with a goal of these targets, and check at once."""
         self.goal = Goal(targets)
         self._certain, self._told = {}, ()
-        self.checks.hasten()
+        self._is_unchecked, self._check_due_s = True, 0.0
 
-    @property
-    def has_valid_result(self) -> bool:
-        """Whether there is a result with all six degrees of freedom."""
-        return self.result is not None and self.result.status is SolveStatus.OK
-
-    def age_s(self, steady_s: float) -> float:
-        """Age of the result at a steady time."""
-        return 0.0 if self.solved_at_s is None else steady_s - self.solved_at_s
+    # ------------------------------------------------------------------ solving
 
     def ask(self, on_solved: OnSolved) -> None:
         """Solve as soon as possible."""
@@ -115,7 +115,7 @@ class SolveCycle:
     def start_if_due(self) -> None:
         """Solve if there is something new and the last solve has left the processor a rest."""
         now_s = time.monotonic()
-        has_work = self._session.has_new_poses or self.checks.is_due(now_s)
+        has_work = self._session.has_new_poses or self._must_check(now_s)
         if has_work and not self.is_solving and now_s >= self._rest_until_s:
             self._start()
 
@@ -136,17 +136,20 @@ class SolveCycle:
         for answer in self._process.answers():
             self.conclude(answer)
 
+    def _must_check(self, now_s: float) -> bool:
+        return self._is_unchecked and now_s >= self._check_due_s
+
     def _start(self) -> None:
-        self.is_solving = True
-        self.checks.has_new_poses |= self._session.has_new_poses
+        self.is_solving, now_s = True, time.monotonic()
+        self._is_unchecked |= self._session.has_new_poses
         self._session.has_new_poses = False
         self._asked_in_flight, self._asked = self._asked, []
-        now_s = time.monotonic()
-        check = self.checks.is_due(now_s)
-        if check:
-            self.checks.begin(now_s)
+        if check := self._must_check(now_s):
+            self._is_unchecked, self._check_due_s = False, now_s + _CHECK_PERIOD_S
         self._submitted = self._session.calibrator.snapshot()
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
+
+    # ------------------------------------------------------------------ answers
 
     def conclude(self, answer: Answer) -> tuple[bool, str]:
         """Take an answer; whether it is good, and a line about it."""
@@ -154,67 +157,57 @@ class SolveCycle:
             return False, "the session was reset during the solve: its result is dropped"
         # Solves that take longer than their period leave the processor free for half the time.
         self._rest_until_s = time.monotonic() + answer.seconds
-        self.seen, self.failure = answer.seen, answer.failure
+        self._seen, self._failure = answer.seen, answer.failure
         self._session.calibrator.adopt(answer.time_offset)
+        if answer.options:
+            self._certain, self._told = self._certain | answer.options, answer.told
         if answer.check is not None:
-            self._take_check(answer.check)
+            self.checks.take(answer.check)
+        elif answer.is_checked:
+            self._check_due_s = 0.0
         if answer.failure is not None:
-            missing = what_is_missing(self.seen) if self.seen and self.seen.n_poses else ""
-            self.goal.wait(missing or answer.failure.what)
-            return False, self._report_failure(answer.failure)
+            text = self._report(answer.failure)
+            if answer.calibration is None:
+                missing = what_is_missing(self._seen) if self._seen.n_poses else ""
+                self.goal.wait(missing or answer.failure.what)
+                return False, text
         assert answer.calibration is not None
         told = tuple(dict.fromkeys((*self._told, *answer.calibration.warnings)))
         newest = self._with_findings(replace(answer.calibration, warnings=told))
         if newest.status.failure:
-            return False, self._answer_with(newest)
+            return False, self._say(newest)
         return self._take(self._complete(newest))
-
-    def _take_check(self, checked: Checked) -> None:
-        if checked.failure is not None:
-            self._log.warning(f"the streams cannot be checked: {checked.failure.what}")
-            return
-        if checked.options:
-            self._certain, self._told = self._certain | checked.options, checked.told
-        new, gone = self.checks.take(checked.result, time.monotonic())
-        for line in new:
-            self._log.warning(line)
-        for line in gone:
-            self._log.info(line)
 
     def _take(self, newest: Calibration) -> tuple[bool, str]:
         """Take a usable calibration: it becomes the session's result, unless a better one that has
         reached the goal is kept.
         """
-        assert self.seen is not None
         was_done = self.goal.progress.done
-        progress = self.goal.add(newest, self.seen, self.checks.faults())
+        progress = self.goal.add(newest, self._seen, self.checks.faults())
         result = self.goal.best or newest
         if result is newest:
             self.snapshot = with_options(self._submitted, self._certain)
         else:
             result = replace(result, warnings=(*result.warnings, _why_kept(result, newest)))
-        self.result, self.solved_at_s = self._with_findings(result), time.monotonic()
+        self.result, self._solved_at_s = self._with_findings(result), time.monotonic()
         self._publish(self.result)
         if not progress.is_faulty and progress.sentence:
             write = self._log.warning if progress.will_not_get_there else self._log.info
             write(progress.sentence, _SAID_EVERY_S, key=f"now {progress.done}")
         every_s = _SAID_EVERY_S if progress.done == was_done else 0.0
-        return self.result.status is SolveStatus.OK, self._answer_with(self.result, every_s)
+        return self.result.status is SolveStatus.OK, self._say(self.result, every_s)
 
-    def _answer_with(self, calibration: Calibration, every_s: float = _SAID_EVERY_S) -> str:
+    def _say(self, calibration: Calibration, every_s: float = _SAID_EVERY_S) -> str:
         """A line about a calibration with its reasons and warnings. What is new of that is logged:
         the reasons once the motion has had its chance, as the progress says what to do before.
         """
-        text = describe(calibration)
+        text, progress = describe(calibration), self.goal.progress
         self._log.info(text, every_s, key="result")
-        progress, seen = self.goal.progress, self.seen
-        is_late = seen is not None and seen.motion_s >= _ENOUGH_MOTION_S
-        is_final = progress.done or progress.will_not_get_there or bool(calibration.status.failure)
+        is_final = progress.done or progress.will_not_get_there or calibration.status.failure
         said = []
         for reason in calibration.reasons:
             said.append(f"{reason.sentence}; {reason.what_to_do}")
-            is_due = is_final or (is_late and reason.rule == "unobservable")
-            if is_due and not reason.is_finding:  # which are in the log already
+            if is_final and not reason.is_finding:  # which are in the log already
                 self._log.warning(f"{reason.verdict.value}: {said[-1]}")
         for warning in calibration.warnings:
             self._log.warning(warning)
@@ -225,16 +218,91 @@ class SolveCycle:
             return calibration  # which has its own
         return replace(calibration, findings=self.checks.findings)
 
-    def _report_failure(self, failure: Failure) -> str:
-        if failure.kind is FailureKind.NOT_ENOUGH_DATA:
-            self._log.info(f"cannot solve yet: {failure.what}", ONCE_S)
-        elif failure.kind is FailureKind.UNUSABLE:
-            self._log.warning(f"cannot solve: {failure.what}")
-        else:
+    def _report(self, failure: Failure) -> str:
+        if failure.details:
             text = f"the solve failed unexpectedly: {failure.what}"
-            self._log.error("\n".join(filter(None, (text, failure.details))))
+            self._log.error(f"{text}\n{failure.details}")
             return f"{text}; see the log"
+        if failure.is_early:
+            self._log.info(f"cannot solve yet: {failure.what}", ONCE_S)
+        else:
+            self._log.warning(f"cannot solve: {failure.what}")
         return failure.what
+
+    # -------------------------------------------------------------------- state
+
+    def extrinsic_state(
+        self, accepts_poses: bool, tf_static: tuple[Broadcast, str]
+    ) -> ExtrinsicState:
+        """The result: what is missing, how good it is, how it was found. ``tf_static`` is what is
+        done about that topic, and the reason.
+        """
+        seen, result = self._seen, self.result
+        level, text = self._judged(accepts_poses, tf_static)
+        return ExtrinsicState(
+            level=level,
+            text=text,
+            is_solving=self.is_solving,
+            n_poses=seen.n_poses,
+            path_m=seen.distance,
+            motion_s=seen.motion_s,
+            has_vehicle_axes=seen.has_vehicle_axes,
+            rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True)),
+            tf_static=tf_static[0],
+            tf_static_reason=tf_static[1],
+            result=_result_state(result, time.monotonic() - self._solved_at_s) if result else None,
+        )
+
+    def _judged(self, accepts_poses: bool, tf_static: tuple[Broadcast, str]) -> tuple[Level, str]:
+        """Level and message: the gravest that applies."""
+        result, failure = self.result, self._failure
+        if failure is not None and failure.details:
+            return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
+        if not accepts_poses:
+            return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
+        if result is None:
+            said = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
+            said += [failure.what] if failure else []
+            return Level.WARN, "; ".join(said) or "no result yet"
+        if tf_static[0] is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
+            return Level.WARN, f"publish_tf is refused: {tf_static[1]}"
+        if failure is not None:
+            return Level.WARN, failure.what
+        return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
+
+    def progress_state(self, why_not_compared: str) -> ProgressState:
+        """Each axis against its target, the seconds left, and what to do now; WARN before the first
+        result, and while the motion is of no use for an axis that lacks. ``why_not_compared`` with
+        what is installed: empty if that was not asked for.
+        """
+        progress, result = self.goal.progress, self.result
+        comparison = result.comparison if result is not None else None
+        if comparison is None and why_not_compared:
+            comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
+        return ProgressState(
+            level=Level.WARN if result is None or progress.will_not_get_there else Level.OK,
+            text=progress.sentence,
+            has_result=result is not None,
+            progress=progress,
+            comparison=comparison,
+        )
+
+
+def _result_state(result: Calibration, age_s: float) -> ResultState:
+    T, sigmas = result.T_parent_child, result.sigmas_printed
+    pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
+    same = ("parent_frame", "child_frame", "warnings", "n_poses", "time_offset_s",
+            "time_offset_sigma_s", "scale", "scale_sigma")  # fmt: skip
+    return ResultState(
+        **{name: getattr(result, name) for name in same},
+        verdict=result.verdict.value,
+        status=result.status.value,
+        reasons=tuple(f"{each.sentence}: {each.what_to_do}" for each in result.reasons),
+        pose=by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
+        pose_sigma=by_axis(sigmas),
+        inlier_share=result.n_inliers / max(result.n_pairs, 1),
+        age_s=age_s,
+    )
 
 
 def _why_kept(kept: Calibration, newest: Calibration) -> str:
@@ -257,14 +325,12 @@ def describe(calibration: Calibration) -> str:
     """One line for a log: whose pose in whose frame, how good, from how much."""
     xyz, rpy = _pose_in_words(calibration)
     sigmas = calibration.sigmas_printed
-    sigmas_mm = ", ".join(_sigma(1000 * value, 1) for value in sigmas[:3])
-    sigmas_deg = ", ".join(_sigma(value, 3) for value in np.degrees(sigmas[3:]))
-    backend = " ipopt" * (calibration.backend == "ipopt")
+    mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
+    deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
     return (
         f"{calibration.headline}. {calibration.child_frame} in {calibration.parent_frame}: "
-        f"xyz = ({xyz}) m +/- ({sigmas_mm}) mm, rpy = ({rpy}) deg +/- ({sigmas_deg}) deg; "
-        f"status {calibration.status.value}; "
-        f"{calibration.method} {calibration.reference}{backend}: "
+        f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
+        f"status {calibration.status.value}; {calibration.method} {calibration.reference}: "
         f"{calibration.n_poses} poses, {calibration.n_pairs} pairs, "
         f"{calibration.n_inliers} inliers"
     )
@@ -276,7 +342,3 @@ def _pose_in_words(calibration: Calibration) -> tuple[str, str]:
         ", ".join(f"{value:.4f}" for value in calibration.T_parent_child[:3, 3]),
         ", ".join(f"{value:.3f}" for value in angles),
     )
-
-
-def _sigma(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if np.isfinite(value) else "unknown"

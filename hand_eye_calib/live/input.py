@@ -16,15 +16,15 @@ from hand_eye_calib.live.stamp_guard import Judgement, StampGuard
 from hand_eye_calib.live.state import InputState, Level
 
 # An input without a message for so long is silent, and a bad message is reported for so long (s).
-STALE_AFTER_S, BAD_INPUT_FOR_S = 2.0, 10.0
+_SILENT_AFTER_S, _BAD_INPUT_FOR_S = 2.0, 10.0
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
 # A message may be overtaken by so many others of its publisher; farther back, the publisher was
 # started again.
 _MOST_OVERTAKEN = 1000
-# Reports (one a second) over which rates and shares are taken, and newest delays.
-_REPORTS, _DELAYS = 10, 200
+# Reports (one a second) over which rates and shares are taken.
+_REPORTS = 10
 
 
 class PoseInput:
@@ -38,15 +38,13 @@ class PoseInput:
         Where they come from, for messages.
     session : LiveSession
     log : NodeLog
-    clock_ns : callable
-        The node's clock; 0 while it does not run.
     on_jump_back : callable
         Called with this input when its stamps have jumped back: a new session has to begin.
 
     Attributes
     ----------
     is_enabled : bool
-        Whether poses are taken; ``ignored`` counts those that came while it was not.
+        Whether poses are taken.
     problem : str
         Why the topic is not used; empty if it is.
     """
@@ -57,21 +55,17 @@ class PoseInput:
         topic: str,
         session: LiveSession,
         log: NodeLog,
-        clock_ns: Callable[[], int],
         on_jump_back: Callable[["PoseInput"], None],
     ) -> None:
         self.name, self.topic = name, topic
-        self.is_enabled, self.problem, self.ignored = True, "", 0
+        self.is_enabled, self.problem, self._sensor_frame = True, "", ""
         self._guard, self._refused = StampGuard(), Counter[str]()
-        self._session, self._log, self._clock_ns = session, log, clock_ns
-        self._on_jump_back = on_jump_back
-        self._sensor_frame = ""
+        self._session, self._log, self._on_jump_back = session, log, on_jump_back
         self._wanted, self._is_watching = "auto", False
         self._arrived = self._lost = 0
         self._next_number: int | None = None
         self._arrived_s: float | None = None
         self._bad, self._bad_at_s = "", -np.inf
-        self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
         self._counts = deque([(time.monotonic(), 0, 0)], maxlen=_REPORTS + 1)
         self._last_stamp_ns: int | None = None
         self._longest_gap_ns = 0
@@ -130,12 +124,9 @@ class PoseInput:
 
     def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         """Take a message; it is read when its stamp is believed."""
-        if not self.is_enabled:
-            self.ignored += 1
-            return
         self._arrived, self._arrived_s = self._arrived + 1, time.monotonic()
-        if clock_ns := self._clock_ns():
-            self._delays_ns.append(clock_ns - stamp_ns)
+        if not self.is_enabled:
+            return
         if self._last_stamp_ns is not None:
             self._longest_gap_ns = max(self._longest_gap_ns, stamp_ns - self._last_stamp_ns)
         self._last_stamp_ns = stamp_ns
@@ -186,7 +177,7 @@ class PoseInput:
 
     def is_silent(self, steady_s: float) -> bool:
         """Whether messages have come, but not lately."""
-        return self._arrived_s is not None and steady_s - self._arrived_s > STALE_AFTER_S
+        return self._arrived_s is not None and steady_s - self._arrived_s > _SILENT_AFTER_S
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
         """What has come in; to be called once a second. ``may_rest`` if silence is nothing to look
@@ -198,7 +189,6 @@ class PoseInput:
         level, text = self._judge(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
         taken = self._session.statistics(self.name)
         refused = {"repeated stamp": taken.refused_duplicate, "too late": taken.refused_late}
-        outdated = {"of the session before": self._guard.outdated} if self._guard.outdated else {}
         return InputState(
             level=level,
             text=text,
@@ -206,10 +196,9 @@ class PoseInput:
             rate_hz=rate_hz,
             messages=self._arrived,
             poses_taken=taken.received,
-            refused=refused | outdated | dict(sorted(self._refused.items())),
+            refused=refused | dict(sorted(self._refused.items())),
             lost=None if self._next_number is None else self._lost,
             longest_gap_s=self._longest_gap_ns * 1e-9,
-            delay_s=float(np.median(self._delays_ns)) * 1e-9 if self._delays_ns else None,
         )
 
     def _judge(
@@ -218,7 +207,7 @@ class PoseInput:
         if self._arrived_s is None:
             text = f"no message on {self.topic} yet"
             return Level.WARN, ": ".join(filter(None, [text, self.problem]))
-        if steady_s - self._bad_at_s < BAD_INPUT_FOR_S:
+        if steady_s - self._bad_at_s < _BAD_INPUT_FOR_S:
             return Level.ERROR, f"{self.topic}: {self._bad}"
         if self.is_silent(steady_s):
             text = f"{self.topic} has been silent for {steady_s - self._arrived_s:.0f} s"

@@ -30,8 +30,8 @@ _MOST_WAITING = 240
 
 # The engines by the child sensor of each; all of them have the same parent.
 Engines = Mapping[str, Calibrator]
-# Stream, stamp (ns), position and quaternion of a pose.
-_Event = tuple[str, int, Sequence[float], Sequence[float]]
+# Stream, stamp (ns), position and quaternion.
+_Pose = tuple[str, int, Sequence[float], Sequence[float]]
 
 
 def takers(stream: str, engines: Engines) -> list[tuple[str, Calibrator]]:
@@ -50,54 +50,42 @@ def give(journal: Journal, directory: Path, engines: Engines) -> None:
         If they do not take it.
     """
     try:
-        for name, engine in engines.items():
-            for stream, own_stream in (("parent", "parent"), (name, "child")):
-                if frame := journal.about.get(stream, {}).get("frame"):
-                    engine.set_frame(own_stream, frame)
-            columns = (journal.streams, journal.stamps_ns, journal.poses)
-            for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
-                if stream in ("parent", name):
-                    own_stream = "parent" if stream == "parent" else "child"
-                    engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
+        for stream, about in journal.about.items():
+            for own_stream, engine in takers(stream, engines) if about.get("frame") else ():
+                engine.set_frame(own_stream, about["frame"])
+        columns = (journal.streams, journal.stamps_ns, journal.poses)
+        for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
+            for own_stream, engine in takers(stream, engines):
+                engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
     except InputError as error:
         raise InputError(f"cannot use the session journal {directory}: {error}") from None
 
 
-class DirectoryLock:
-    """Keeps a directory for this process until :meth:`release`, or its end, however that comes.
-
-    Parameters
-    ----------
-    directory : path
-        Made if it does not exist. If it cannot be written, nothing is locked: the journal will say
-        so.
+def lock_directory(directory: Path) -> int | None:
+    """Keep a directory, made if need be, for this process, until the descriptor is closed or the
+    process ends. None if it cannot be written: the journal will say so.
 
     Raises
     ------
     ConfigError
         If another node has it.
     """
-
-    def __init__(self, directory: Path) -> None:
-        self._descriptor: int | None = None
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            raise ConfigError(
-                f"output_directory {directory} is in use by another calibrator: stop that one, or "
-                "choose another directory"
-            ) from None
-        except OSError:
-            return  # a disk that takes no lock, or nothing at all
-
-    def release(self) -> None:
-        """Leave the directory to others."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise ConfigError(
+            f"output_directory {directory} is in use by another calibrator: stop that one, or "
+            "choose another directory"
+        ) from None
+    except OSError:
+        pass  # a disk that takes no lock
+    return descriptor
 
 
 class SessionJournal:
@@ -122,7 +110,7 @@ class SessionJournal:
     Raises
     ------
     ConfigError
-        If another node writes into the directory above.
+        If another node has the directory above.
     """
 
     def __init__(
@@ -133,9 +121,9 @@ class SessionJournal:
         resumed: Journal | None = None,
     ) -> None:
         self.directory, self.error, self._log = directory, "", log
-        self._lock = DirectoryLock(directory.parent)
+        self._lock = lock_directory(directory.parent)
         self._make_about, self._about = about, about()
-        self._events: list[_Event] = []
+        self._poses: list[_Pose] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
         self._jobs.put(partial(self._open, self._about, resumed))
@@ -146,21 +134,21 @@ class SessionJournal:
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> None:
         """Note a pose that the engine has taken."""
-        self._events.append((stream, stamp_ns, position, quat_xyzw))
+        self._poses.append((stream, stamp_ns, position, quat_xyzw))
 
     def flush(self) -> None:
         """Hand what is new to the thread; to be called often."""
-        events, self._events = self._events, []
+        poses, self._poses = self._poses, []
         before, self._about = self._about, self._make_about()
         if self._jobs.qsize() > _MOST_WAITING and not self.error:
             self._give_up("the disk does not answer")
-        elif not self.error and (events or self._about != before):
-            self._jobs.put(partial(self._write, events, self._about))
+        elif not self.error and (poses or self._about != before):
+            self._jobs.put(partial(self._write, poses, self._about))
 
     def begin(self) -> None:
         """Start a new session without poses; the one so far is kept aside."""
-        self._jobs.put(partial(self._write, self._events, self._about))
-        self._events, self._about, self.error = [], self._make_about(), ""
+        self._jobs.put(partial(self._write, self._poses, self._about))
+        self._poses, self._about, self.error = [], self._make_about(), ""
         self._jobs.put(self._close)
         self._jobs.put(partial(self._open, self._about))
 
@@ -170,7 +158,8 @@ class SessionJournal:
         self._jobs.put(self._close)
         self._jobs.put(None)
         self._thread.join(timeout_s)
-        self._lock.release()
+        if self._lock is not None:
+            os.close(self._lock)
 
     def _give_up(self, reason: str) -> None:
         """Leave the files as they are."""
@@ -195,20 +184,15 @@ class SessionJournal:
         if resumed is None and has_session(self.directory):
             poses = count_poses(self.directory)
             if poses != 0:  # not the empty one of a node that was started in vain
-                what = "a session that cannot be read"
-                if poses is not None:
-                    what = f"the session before this one ({poses} poses)"
-                self._log.info(
-                    f"{what} is kept in {keep_aside(self.directory)}; to go on with it, stop the "
-                    f"node, rename that folder to {self.directory.name} and start with the "
-                    "parameter journal at resume"
-                )
+                what = "" if poses is None else f" ({poses} poses)"
+                aside = keep_aside(self.directory)
+                self._log.info(f"the session before this one{what} is kept in {aside}")
         self._writer = JournalWriter(self.directory, about, resumed=resumed)
 
-    def _write(self, events: list[_Event], about: About) -> None:
+    def _write(self, poses: list[_Pose], about: About) -> None:
         if self._writer is not None:
-            for event in events:
-                self._writer.add_pose(*event)
+            for pose in poses:
+                self._writer.add_pose(*pose)
             self._writer.flush()
             self._writer.describe(about)
 

@@ -22,6 +22,13 @@ _GRACE_S = 0.3
 class LiveSession:
     """Every pose that the engine takes is written to the journal as well, if there is one.
 
+    Parameters
+    ----------
+    log : NodeLog
+    config : CalibratorConfig
+    others : sequence of str
+        Further child sensors, by the names of their inputs.
+
     Attributes
     ----------
     engines : dict of str to Calibrator
@@ -34,8 +41,9 @@ class LiveSession:
         A solve would have something new to go by: poses or options.
     """
 
-    def __init__(self, log: NodeLog) -> None:
-        self.engines = {"child": Calibrator()}
+    def __init__(self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()) -> None:
+        self.engines = {"child": Calibrator(config)}
+        self.engines |= {name: Calibrator(_of_other(config)) for name in others}
         self.number = 0
         self.topics: dict[str, str] = {}
         self.has_new_poses = False
@@ -50,11 +58,6 @@ class LiveSession:
         """The engine of parent and child."""
         return self.engines["child"]
 
-    @property
-    def others(self) -> dict[str, Calibrator]:
-        """The engines of further child sensors by the names of their inputs."""
-        return {name: engine for name, engine in self.engines.items() if name != "child"}
-
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> bool:
@@ -68,11 +71,6 @@ class LiveSession:
             self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
         self.has_new_poses |= self._is_solved and stream in STREAMS
         return True
-
-    def take_others(self, names: Sequence[str]) -> None:
-        """Take further child sensors, known by the names of their inputs, from now on."""
-        config = _of_other(self.calibrator.config)
-        self.engines |= {name: Calibrator(config) for name in names}
 
     def statistics(self, stream: str) -> StreamStatistics:
         """What the engine has taken of a stream."""
@@ -99,7 +97,7 @@ class LiveSession:
         ConfigError
             If nothing can be calibrated with what the other stream measures.
         """
-        if stream in self.others:
+        if stream not in STREAMS:
             engine = self.engines[stream]
             engine.reconfigure(replace(engine.config, child_measures=measures))
             return
@@ -116,9 +114,10 @@ class LiveSession:
 
     def reconfigure(self, config: CalibratorConfig) -> None:
         """Put other options in force; the poses stay, and are to be solved again."""
+        for name, engine in self.engines.items():
+            if name != "child":
+                engine.reconfigure(_of_other(config, engine.config.child_measures))
         self.calibrator.reconfigure(replace(config, **self._measures))
-        for other in self.others.values():
-            other.reconfigure(_of_other(config, other.config.child_measures))
         self.has_new_poses = self._n_poses() > 0 and self._is_solved
 
     def reset(self) -> None:
@@ -129,10 +128,6 @@ class LiveSession:
         self.has_new_poses = False
         if self._journal is not None:
             self._journal.begin()
-
-    def inputs(self) -> dict[str, Any]:
-        """Where the poses came from and the options, in plain values."""
-        return self.calibrator.inputs(self.topics)
 
     def _n_poses(self) -> int:
         return sum(self.calibrator.statistics(stream).received for stream in STREAMS)
@@ -176,11 +171,10 @@ class LiveSession:
         if journal is not None and journal.error:
             level = Level.ERROR
             text = f"cannot write: {journal.error}; a crash would lose the session"
-        elif journal is None and options.journal == "off":
-            text = "off"
         elif journal is None:
-            level = Level.WARN
-            text = "off: the node began without output_directory, a crash would lose the session"
+            text = "off"
+            if options.journal != "off":
+                level, text = Level.WARN, "off: the node began without output_directory"
         directory = str(journal.directory.resolve()) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 
@@ -229,22 +223,19 @@ def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorCon
     return replace(config, child_measures=measures, given=config.given - of_child, **defaults)
 
 
-def output_path(directory: str) -> Path:
-    """The path of an output directory, ``~`` expanded. Raises ConfigError for an unknown user."""
+def output_path(directory: str, base: Path | None = None) -> Path:
+    """The path of an output directory, ``~`` expanded. Raises ConfigError for an unknown user, and
+    if it is neither ``base`` nor below it: any participant may set it while the node runs, and must
+    not write elsewhere.
+    """
     try:
-        return Path(directory).expanduser()
+        path = Path(directory).expanduser()
     except RuntimeError as error:
         text = f"output_directory {directory!r}: {error}; write the whole path"
         raise ConfigError(text) from None
-
-
-def check_below(base: Path, directory: str) -> None:
-    """Raise ConfigError if an output directory is neither ``base`` nor below it: any participant
-    may set it while the node runs, and must not write elsewhere.
-    """
-    path = output_path(directory).resolve()
-    if not path.is_relative_to(base):
+    if base is not None and not path.resolve().is_relative_to(base):
         raise ConfigError(
             f"output_directory must be {base} or below it while the node runs; got {path}: "
             "start the node with the directory that is wanted"
         )
+    return path

@@ -1,18 +1,23 @@
-"""The process that solves: reads jobs from standard input, writes answers to standard output.
+"""The process beside the node's that solves: what it is sent, what it answers, and both ends.
 
-It imports the engine and nothing of ROS. Messages are pickles: both ends are the same program, and
-nobody else has the pipes.
+A thread that solves would share the interpreter with the callbacks: on a slow machine their latency
+rises to a second. The process imports the engine and nothing of ROS. Messages are pickles: both
+ends are the same program, and nobody else has the pipes.
 """
 
+import contextlib
 import os
 import pickle
 import queue
+import select
+import signal
+import subprocess
 import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from enum import Enum, auto
 from typing import Any, BinaryIO
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -22,27 +27,33 @@ from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.run import review, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
+
+# Not `-m`: its classes would belong to the module __main__, which the node does not have.
+_SOLVE = "from hand_eye_calib.live.solving import main; main()"
 
 # Every other program goes first, the node's callbacks above all.
 _NICENESS = 10
 
+# A job that has taken this long (s) hangs: live sessions are solved in seconds.
+HANGS_AFTER_S = 600.0
 
-class FailureKind(Enum):
-    """Why there is no result: too little data, unusable input or options, or a defect."""
+# A process that was killed is waited for so long (s).
+_LAST_BREATH_S = 1.0
 
-    NOT_ENOUGH_DATA = auto()
-    UNUSABLE = auto()
-    UNEXPECTED = auto()
+NO_MOTION = excitation(PosePairs.empty())
 
 
 @dataclass(frozen=True)
 class Failure:
-    """An error as text: ``what`` in one line, ``details`` for the log."""
+    """An error as one line. ``details`` are for the log, and only of a defect; ``is_early`` if
+    there is too little data.
+    """
 
-    kind: FailureKind
     what: str
     details: str = ""
+    is_early: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,31 +69,25 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Checked:
-    """How a stream check ended: with neither findings nor a failure if the motion is too short or
-    has too little rotation to tell. The result is one with the options that it is certain of, and
-    warnings tell of that.
-    """
-
-    result: CheckResult | None = None
-    failure: Failure | None = None
-    options: dict[str, Any] = field(default_factory=dict)
-    told: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Answer:
-    """How a job ended, after how many seconds: with a calibration or with a failure; and how the
-    sensors have been seen to move.
+    """How a job ended, after how many seconds: with a calibration, and how the sensors have been
+    seen to move, or with a failure; with both if only the check has failed.
+
+    ``is_checked`` if a check was asked for: its result is None if the motion is too short or has
+    too little rotation to tell. The result is one with the options that it is certain of, and
+    ``told`` are the warnings about that.
     """
 
     session: int
     seconds: float
-    seen: Excitation | None = None
+    seen: Excitation = NO_MOTION
     calibration: Calibration | None = None
     time_offset: TimeOffset | None = None
     failure: Failure | None = None
-    check: Checked | None = None
+    is_checked: bool = False
+    check: CheckResult | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    told: tuple[str, ...] = ()
 
 
 def answer(job: Job) -> Answer:
@@ -90,39 +95,40 @@ def answer(job: Job) -> Answer:
     calibration is the one with these.
     """
     start_s = time.monotonic()
-    snapshot, seen, calibration, failure, checked = job.snapshot, None, None, None, None
+    found: dict[str, Any] = {"time_offset": job.snapshot.time_offset}
+    calibration = None
     try:
-        snapshot = with_options(snapshot, job.options).resolved()
-        seen = excitation(snapshot.pose_pairs())
+        snapshot = with_options(job.snapshot, job.options).resolved()
+        found["time_offset"] = snapshot.time_offset
+        found["seen"] = excitation(snapshot.pose_pairs())
         calibration = snapshot.estimate()
     except Exception as error:  # the node reports it
-        failure = _failure(error)
-    if job.check:
-        checked = Checked()
-        try:
-            if can_check(*job.snapshot.streams):
-                as_sent = with_options(job.snapshot, job.options)
-                if calibration is None:
-                    checked = Checked(check(as_sent))
-                else:
-                    found = review(calibration, as_sent, job.options)
-                    calibration = found.calibration if found.options else calibration
-                    checked = Checked(found.check, options=dict(found.options), told=found.told)
-        except Exception as error:  # the node reports it
-            checked = Checked(failure=_failure(error))
+        found["failure"] = _failure(error)
+    try:
+        if job.check and can_check(*job.snapshot.streams):
+            as_sent = with_options(job.snapshot, job.options)
+            if calibration is None:
+                found["check"] = check(as_sent)
+            else:
+                run = review(calibration, as_sent, job.options)
+                calibration = run.calibration if run.options else calibration
+                found |= {"check": run.check, "options": dict(run.options), "told": run.told}
+    except Exception as error:  # the node reports it
+        found.setdefault("failure", _failure(error))
     if calibration is not None:  # the node has no use for the noise model's whole solution
         calibration = replace(calibration, model=None)
     seconds = time.monotonic() - start_s
-    return Answer(job.session, seconds, seen, calibration, snapshot.time_offset, failure, checked)
+    return Answer(job.session, seconds, calibration=calibration, is_checked=job.check, **found)
 
 
 def _failure(error: Exception) -> Failure:
-    if isinstance(error, NotEnoughDataError):
-        return Failure(FailureKind.NOT_ENOUGH_DATA, str(error))
     if isinstance(error, HandEyeCalibError):
-        return Failure(FailureKind.UNUSABLE, str(error))
+        return Failure(str(error), is_early=isinstance(error, NotEnoughDataError))
     details = "".join(traceback.format_exception(error))
-    return Failure(FailureKind.UNEXPECTED, f"{type(error).__name__}: {error}", details)
+    return Failure(f"{type(error).__name__}: {error}", details)
+
+
+# ------------------------------------------------------------- in the process
 
 
 def main() -> None:
@@ -147,3 +153,111 @@ def _receive(incoming: BinaryIO, jobs: "queue.SimpleQueue[Job]") -> None:
             jobs.put(pickle.load(incoming))
     finally:
         os._exit(0)
+
+
+# ----------------------------------------------------------------- in the node
+
+
+def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Popen[bytes]":
+    """Run Python code with the same modules as here, in a group of its own, which Ctrl-C in the
+    terminal leaves alone.
+    """
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdin=stdin,
+        stdout=stdout,
+        env=os.environ | {"PYTHONPATH": path},
+        process_group=0,
+    )
+
+
+class SolvingProcess:
+    """Answers jobs in another process, in the order they were submitted.
+
+    The process is started at once and again when it has died, or was killed because it hung; the
+    job in hand has failed then. It ends with this one, however this one ends. The thread here only
+    waits for the pipes.
+
+    Parameters
+    ----------
+    on_answer : callable
+        Called in another thread when an answer is ready; one call may stand for two.
+    command : str
+        Python code that the process runs.
+    """
+
+    def __init__(self, on_answer: Callable[[], None], command: str = _SOLVE) -> None:
+        self._on_answer, self._command = on_answer, command
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._is_stopping = False
+        self._start()
+        # A daemon: a disk or a pipe that hangs must not keep the node alive.
+        self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Id of the process that solves."""
+        return self._process.pid
+
+    def submit(self, job: Job) -> None:
+        """Queue a job."""
+        self._jobs.put(job)
+
+    def answers(self) -> list[Answer]:
+        """The answers that nobody has taken, in order."""
+        return [self._answers.get() for _ in range(self._answers.qsize())]
+
+    def stop(self, timeout_s: float) -> None:
+        """Wait for the job in hand, then end the process whatever it does."""
+        self._is_stopping = True
+        self._jobs.put(None)
+        self._thread.join(timeout_s)
+        self._process.kill()
+        self._thread.join(_LAST_BREATH_S)  # its pipe has ended
+        self._process.communicate()
+
+    def _start(self) -> None:
+        self._process = start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                found = self._answer(job)
+            except (EOFError, OSError, pickle.UnpicklingError) as error:
+                if self._is_stopping:
+                    return
+                found = Answer(job.session, 0.0, failure=self._restart(error))
+            self._answers.put(found)
+            if not self._is_stopping:
+                self._on_answer()
+
+    def _answer(self, job: Job) -> Answer:
+        """What the process answers. Raises EOFError, OSError or UnpicklingError."""
+        to, back = self._process.stdin, self._process.stdout
+        assert to is not None
+        assert back is not None
+        pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
+        to.flush()
+        if not select.select([back], [], [], HANGS_AFTER_S)[0]:
+            raise TimeoutError
+        found: Answer = pickle.load(back)
+        return found
+
+    def _restart(self, error: Exception) -> Failure:
+        """Start the process again; returns how it ended."""
+        hangs = isinstance(error, TimeoutError)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.0 if hangs else _LAST_BREATH_S)
+        self._process.kill()
+        self._process.communicate()
+        code = self._process.returncode
+        cause = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
+        if hangs:
+            cause = f"had no answer after {HANGS_AFTER_S:g} s and was killed"
+        self._start()
+        if self._is_stopping:
+            self._process.kill()
+        return Failure(f"the solving process {cause}", "it was started again")

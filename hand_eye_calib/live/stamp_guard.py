@@ -43,23 +43,16 @@ class Judgement(NamedTuple):
 
 
 class StampGuard:
-    """Watches the stamps of one stream.
-
-    Attributes
-    ----------
-    last_ns : int or None
-        Newest stamp taken in the session.
-    outdated : int
-        Messages that were left out because they are of the session before.
+    """Watches the stamps of one stream; ``last_ns`` is the newest one taken in the session, None
+    if there is none.
     """
 
     def __init__(self) -> None:
-        self.outdated = 0
-        self._outdated_until_s = -math.inf
         self._arrived_s = 0.0
         self._begin()
 
     def _begin(self) -> None:
+        self._outdated_until_s = -math.inf
         self.last_ns: int | None = None
         # Those taken last: corrupt ones come WITNESSES - 1 together, and are never half of these.
         self._recent_ns: deque[int] = deque(maxlen=2 * WITNESSES - 1)
@@ -70,7 +63,6 @@ class StampGuard:
         self._arrived_s = now_s
         if self._is_near(stamp_ns):
             if now_s < self._outdated_until_s:
-                self.outdated += 1
                 return Judgement()
             return Judgement(self._take([(stamp_ns, message)]), self._drop_held())
         dropped = []
@@ -95,7 +87,6 @@ class StampGuard:
         """Begin a new session; with ``now_s`` (steady time) as another stream has jumped back."""
         if now_s is None:
             self._begin()
-            self._outdated_until_s = -math.inf
         elif self.last_ns is not None:
             follow_s = _OTHERS_FOLLOW_S + 2 * WITNESSES * self._period_ns() * 1e-9
             self._outdated_until_s = now_s + follow_s

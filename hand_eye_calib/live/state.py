@@ -9,9 +9,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.plain import plain
 from hand_eye_calib.results.records import Comparison, Progress
+from hand_eye_calib.results.status import AXES
 
 AxisValues = Mapping[str, float | None]
+
+
+def by_axis(values: FloatArray) -> AxisValues:
+    """Values (6,) by axis."""
+    return dict(zip(AXES, plain(values), strict=True))
 
 
 class Level(IntEnum):
@@ -44,7 +52,7 @@ class Part:
 @dataclass(frozen=True, kw_only=True)
 class ResultState:
     """The session's result. ``pose`` has x, y, z (m), roll, pitch, yaw (rad) as they are printed,
-    None if an axis is not determined; ages are None while the node's clock does not run.
+    None if an axis is not determined.
     """
 
     parent_frame: str
@@ -62,19 +70,13 @@ class ResultState:
     scale: float
     scale_sigma: float
     age_s: float
-    newest_pose_age_s: float | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExtrinsicState(Part):
-    """The solver, what has been seen of the motion, and the result if there is one.
-
-    Attributes
-    ----------
-    motion_s : float
-        Seconds during which the sensors moved.
-    has_vehicle_axes : bool
-        The parent sensor moves along its x and turns about its z, as on a vehicle (REP 103).
+    """The solver, what has been seen of the motion, and the result if there is one. The sensors
+    moved for ``motion_s``; ``has_vehicle_axes`` if the parent sensor moves along its x and turns
+    about its z, as on a vehicle (REP 103).
     """
 
     is_solving: bool
@@ -103,8 +105,7 @@ class ProgressState(Part):
 @dataclass(frozen=True, kw_only=True)
 class InputState(Part):
     """What an input has delivered. ``lost`` messages were published and never arrived, None if the
-    middleware does not tell; ``delay_s`` is the node's clock minus the stamps, the median, and
-    ``clock_offset_s`` what the child's delay is more than the parent's.
+    middleware does not tell.
     """
 
     topic: str
@@ -114,8 +115,6 @@ class InputState(Part):
     refused: Mapping[str, int]
     lost: int | None
     longest_gap_s: float
-    delay_s: float | None
-    clock_offset_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

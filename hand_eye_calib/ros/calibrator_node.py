@@ -26,9 +26,8 @@ from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.monitor import LIMITS, MountWatch
-from hand_eye_calib.live.reporting import extrinsic_state, input_states, progress_state
 from hand_eye_calib.live.saving import Saver
-from hand_eye_calib.live.session import LiveSession, check_below, output_path
+from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.inputs import TfInput, TopicInput, qos_parameter_names
@@ -63,7 +62,6 @@ class CalibratorNode(Node):
                 f"a parameter that was given has no usable value, such as []: {error}"
             ) from None
         self._log = NodeLog(self.get_logger())
-        self._session = LiveSession(self._log)
         self._output_base: Path | None = None
         self._options = Parameters(
             self, set(qos_parameter_names(self)), self._follow_parameters, self._check_options
@@ -76,15 +74,14 @@ class CalibratorNode(Node):
         if options.monitor:
             config.require_poses("monitor")
         _ = config.measured  # or it raises
-        self._session.reconfigure(config)
+        others = other_names(options.other_children)
+        self._session = LiveSession(self._log, config, others)
         tree = RobotTree(self, self._log)
         self._robot = Robot(self._log, options, tree)
         if needs_tf(options):
             tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
-        self._others = other_names(options.other_children)
-        self._session.take_others(self._others)
-        self._inputs = [self._make_input(name) for name in ("parent", "child", *self._others)]
+        self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
         self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
         self._session.start_journal(options, is_first=True)
         for each in self._inputs:
@@ -144,8 +141,7 @@ class CalibratorNode(Node):
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
         options = self._options.node
-        clock_ns = lambda: self.get_clock().now().nanoseconds  # noqa: E731
-        parts = self._session, self._log, clock_ns, self._begin_session
+        parts = self._session, self._log, self._begin_session
         made: TopicInput | TfInput
         if frames := getattr(options, f"{name}_tf", ""):
             made = TfInput(self, name, TfSource.parse(frames), parts)
@@ -204,38 +200,27 @@ class CalibratorNode(Node):
         self._tf.add(calibration, why_not or self._robot.lacks_base(calibration))
 
     def _publish_state(self, has_ended: bool = False) -> None:
-        # New results of the further child sensors, in their order.
-        for name, calibration in zip(self._others, self._saver.take_others(), strict=False):
-            self._results.publish_other(name, calibration)
         self._tf.look()
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
-        state = replace(self._state(time.monotonic(), clock_ns), has_ended=has_ended)
-        self._states.publish(state, clock_ns)
+        self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
 
-    def _state(self, steady_s: float, clock_ns: int) -> NodeState:
-        options, cycle, name = self._options.node, self._cycle, self.get_fully_qualified_name()
-        result = cycle.result
-        used_s = result.time_offset_s if result else self._options.calibrator.time_offset
-        inputs = input_states(self._inputs, cycle.has_valid_result, used_s, steady_s)
+    def _state(self) -> NodeState:
+        cycle, name, steady_s = self._cycle, self.get_fully_qualified_name(), time.monotonic()
+        # A robot that rests, once there is a result, has nothing more to show.
+        may_rest = all(each.is_silent(steady_s) for each in self._inputs[:2])
+        may_rest &= cycle.result is not None
+        inputs = {each.name: each.state(steady_s, may_rest) for each in self._inputs}
         if self._mount is not None:
             return NodeState(node=name, mount=self._mount.state(), inputs=inputs)
-        extrinsic = extrinsic_state(
-            cycle,
-            accepts_poses=self._inputs[0].is_enabled,
-            tf_static=self._tf.state,
-            waited_for_s=options.solve_period if self._session.has_new_poses else None,
-            steady_s=steady_s,
-            clock_ns=clock_ns,
-        )
         return NodeState(
             node=name,
-            extrinsic=extrinsic,
-            progress=progress_state(cycle, self._robot.why_not_compared),
+            extrinsic=cycle.extrinsic_state(self._inputs[0].is_enabled, self._tf.state),
+            progress=cycle.progress_state(self._robot.why_not_compared),
             inputs=inputs,
-            checks=cycle.checks.state(steady_s),
-            journal=self._session.journal_state(options),
+            checks=cycle.checks.state(),
+            journal=self._session.journal_state(self._options.node),
             saved=self._saver.state,
         )
 
@@ -246,9 +231,10 @@ class CalibratorNode(Node):
         self._session.reset()
         if self._mount is not None and because_of is None:
             self._mount = self._watch_mount()
-        for part in (self._log, self._cycle, self._saver, self._tf, self._mount):
+        for part in (self._log, self._cycle, self._tf, self._mount):
             if part is not None:
                 part.restart()
+        self._saver.state = None
         self._results.clear()
         for each in self._inputs:
             each.restart(because_of)
@@ -272,8 +258,7 @@ class CalibratorNode(Node):
     def _set_enabled(self, request: SetBool.Request) -> tuple[bool, str]:
         for each in self._inputs:
             each.is_enabled = request.data
-        ignored = sum(each.ignored for each in self._inputs)
-        text = f"{'' if request.data else 'not '}accepting poses; {ignored} ignored so far"
+        text = f"{'' if request.data else 'not '}accepting poses"
         self._log.info(text)
         return True, text
 
@@ -294,7 +279,7 @@ class CalibratorNode(Node):
                 TfSource.parse(frames)
                 message_type(name)
         if self._output_base is not None and options.output_directory:
-            check_below(self._output_base, options.output_directory)
+            output_path(options.output_directory, self._output_base)
 
     def _follow_parameters(self) -> None:
         options, config = self._options.node, self._options.calibrator

@@ -29,7 +29,7 @@ _MOST_AT_ONCE = 50
 
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
-Parts = tuple[LiveSession, NodeLog, Callable[[], int], Callable[[PoseInput], None]]
+Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
 
 
 def _quick() -> QoSProfile:

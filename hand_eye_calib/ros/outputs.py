@@ -7,7 +7,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from hand_eye_calib.live.state import NodeState
@@ -32,40 +31,28 @@ _UNNAMED = ("progress", "axes", "result", "differences")
 
 
 class ResultTopics:
-    """Publishes results on ``~/extrinsic`` and ``~/extrinsic_with_covariance``, latched; those of
-    further child sensors on ``~/extrinsic_child2`` and so on.
-    """
+    """Publishes results on ``~/extrinsic`` and ``~/extrinsic_with_covariance``, latched."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._publishers: dict[str, Publisher] = {}
-        self.clear()
+        self._advertise()
+
+    def _advertise(self) -> None:
+        make = self._node.create_publisher
+        self._transform = make(TransformStamped, "~/extrinsic", LATCHED)
+        self._pose = make(PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED)
 
     def publish(self, calibration: Calibration) -> None:
         """Publish a result: with its covariance always, alone if that says enough to be used."""
-        pose = to_pose_with_covariance(calibration)
-        self._publishers["extrinsic_with_covariance"].publish(pose)
+        self._pose.publish(to_pose_with_covariance(calibration))
         if _is_known(calibration):
-            self._publishers["extrinsic"].publish(to_transform(calibration))
-
-    def publish_other(self, input_name: str, calibration: Calibration) -> None:
-        """Publish a result of a further child sensor, by the name of its input."""
-        name = f"extrinsic_{input_name}"
-        if name not in self._publishers:
-            publisher = self._node.create_publisher(TransformStamped, f"~/{name}", LATCHED)
-            self._publishers[name] = publisher
-        self._publishers[name].publish(to_transform(calibration))
+            self._transform.publish(to_transform(calibration))
 
     def clear(self) -> None:
         """Withdraw the results: who subscribes from now on gets none."""
-        for publisher in self._publishers.values():
+        for publisher in (self._transform, self._pose):
             self._node.destroy_publisher(publisher)
-        self._publishers.clear()
-        for name, kind in (
-            ("extrinsic", TransformStamped),
-            ("extrinsic_with_covariance", PoseWithCovarianceStamped),
-        ):
-            self._publishers[name] = self._node.create_publisher(kind, f"~/{name}", LATCHED)
+        self._advertise()
 
 
 def _is_known(calibration: Calibration) -> bool:

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import time
 
 import numpy as np
 import pytest
@@ -77,19 +76,16 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
     start_node("-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS)
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
-    # Stamps of now, the child's 5 s behind.
-    stamps_ns = stamps_ns - stamps_ns[-1] + time.time_ns()
-    peer.wait_matched(*publishers)
+    peer.wait_matched(*publishers)  # the child's clock is 20 s behind
     for publisher, frame, Ts, late_ns in zip(
-        publishers, ("lidar", "camera"), (Ts_pw_p, Ts_cw_c), (0, 5 * 10**9), strict=True
+        publishers, ("lidar", "camera"), (Ts_pw_p, Ts_cw_c), (0, 20 * 10**9), strict=True
     ):
         for stamp_ns, T in zip(stamps_ns, Ts, strict=True):
             publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
-    parent = state(lambda each: "set time_offset" in each.inputs["parent"].text).inputs["parent"]
-    assert parent.level is Level.WARN
-    # By the times of arrival: more on a busy machine.
-    assert parent.clock_offset_s > 3.0
-    assert peer.set_parameter("time_offset", 5.0).successful
+    apart = state(lambda each: "set time_offset" in each.extrinsic.text).extrinsic
+    assert apart.level is Level.WARN
+    assert "the streams do not overlap in time (120 parent and 120 child poses" in apart.text
+    assert peer.set_parameter("time_offset", 20.0).successful
     good = state(lambda each: each.extrinsic.level is Level.OK and each.extrinsic.n_poses == 120)
     assert good.extrinsic.text.startswith("USE: all six axes are known to ")
     assert all(angle > 20 for angle in good.extrinsic.rotation_deg.values())
@@ -150,11 +146,10 @@ def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_n
     state(lambda each: disabled in each.extrinsic.text)
 
 
-def test_too_little_driving_and_simulated_time_that_does_not_run_are_said(start_node, peer, state):
+def test_too_little_driving_is_said_also_where_time_does_not_run(start_node, peer, state):
     start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())
     found = state(lambda each: each.extrinsic.result)
-    assert found.extrinsic.result.newest_pose_age_s is None
     assert (found.checks.level, found.checks.age_s) == (Level.WARN, None)
     said = "not checked yet: that takes 20 s of motion with rotations of 30 deg"
     assert found.checks.text == said

@@ -14,11 +14,12 @@ from result_making import calibration, seen
 
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.live import cycle as module
 from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.solving import Answer, Checked
+from hand_eye_calib.live.solving import Answer
 from hand_eye_calib.live.state import Level, NodeState
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
@@ -49,7 +50,14 @@ def cycle(lines, monkeypatch):
     write = {level: lambda text, level=level: lines.append((level, text)) for level in levels}
     log = NodeLog(SimpleNamespace(**write))
     published = []
-    made = SolveCycle(LiveSession(log), log, print, lambda each: each, published.append, TARGETS)
+    made = SolveCycle(
+        LiveSession(log, CalibratorConfig()),
+        log,
+        print,
+        lambda each: each,
+        published.append,
+        TARGETS,
+    )
     made.published = published
     made.ask(lambda good, text: None)
     return made
@@ -102,7 +110,7 @@ def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cyc
         code="inverse", severity=Severity.ERROR, what="inverse poses", advice="invert"
     )
     found = CheckResult(findings=(finding,))
-    good, text = answered(cycle, 46.0, check=Checked(found))
+    good, text = answered(cycle, 46.0, check=found)
     assert cycle.result.verdict is Verdict.DO_NOT_USE
     assert text.startswith("DO NOT USE: ")
     assert not cycle.goal.progress.done

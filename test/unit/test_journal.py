@@ -1,5 +1,6 @@
 import itertools
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
-from hand_eye_calib.live.journal import DirectoryLock, give, takers
+from hand_eye_calib.live.journal import give, lock_directory, takers
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}
@@ -181,9 +182,9 @@ def test_further_child_sensors_are_resumed_too(tmp_path):
 
 
 def test_the_lock_is_on_the_directory(tmp_path):
-    lock = DirectoryLock(tmp_path)
+    lock = lock_directory(tmp_path)
     with pytest.raises(ConfigError, match="is in use by another calibrator"):
-        DirectoryLock(tmp_path)
+        lock_directory(tmp_path)
     assert not list(tmp_path.iterdir())
-    lock.release()
-    DirectoryLock(tmp_path).release()
+    os.close(lock)
+    os.close(lock_directory(tmp_path))

@@ -47,7 +47,7 @@ RESULT = ResultState(
     parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
     reasons=("a: b", "c: d"), warnings=(), n_poses=9,
     inlier_share=1.0, time_offset_s=0.0, time_offset_sigma_s=0.0, scale=1.0, scale_sigma=0.0,
-    age_s=1.0, newest_pose_age_s=None,
+    age_s=1.0,
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
     pose_sigma={"x": 0.004, "y": 0.004, "z": None, "roll": 0.01, "pitch": 0.01, "yaw": 0.01},
 )  # fmt: skip
@@ -73,7 +73,7 @@ SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six 
 
 def inputs(parent=Level.OK, child=Level.OK):
     texts = ["20.0 Hz", "/odom has been silent for 3 s", "/odom: bad quaternion"]
-    figures = dict.fromkeys(("rate_hz", "longest_gap_s", "delay_s"), 0.0)
+    figures = dict.fromkeys(("rate_hz", "longest_gap_s"), 0.0)
     figures |= dict.fromkeys(("messages", "poses_taken", "lost"), 0)
     return {
         name: InputState(level=level, text=texts[level], topic="/odom", refused={}, **figures)
