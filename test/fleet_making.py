@@ -8,14 +8,9 @@ from pathlib import Path
 import numpy as np
 from result_making import calibration
 
-from hand_eye_calib.cli.batch.work import failed
+from hand_eye_calib.cli.batch.work import Outcome, Task
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 DAY_NS = 86_400_000_000_000
@@ -27,14 +22,14 @@ def dies_once(task):
     if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return failed(task, "done")
+    return Outcome.of(task, "done")
 
 
 def always_dies(task):
     """Work whose process dies of the task called bad."""
     if task.name == "bad":
         os.kill(os.getpid(), signal.SIGKILL)
-    return failed(task, "done")
+    return Outcome.of(task, "done")
 
 
 def never_ends(task):
@@ -75,17 +70,5 @@ def outcome(name, vehicle, T, covariance, day=0):
         child_frame="camera",
     )
     stamps = {"first_stamp_ns": day * DAY_NS + 1, "last_stamp_ns": day * DAY_NS + 10**10 + 1}
-    return {
-        "name": name,
-        "vehicle": vehicle,
-        "bags": [f"bags/{name}"],
-        "calibration": found.to_dict(),
-        "findings": [],
-        "inputs": {"parent": stamps, "child": stamps},
-        "error": None,
-    }
-
-
-def calibration_of(outcome_):
-    """The calibration that an outcome has."""
-    return Calibration.from_dict(outcome_["calibration"])
+    task = Task(name=name, bags=(f"bags/{name}",), vehicle=vehicle)
+    return Outcome.of(task, None, found, {"parent": stamps, "child": stamps})

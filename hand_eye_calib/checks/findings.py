@@ -34,12 +34,7 @@ _ONE_BODY = "check that both are on one rigid body, {units}, and the clocks (tim
 
 _ROWS = {
     # ------------------------------------------------------------------ of one stream
-    "disorder": _Row(
-        "{backwards} {stream} stamps are earlier than the one before, {repeated} repeat another",
-        "poses are sorted by stamp; the first of each is used",
-        severity=_NOTE,
-    ),
-    "repaired_file": _Row("{text}", "repair the file's source", code="disorder", severity=_NOTE),
+    "disorder": _Row("{text}", "repair the source of the stamps", severity=_NOTE),
     "leap": _Row("{whose} {text}", "{remedy}"),
     "gaps": _Row(
         "the {stream} stream has {gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the time)",

@@ -110,23 +110,6 @@ def coarse_poses(trajectory: Trajectory, step_s: float) -> FloatArray:
     return trajectory.poses[np.unique(steps, return_index=True)[1]]
 
 
-def tidy(
-    stamps_ns: IntArray, translations: FloatArray, quats_xyzw: FloatArray, stream: str
-) -> tuple[Trajectory, list[Finding]]:
-    """A Trajectory from N poses in the order of their arrival, and findings about that order.
-
-    It is sorted; of poses with the same stamp the first counts. Quaternions are (N, 4), x y z w;
-    ``stream`` is "parent" or "child".
-    """
-    sorted_ns, first = np.unique(stamps_ns, return_index=True)
-    repeated, backwards = len(stamps_ns) - len(sorted_ns), int((np.diff(stamps_ns) < 0).sum())
-    findings = []
-    if repeated or backwards:
-        findings = [finding("disorder", stream, repeated=repeated, backwards=backwards)]
-    trajectory = Trajectory.from_quat_xyzw(sorted_ns, translations[first], quats_xyzw[first])
-    return trajectory, findings
-
-
 def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
     """Which intervals (N,) between poses, s, are gaps: longer than may be interpolated across, and
     than is usual in the stream.

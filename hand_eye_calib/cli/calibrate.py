@@ -40,6 +40,8 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
+# Files of an arm's samples.
+_SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 # Of the table of topics.
 _ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
@@ -102,8 +104,6 @@ def _add_many(parser: argparse.ArgumentParser) -> None:
         "recordings of one vehicle are put together"
     )
     add("--vehicle", metavar="PATTERN", help=vehicle)
-    pairs = "the PATHs are trajectory files, parent and child by turns, of several recordings"
-    add("--pairs", action="store_true", help=pairs)
     no_report = "no page for each recording: they take most time"
     add("--no-report", action="store_true", help=no_report)
     jobs = "number of worker processes. Default: one for each core"
@@ -125,7 +125,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.io.remote import local_copies
 
     if any("*" in str(path) for path in arguments.paths):
-        from hand_eye_calib.cli.batch.tasks import matching
+        from hand_eye_calib.cli.batch.work import matching
 
         arguments.paths = [
             type(path)(found) for path in arguments.paths for found in matching(str(path))
@@ -139,8 +139,8 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise ConfigError("--batch cannot be combined with PATH or --list")
     if not arguments.batch and (arguments.dask or arguments.vehicle):
         raise ConfigError("--dask and --vehicle are for --batch")
-    if arguments.pairs and len(arguments.paths) % 2:
-        raise ConfigError("--pairs takes the files of parent and child by turns: one is missing")
+    if bool(arguments.target) != bool(arguments.camera):
+        raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
     named = [f"{stream}_{kind}" for stream in STREAMS for kind in ("topic", "tf")]
     others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
     if arguments.topics and others:
@@ -154,47 +154,41 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """
     if arguments.list:
         return _list_topics(arguments, as_given)
-    from hand_eye_calib.cli import reading, rig, stops
-    from hand_eye_calib.cli.parts import SeveralRecordings
+    from hand_eye_calib.cli import reading
     from hand_eye_calib.cli.present import deliver
 
     paths = arguments.paths
-    if arguments.topics:
-        return rig.calibrate_bag(arguments, as_given)
-    if stops.are_stops(arguments):
-        calibration, inputs = stops.solved(arguments)
-        return deliver(calibration, arguments, inputs)
-    if arguments.pairs:
-        pairs = list(zip(paths[::2], paths[1::2], strict=True))
-        return _together(arguments, pairs, are_files=True)
+    are_samples = len(paths) == 1 and paths[0].suffix in _SAMPLES
+    if are_samples or arguments.target or arguments.order == "none":
+        from hand_eye_calib.cli import stops
+
+        return deliver(*stops.solved(arguments), arguments)
     if len(paths) > 1 and any(map(reading.journal_in, paths)):
         return _together(arguments, [[path] for path in paths])
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
-    if len(paths) > 2 and not are_bags:
-        return rig.calibrate_files(arguments)
+    if arguments.topics or (len(paths) > 2 and not are_bags):
+        from hand_eye_calib.cli.rig import calibrate_rig
+
+        return calibrate_rig(arguments, as_given)
     options = options_from(arguments)
     try:
         if are_bags:
-            recording = reading.read_paths(paths, sources_from(arguments), options)
+            recording = reading.read_recording(paths, sources_from(arguments), options)
         else:
-            recording = reading.read_pair(paths, reading.file_settings(arguments), options)
-    except SeveralRecordings as several:
+            recording = reading.read_pair(arguments, options)
+    except reading.SeveralRecordings as several:
         note(f"{several.reason}; they give one result, as recordings of one rig")
         return _together(arguments, several.groups)
-    calibration = recording.solved()
-    if arguments.out:
-        recording.with_fingerprints()
+    calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     bag = paths[0] if are_bags else None
-    return deliver(calibration, arguments, as_given(recording.inputs), recording.snapshot, bag)
+    return deliver(calibration, as_given(recording.inputs), arguments, recording.snapshot, bag)
 
 
-def _together(
-    arguments: argparse.Namespace, groups: Sequence[Sequence[Any]], are_files: bool = False
-) -> int:
+def _together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path]]) -> int:
     from hand_eye_calib.cli.batch.run import run_together
 
-    return run_together(arguments, groups, are_files)
+    return run_together(arguments, groups)
 
 
 def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:

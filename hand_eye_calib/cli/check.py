@@ -2,17 +2,9 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import (
-    STREAMS,
-    note,
-    print_result,
-    typed_options,
-    waiting_for,
-    with_progress,
-)
+from hand_eye_calib.cli.console import STREAMS, fail, print_result, typed_options, waiting_for
 from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
@@ -21,7 +13,7 @@ from hand_eye_calib.cli.options import (
     options_from,
     sources_from,
 )
-from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
@@ -53,21 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import answered, finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.cli.console import fail
-    from hand_eye_calib.cli.reading import are_bags, file_settings, read_files
     from hand_eye_calib.engine.checking import check_partial
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
     from hand_eye_calib.plain import json_text
 
     options = options_from(arguments)
-    names = [str(path) for path in arguments.paths]
-    if are_bags(arguments.paths) and len(names) == 1:
-        names, (first, second), of_files = _read_bag(arguments)
-    elif len(names) == 2 and not are_bags(arguments.paths):
-        (first, second), repairs = read_files(arguments.paths, file_settings(arguments), options)
-        of_files = [finding("repaired_file", text=text) for text in repairs]
-    else:
-        raise ConfigError(f"expected one bag or two trajectory files; got {len(names)}")
+    sources, (first, second), repairs = _opened(arguments, options)
     config = offline_config(first, second, options)
     snapshot = whole_snapshot(config, first, second)
     parent, child = snapshot.parent, snapshot.child
@@ -79,8 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
             checked = check_streams(parent, child, offset_s, scale, config.max_gap)
         else:
             checked = check_partial(snapshot)
+    of_files = [finding("disorder", text=text) for text in repairs]
     findings = gravest_first(answered([*checked.findings, *of_files], config))
-    sources = dict(zip(STREAMS, names, strict=True))
     both = zip(STREAMS, (parent, child), strict=True)
     streams = {name: summarise(one) for name, one in both if len(one) > 1}
     if arguments.json:
@@ -99,32 +82,27 @@ def run(arguments: argparse.Namespace) -> int:
     return fail(unusable[0], 1) if unusable else 0
 
 
-def _read_bag(
-    arguments: argparse.Namespace,
-) -> "tuple[list[str], list[Trajectory], list[Finding]]":
-    """Every pose as it was recorded: what is wrong with the stamps is a finding."""
-    from hand_eye_calib.checks.streams import tidy
-    from hand_eye_calib.cli.reading import select
-    from hand_eye_calib.io.bags import PoseBag, PoseBlock
+def _opened(
+    arguments: argparse.Namespace, options: Mapping[str, Any]
+) -> "tuple[dict[str, str], list[Trajectory], list[str]]":
+    """Where both streams are from, their poses, and what was wrong with the stamps."""
+    from hand_eye_calib.cli import reading
 
-    with PoseBag(arguments.paths[0]) as bag:
-        sources, measures = select(bag, sources_from(arguments), config_from(arguments))
-        parent, child = sources.values()
-        blocks = bag.blocks(parent, child, measures=measures)
-        expected = bag.expected(parent, child)
-        found = list(with_progress(blocks, expected, f"reading {bag}", len))
-        for text in bag.warnings:
-            note(text)
-        if not found:
-            raise InputError(f"no poses on {parent} and {child} of {bag}")
-    read = PoseBlock.concatenate(found)
-    trajectories, findings = [], []
-    for stream in STREAMS:
-        part = read[read.streams == stream]
-        tidied, told = tidy(part.stamps_ns, part.poses[:, :3], part.poses[:, 3:], stream)
-        trajectories.append(replace(tidied, measures=measures[stream]))
-        findings += told
-    return [str(parent), str(child)], trajectories, findings
+    paths = arguments.paths
+    is_bag = reading.are_bags(paths)
+    if len(paths) != (1 if is_bag else 2):
+        raise ConfigError(f"expected one bag or two trajectory files; got {len(paths)}")
+    if not is_bag:
+        names = dict(zip(STREAMS, map(str, paths), strict=True))
+        return names, *reading.read_files(arguments, paths, options)
+    from hand_eye_calib.io.bags import PoseBag
+
+    with PoseBag(paths[0]) as bag:
+        sources, measures = reading.select(bag, sources_from(arguments), config_from(arguments))
+        names = {stream: str(source) for stream, source in sources.items()}
+        return names, *reading.read_sources(
+            bag, zip(sources.values(), measures.values(), strict=True)
+        )
 
 
 def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:

@@ -6,7 +6,6 @@ import dataclasses
 import os
 import re
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import PurePath
@@ -107,19 +106,11 @@ def print_result(text: str) -> None:
 
 
 def told_apart(paths: Sequence[str]) -> list[str]:
-    """The shortest ends of paths that tell them apart, without an end that all share: monday and
-    tuesday of monday/bag and tuesday/bag.
+    """Paths without the beginning and the end that all share: monday and tuesday of a/monday/bag
+    and a/tuesday/bag.
     """
     whole = [PurePath(path).parts for path in paths]
     first = len(os.path.commonprefix(whole))
     parts = [each[first:] or each[-1:] for each in whole]
     shared = len(os.path.commonprefix([each[::-1] for each in parts]))
-    names: dict[tuple[str, ...], str] = {}
-    for length in range(1, max(map(len, parts), default=0) + 1):
-        ends = {
-            each: "/".join(each[: len(each) - shared][-length:] or each[-1:])
-            for each in {*parts} - names.keys()
-        }
-        alike = Counter(ends.values())
-        names |= {each: end for each, end in ends.items() if alike[end] == 1}
-    return [names.get(each, "/".join(each)) for each in parts]
+    return ["/".join(each[: len(each) - shared] or each[-1:]) for each in parts]

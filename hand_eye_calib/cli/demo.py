@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
 from hand_eye_calib.cli.options import add_json_argument, at_least
-from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
@@ -57,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
     from hand_eye_calib.cli.present import exit_code
-    from hand_eye_calib.cli.reading import read_bags
+    from hand_eye_calib.cli.reading import read_recording
     from hand_eye_calib.cli.reporting import rendered, write_report
     from hand_eye_calib.io.bags import PoseBag, write_bag
     from hand_eye_calib.plain import json_text
@@ -72,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         streams = zip(TOPICS.values(), (drive.parent, drive.child), strict=True)
         write_bag(bag_path, {topic: (each, "nav_msgs/msg/Odometry") for topic, each in streams})
     note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
-    recording = read_bags([bag_path], TOPICS, CalibratorConfig())
+    recording = read_recording([bag_path], TOPICS, {})
     offline = recording.snapshot.estimate()
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
     # Simulated odometry stays away from robots on the network.

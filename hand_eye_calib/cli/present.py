@@ -49,8 +49,8 @@ _SCATTER = {
 
 def deliver(
     calibration: Calibration,
-    arguments: argparse.Namespace,
     inputs: dict[str, Any],
+    arguments: argparse.Namespace,
     snapshot: "Snapshot | None" = None,
     bag: Path | None = None,
 ) -> int:

@@ -19,14 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fleet_making import always_dies, calibration_of, dies_once, outcome, recordings_of
+from fleet_making import always_dies, dies_once, outcome, recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.cli.batch import run as batch_run
 from hand_eye_calib.cli.batch import work as batch_work
-from hand_eye_calib.cli.batch.run import row_of, write_rows
-from hand_eye_calib.cli.batch.tasks import Task, matching, tasks_of
-from hand_eye_calib.cli.batch.work import outcomes, work
+from hand_eye_calib.cli.batch.run import write_rows
+from hand_eye_calib.cli.batch.work import Outcome, Task, matching, outcomes, tasks_of, work
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
@@ -61,7 +60,14 @@ def fleet(tmp_path):
     """Three drives and a bag that is missing, as they are typed."""
     for number in range(3):
         write_drive(tmp_path / "bags" / f"drive{number}", 60, number)
-    return ["--batch", f"{tmp_path}/bags/drive*", tmp_path / "gone", *STREAMS, "--reference", "B5"]
+    return [
+        "--batch",
+        f"{tmp_path}/bags/drive*",
+        tmp_path / "bags" / "gone",
+        *STREAMS,
+        "--reference",
+        "B5",
+    ]
 
 
 def assert_is_result_of_the_fleet(code, out, err):
@@ -98,7 +104,7 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, mon
     assert done == ["gone"]
     assert "3 of 4 bags are done already" in err
     # A bag that was missing, or has changed, is done; with other options all are.
-    write_drive(tmp_path / "gone", 100, seed=7)
+    write_drive(tmp_path / "bags" / "gone", 100, seed=7)
     next((tmp_path / "bags" / "drive1").glob("*.mcap")).touch()
     done.clear()
     code, out, err = run(*fleet, "--out", out_dir)
@@ -133,7 +139,7 @@ def test_a_batch_checks_the_streams_as_a_single_bag_does(run, tmp_path):
     alone = json.loads(run(tmp_path / "short", *STREAMS, "--json")[1])
     assert row["calibration"]["scale"] == alone["scale"] == pytest.approx(0.001)
     assert row["inputs"]["options"] == alone["inputs"]["options"]
-    assert row["findings"] == alone["findings"]
+    assert row["calibration"]["findings"] == alone["findings"]
     assert row["calibration"]["warnings"] == alone["warnings"]
 
 
@@ -155,17 +161,17 @@ def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
 
 
 def test_a_defect_in_one_bag_leaves_the_others_alone(monkeypatch):
-    monkeypatch.setattr(batch_work, "read_paths", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(batch_work, "read_recording", lambda *_, **__: 1 / 0)
     outcome = work(Task(name="a", bags=("absent",)))
-    assert outcome["error"] == "unexpected ZeroDivisionError: division by zero"
-    assert "ZeroDivisionError" in outcome["traceback"]
+    assert outcome.row["error"] == "unexpected ZeroDivisionError: division by zero"
+    assert "ZeroDivisionError" in json.loads(outcome.text)["traceback"]
 
 
 @pytest.mark.parametrize(
     ("bags", "names"),
     [
-        (["monday/bag", "other", "other"], ["bag", "other", "other_2"]),
-        (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a_monday", "b_monday", "tuesday"]),
+        (["monday/bag", "other", "other"], ["monday_bag", "other", "other_2"]),
+        (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a_monday", "b_monday", "b_tuesday"]),
         (["s3://fleet/t1/run.mcap?sig=a/b", "s3://fleet/t2/run.mcap"], ["t1", "t2"]),
         (["a/vehicles", "a/."], ["vehicles_2", "a"]),
     ],
@@ -182,7 +188,7 @@ def some_tasks(*names, **options):
 
 
 def done_by(tasks, work, **where):
-    return {task.name: found["error"] for task, found in outcomes(tasks, 2, do=work, **where)}
+    return {task.name: found.row["error"] for task, found in outcomes(tasks, 2, do=work, **where)}
 
 
 NAMES = ("a", "b", "c", "d", "bad")
@@ -208,7 +214,7 @@ def ended(pidfd, within_s=120):
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="processes are awaited by Linux's pidfd")
 def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
     code = (
-        "from fleet_making import never_ends; from hand_eye_calib.cli.batch.tasks import Task\n"
+        "from fleet_making import never_ends; from hand_eye_calib.cli.batch.work import Task\n"
         "from hand_eye_calib.cli.batch.work import outcomes\n"
         "if __name__ == '__main__':\n"
         "    tasks = [Task(name=name, bags=(), options={'pipe': PIPE}) for name in 'ab']\n"
@@ -260,7 +266,7 @@ def test_rows_are_the_same_whoever_did_the_work(run, fleet, tmp_path):
 @pytest.mark.parametrize("name", [" =cmd()", "＝1+1", "a;=cmd()"])
 def test_a_cell_cannot_become_a_formula(tmp_path, name):
     (one,) = fleet_outcomes("truck", 1, 1)
-    write_rows(tmp_path / "rows.csv", [row_of({**one, "name": name})])
+    write_rows(tmp_path / "rows.csv", [{**one.row, "name": name}])
     text = (tmp_path / "rows.csv").read_text()
     (row,) = csv.DictReader(text.splitlines())
     assert row["name"] == (name if name[0] == "a" else f"'{name}")
@@ -281,7 +287,7 @@ def outcomes_of(*bags):
         sources={"parent": "/a", "child": "/b"},
         with_fingerprints=True,
     )
-    return tasks, [work(task) for task in tasks]
+    return tasks, [json.loads(work(task).text) for task in tasks]
 
 
 @pytest.fixture
@@ -403,10 +409,10 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     from hand_eye_calib.report.batch_page import render_batch
 
     outcomes = [*fleet_outcomes("<b>", 6, 1, shift=(4, 5)), *fleet_outcomes("a", 2, 2)]
-    outcomes.append({**outcomes[0], "name": "lost", "calibration": None, "error": "no <bag>"})
-    rows = [row_of(one) for one in outcomes]
+    outcomes.append(Outcome.of(Task(name="lost", bags=()), "no <bag>"))
+    rows = [one.row for one in outcomes]
     vehicles = {
-        name: together({one["name"]: calibration_of(one) for one in outcomes[part]})
+        name: together({one.row["name"]: one.calibration for one in outcomes[part]})
         for name, part in (("<b>", slice(0, 6)), ("a", slice(6, 8)))
     }
     with_report = {row["name"] for row in rows[:-1]}
@@ -431,7 +437,7 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
     groups = [[bag] for bag in matching(f"{tmp_path}/fleet/**")]
     assert [(task.name, task.vehicle) for task in tasks_of(groups, "fleet/{vehicle}/*")] == [
         ("truck_1_monday", "truck_1"),
-        ("tuesday", "truck_1"),
+        ("truck_1_tuesday", "truck_1"),
         ("truck_2_monday", "truck_2"),
     ]
     assert {task.vehicle for task in tasks_of(groups, "other/{vehicle}/*")} == {""}

@@ -150,6 +150,6 @@ def test_the_command_refuses_options_of_two_files(files, capsys):
     assert main(["calibrate", *files, "--parent-format", "tum"]) == 2
     assert "--parent-format is of two files" in capsys.readouterr().err
     assert main(["calibrate", *files[:2], files[1]]) == 2
-    assert "of one sensor, 'front'" in capsys.readouterr().err
+    assert "of one sensor, 'front.txt'" in capsys.readouterr().err
     assert main(["calibrate", *files, "--installed", "0 0 0 0 0 0"]) == 2
     assert "--installed and --base-frame are of two sensors" in capsys.readouterr().err

@@ -111,5 +111,5 @@ class TestCommand:
         document = json.loads(capsys.readouterr().out)
         assert document["reference"] == "stops"
         np.testing.assert_allclose(document["T_parent_child"]["matrix"], X, atol=5e-3)
-        assert main(["calibrate", files[0], "--order", "none"]) == 2
-        assert "two trajectory files, or the samples" in capsys.readouterr().err
+        assert main(["calibrate", files[0], "--order", "none"]) == 1
+        assert "expected samples of an arm" in capsys.readouterr().err

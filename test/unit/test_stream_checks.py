@@ -19,7 +19,6 @@ from hand_eye_calib.checks.streams import (
     check_stream,
     frozen_share,
     summarise,
-    tidy,
 )
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
@@ -186,15 +185,6 @@ class TestOneStream:
             if f.code == "jumps"
         ]
         assert "1.0% of the child stream's steps" in jumps[0].what
-
-    def test_disorder_and_repeated_stamps(self):
-        stamps_ns = np.array([0, 10, 20, 20, 40, 30, 50]) * 10**7
-        trajectory, findings = tidy(
-            stamps_ns, np.arange(21).reshape(7, 3), np.tile([0, 0, 0, 1.0], (7, 1)), "child"
-        )
-        assert np.array_equal(trajectory.stamps_ns, np.array([0, 10, 20, 30, 40, 50]) * 10**7)
-        assert trajectory.poses[2, 0, 3] == 6.0
-        assert [f.code for f in findings] == ["disorder"]
 
     def test_frozen_only_while_the_other_moves(self):
         parent, child = drive()

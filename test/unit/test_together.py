@@ -121,21 +121,3 @@ def test_python_takes_pairs_of_trajectories():
     assert table.x_m["1"] == pytest.approx(T_PARENT_CHILD[0, 3], abs=3e-3)
     with pytest.raises(InputError, match="monday: "):
         hec.calibrate_together([(pairs[0][0], 3)], ["monday"])
-
-
-def test_files_are_given_two_by_two(run, tmp_path, no_figures):
-    paths = []
-    for seed in range(2):
-        for name, stream in zip(("a", "b"), pair(seed, 60), strict=True):
-            paths.append(tmp_path / f"{name}{seed}.tum")
-            hec.write_trajectory(paths[-1], stream)
-    given = ["--pairs", *paths, "--jobs", "1", "--no-report", "--out", tmp_path / "out"]
-    code, out, err = run("calibrate", *given)
-    assert code == 0
-    assert "The 2 recordings agree within their standard deviations" in out
-    assert hec.load(tmp_path / "out").together.kind == "agree"
-    assert hec.load(tmp_path / "out" / "a1").together is None
-    assert (tmp_path / "out" / "report.html").exists()
-    code, out, err = run("calibrate", *given)
-    assert "2 of 2 bags are done already" in err
-    assert run("calibrate", "--pairs", *paths[:3])[0] == 2

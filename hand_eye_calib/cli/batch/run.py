@@ -10,21 +10,18 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
 
-from hand_eye_calib.cli.batch import tasks as names
-from hand_eye_calib.cli.batch.tasks import Task, matching, tasks_of
-from hand_eye_calib.cli.batch.work import Outcome, outcomes
-from hand_eye_calib.cli.console import STREAMS, note, waiting_for, with_progress
+from hand_eye_calib.cli.batch import work
+from hand_eye_calib.cli.batch.work import Outcome, Row, Task, matching, outcomes, tasks_of
+from hand_eye_calib.cli.console import note, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from, sources_from
-from hand_eye_calib.cli.present import deliver, exit_code, wrapped
+from hand_eye_calib.cli.present import deliver, wrapped
 from hand_eye_calib.cli.reporting import REPORT, save_text
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.session.together import row_of_result, together
+from hand_eye_calib.session.together import together
 from hand_eye_calib.text import counted, listing
 
 # The worst come first on the terminal; rows.csv has all.
@@ -32,32 +29,6 @@ _MOST_LINES = 200
 _GRAVITY = ("failed", *(each.value for each in reversed(Verdict)))
 # Text that begins with one of these is a formula to spreadsheets, with full width to some.
 _FORMULA = ("=", "+", "-", "@", *"＝＋－＠")
-
-Row = dict[str, Any]
-
-
-class Done(NamedTuple):
-    """A recording that is done: its row, and its outcome as text, which takes little memory."""
-
-    row: Row
-    text: str
-    code: int
-
-    @classmethod
-    def of(cls, outcome: Outcome) -> "Done":
-        """Raises the errors of damaged values."""
-        found, code = outcome["calibration"], 1
-        if found and not outcome["error"]:
-            code = exit_code(Calibration.from_dict(found))
-        return cls(row_of(outcome), json.dumps(outcome, separators=(",", ":")), code)
-
-    @property
-    def calibration(self) -> Calibration:
-        return Calibration.from_dict(json.loads(self.text)["calibration"])
-
-    @property
-    def verdict(self) -> str:
-        return "failed" if self.row["error"] else str(self.row["verdict"])
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
@@ -71,8 +42,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.io.results import save_result
 
         for name, each in vehicles.items():
-            save_result(each, arguments.out / names.VEHICLES / name)
-        _write_rows_and_page(arguments.out, title, done, vehicles, names.INDEX)
+            save_result(each, arguments.out / work.VEHICLES / name)
+        _write_rows_and_page(arguments.out, title, done, vehicles, work.INDEX)
     if arguments.json:
         document = {
             "batch": title,
@@ -95,30 +66,24 @@ def run_batch(arguments: argparse.Namespace) -> int:
     return 1 if 1 in codes else max(codes)
 
 
-def run_together(
-    arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]], are_files: bool
-) -> int:
-    """Calibrate from several recordings of one rig, each given by its bags or files, for one
-    result; returns the exit code.
+def run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]]) -> int:
+    """Calibrate from several recordings of one rig, each given by its bags, for one result; returns
+    the exit code.
     """
-    done = _all_done([[*map(str, group)] for group in groups], "rig", arguments, are_files)
+    done = _all_done([[*map(str, group)] for group in groups], "rig", arguments)
     usable = {one.row["name"]: one.calibration for one in done if one.row["verdict"]}
     if not usable:
         raise InputError("; ".join(f"{one.row['name']}: {one.row['error']}" for one in done))
     found = together(usable)
     if arguments.out:
         _write_rows_and_page(arguments.out, "recordings of one rig", done, {"rig": found}, REPORT)
-    inputs = {"recordings": {one.row["name"]: json.loads(one.text)["inputs"] for one in done}}
-    code = deliver(found, arguments, inputs)
+    code = deliver(found, {"recordings": {one.row["name"]: one.inputs for one in done}}, arguments)
     return 1 if any(one.row["error"] for one in done) else code
 
 
 def _all_done(
-    groups: Sequence[Sequence[str]],
-    vehicle: str,
-    arguments: argparse.Namespace,
-    are_files: bool = False,
-) -> list[Done]:
+    groups: Sequence[Sequence[str]], vehicle: str, arguments: argparse.Namespace
+) -> list[Outcome]:
     """The recordings of an earlier run, and of this one, in their order."""
     out: Path | None = arguments.out
     tasks = tasks_of(
@@ -128,29 +93,26 @@ def _all_done(
         sources=sources_from(arguments),
         with_fingerprints=bool(out),
         with_report=bool(out) and not arguments.no_report,
-        are_files=are_files,
     )
-    found: dict[str, Done] = {}
+    found: dict[str, Outcome] = {}
     for task in with_progress(tasks, len(tasks), "looking for earlier results") if out else ():
         if earlier := stored(task, arguments.out):
             found[task.name] = earlier
     if found:
         note(f"{len(found)} of {len(tasks)} bags are done already; their results are in {out}")
     waiting = [task for task in tasks if task.name not in found]
-    jobs = min(arguments.jobs or os.cpu_count() or 1, len(waiting))
-    doing = outcomes(waiting, jobs, arguments.dask) if waiting else ()
+    doing = outcomes(waiting, arguments.jobs or os.cpu_count() or 1, arguments.dask)
     for task, outcome in with_progress(doing, len(waiting), "calibrating"):
-        page = outcome.pop("page", None)
-        found[task.name] = one = Done.of(outcome)
+        found[task.name] = outcome._replace(page="")
         if out:
-            _store(task, outcome, page, out)
-        told = one.row["error"] or one.row["headline"]
-        if one.row["error"] or not sys.stderr.isatty():
+            _store(task, outcome, out)
+        if outcome.row["error"] or not sys.stderr.isatty():
+            told = outcome.row["error"] or outcome.row["headline"]
             note(f"{len(found)} of {len(tasks)}: {task.name}: {told}")
     return [found[task.name] for task in tasks]
 
 
-def stored(task: Task, directory: Path) -> Done | None:
+def stored(task: Task, directory: Path) -> Outcome | None:
     """What an earlier run did; None if there is nothing, it failed, or something has changed since.
     A folder that is a link out of the directory is an InputError.
     """
@@ -158,43 +120,26 @@ def stored(task: Task, directory: Path) -> Done | None:
     if folder.is_symlink() and not folder.resolve().is_relative_to(directory.resolve()):
         raise InputError(f"{folder} is a link out of {directory}; remove it")
     try:
-        state = json.loads((folder / names.STATE).read_text(encoding="utf-8"))
-        is_same = state["key"] == task.key() and not state["outcome"]["error"]
-        return Done.of(state["outcome"]) if is_same else None
+        about, text = (folder / work.STATE).read_text(encoding="utf-8").splitlines()
+        state = json.loads(about)
+        return Outcome(state["row"], state["code"], text) if state["key"] == task.key() else None
     except Exception:  # to be done again, whatever is wrong with it
         return None
 
 
-def _store(task: Task, outcome: Outcome, page: str | None, directory: Path) -> None:
+def _store(task: Task, outcome: Outcome, directory: Path) -> None:
     """Write the results of a task into its folder."""
     from hand_eye_calib.io.results import save_result
 
     folder = directory / task.name
-    if outcome["calibration"]:
-        save_result(Calibration.from_dict(outcome["calibration"]), folder, outcome["inputs"])
-    if page:
-        save_text(folder / REPORT, page)
+    if outcome.row["verdict"]:
+        save_result(outcome.calibration, folder, outcome.inputs)
+    if outcome.page:
+        save_text(folder / REPORT, outcome.page)
     # What failed is done again in any case, and its bag may be out of reach.
-    key = "" if outcome["error"] else task.key()
-    save_text(folder / names.STATE, json_text({"key": key, "outcome": outcome}) + "\n")
-
-
-def row_of(outcome: Outcome) -> Row:
-    """The row of an outcome in plain values, for tables of other programs."""
-    inputs, calibration = outcome["inputs"], outcome["calibration"]
-    row: Row = {name: outcome[name] for name in ("name", "vehicle", "error")}
-    row |= dict.fromkeys(("start", "duration_s", "verdict", "headline"))
-    row["bags"] = " ".join(outcome["bags"])
-    stamps = [inputs[each] for each in STREAMS if each in inputs]
-    starts = [stream["first_stamp_ns"] for stream in stamps]
-    if starts and None not in starts:
-        date = datetime.fromtimestamp(max(starts) // 1_000_000_000, UTC)
-        row["start"] = date.isoformat(timespec="seconds")
-        row["duration_s"] = (min(each["last_stamp_ns"] for each in stamps) - max(starts)) * 1e-9
-    if calibration:
-        row |= row_of_result(calibration) | {"warnings": "; ".join(calibration["warnings"])}
-        row["findings"] = " ".join(finding["code"] for finding in outcome["findings"])
-    return row
+    key = "" if outcome.row["error"] else task.key()
+    about = json.dumps({"key": key, "row": outcome.row, "code": outcome.code})
+    save_text(folder / work.STATE, f"{about}\n{outcome.text}\n")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -211,9 +156,9 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     save_text(path, text.getvalue())
 
 
-def _vehicles(done: Sequence[Done]) -> dict[str, Calibration]:
+def _vehicles(done: Sequence[Outcome]) -> dict[str, Calibration]:
     """What the recordings of each vehicle say together."""
-    groups: dict[str, list[Done]] = {}
+    groups: dict[str, list[Outcome]] = {}
     for one in done:
         if one.row["vehicle"] and one.row["verdict"]:
             groups.setdefault(one.row["vehicle"], []).append(one)
@@ -230,21 +175,21 @@ def _vehicles(done: Sequence[Done]) -> dict[str, Calibration]:
 def _write_rows_and_page(
     directory: Path,
     title: str,
-    done: Sequence[Done],
+    done: Sequence[Outcome],
     vehicles: Mapping[str, Calibration],
     page: str,
 ) -> None:
     from hand_eye_calib.report.batch_page import render_batch
 
     rows = [one.row for one in done]
-    write_rows(directory / names.TABLE, rows)
+    write_rows(directory / work.TABLE, rows)
     linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
     save_text(directory / page, render_batch(title, rows, vehicles, linked))
-    for name in (names.TABLE, page):
+    for name in (work.TABLE, page):
         note(f"wrote {directory / name}")
 
 
-def _print_results(done: Sequence[Done], vehicles: Mapping[str, Calibration]) -> None:
+def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration]) -> None:
     """Print a line for each recording, the worst first, and what those of each vehicle say."""
     in_order = sorted(done, key=lambda one: _GRAVITY.index(one.verdict))
     for one in in_order[:_MOST_LINES]:

@@ -1,80 +1,230 @@
-"""The work of one task, and who does many: processes of this machine, or a Dask cluster."""
+"""Which recordings a batch has, the work of one of them, and who does many: processes of this
+machine, or a Dask cluster.
+"""
 
+import hashlib
+import json
 import multiprocessing
 import os
+import re
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from glob import glob, has_magic
+from itertools import chain, count
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
-from hand_eye_calib.cli.batch.tasks import Task
-from hand_eye_calib.cli.reading import read_paths
+from hand_eye_calib.cli.console import STREAMS, told_apart
+from hand_eye_calib.cli.options import Options
+from hand_eye_calib.cli.present import exit_code
+from hand_eye_calib.cli.reading import read_recording
 from hand_eye_calib.cli.reporting import rendered
-from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.io import remote
 from hand_eye_calib.io.limits import ReadingMemory
-from hand_eye_calib.io.remote import local_copies, public
-from hand_eye_calib.plain import plain
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.session.together import row_of_result
 
-# What came of a task, in plain values.
-Outcome = dict[str, Any]
+STATE, TABLE, INDEX, VEHICLES = "batch.jsonl", "rows.csv", "index.html", "vehicles"
+_BAGS = (".bag", ".mcap", ".db3")
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One recording to calibrate from, in plain values: it travels to other processes and machines.
+
+    Attributes
+    ----------
+    name : str
+        Of its row and its folder.
+    bags : tuple of str
+        Paths or URLs of its parts, or the directory of a journal.
+    vehicle : str
+        The rig; recordings of one are put together. Empty if it is not known.
+    options : dict
+    sources : dict
+        "parent" and "child" to a topic or WORLD:SENSOR, if they are given.
+    with_fingerprints, with_report : bool
+    """
+
+    name: str
+    bags: tuple[str, ...]
+    vehicle: str = ""
+    options: Options = field(default_factory=dict)
+    sources: dict[str, str] = field(default_factory=dict)
+    with_fingerprints: bool = False
+    with_report: bool = False
+
+    def key(self) -> str:
+        """Digest of the task, its options, and names, sizes and times of its files, so that no
+        older result is taken for this one's.
+        """
+        text = json.dumps([asdict(self), list(map(_state, self.bags))], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _state(bag: str) -> list[Any]:
+    path = Path(bag)  # none of a URL
+    files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
+    return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+
+
+def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) -> list[Task]:
+    """A task for each group of bags that are one recording; ``vehicle`` is its name, or has
+    ``{vehicle}`` at its place in their paths. The other values are those of every Task.
+    """
+    pattern = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
+    pattern = pattern.replace(re.escape("{vehicle}"), "([^/]+)")
+    # A path as "." has no name of its own.
+    paths = [
+        bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
+        for bag, *_ in groups
+    ]
+    stems = told_apart([str(Path(path).with_suffix("")) for path in paths])
+    tasks: list[Task] = []
+    names = {STATE, TABLE, INDEX, VEHICLES}
+    for group, stem in zip(groups, stems, strict=True):
+        name = stem.replace("/", "_")
+        numbered = chain([name], (f"{name}_{number}" for number in count(2)))
+        name = next(one for one in numbered if one not in names)
+        names.add(name)
+        of = vehicle
+        if "{vehicle}" in vehicle:
+            match = re.search(pattern, group[0])
+            of = match[1].strip(".") if match else ""
+        tasks.append(Task(name=name, bags=tuple(group), vehicle=of, **common))
+    return tasks
+
+
+def matching(pattern: str) -> list[str]:
+    """The bags that a pattern stands for, or a ConfigError; a path stands for itself. ``**`` finds
+    bags alone.
+    """
+    found = [pattern]
+    if remote.is_url(pattern):  # a question mark begins its query
+        found = remote.expanded(pattern) if "*" in pattern else found
+    elif has_magic(pattern) and not Path(pattern).exists():
+        found = sorted(glob(pattern, recursive=True))
+        if "**" in pattern:
+            found = [each for each in found if _is_recording(Path(each))]
+    if not found:
+        raise ConfigError(f"no bag matches {pattern}")
+    return found
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether a path is a bag, and not a file of one."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists()
+    return path.suffix in _BAGS and not (path.parent / "metadata.yaml").exists()
+
+
+# ------------------------------------------------------------------ one recording
+
+
+class Outcome(NamedTuple):
+    """What came of a recording.
+
+    Attributes
+    ----------
+    row : dict
+        Its row of the table, in plain values.
+    code : int
+        The exit code of its own.
+    text : str
+        JSON of ``name``, ``vehicle``, ``bags``, ``calibration`` (Calibration.to_dict or null),
+        ``inputs``, ``error`` (text or null), and a ``traceback`` for defects of the program. As
+        text it takes little memory.
+    page : str
+        Its report, if it is wanted.
+    """
+
+    row: Row
+    code: int
+    text: str
+    page: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        error: str | None,
+        result: Calibration | None = None,
+        inputs: Mapping[str, Any] | None = None,
+        page: str = "",
+        as_given: remote.AsGiven = lambda value: value,
+        **more: str,
+    ) -> "Outcome":
+        """From what there is to say of a task beside what is known of every task; ``as_given`` puts
+        URLs back.
+        """
+        inputs = inputs or {}
+        row: Row = {"name": task.name, "vehicle": task.vehicle, "error": error}
+        bags = [remote.public(bag) for bag in task.bags]
+        found = as_given(result.to_dict()) if result else None
+        whole = row | {"bags": bags, "calibration": found, "inputs": as_given(inputs), **more}
+        row |= dict.fromkeys(("start", "duration_s", "verdict", "headline"))
+        row["bags"] = " ".join(bags)
+        stamps = [inputs[each] for each in STREAMS if each in inputs]
+        starts = [stream["first_stamp_ns"] for stream in stamps]
+        if starts and None not in starts:
+            date = datetime.fromtimestamp(max(starts) // 1_000_000_000, UTC)
+            row["start"] = date.isoformat(timespec="seconds")
+            row["duration_s"] = (min(one["last_stamp_ns"] for one in stamps) - max(starts)) * 1e-9
+        if found and result:
+            row |= row_of_result(found) | {"warnings": "; ".join(found["warnings"])}
+            row["findings"] = " ".join(finding.code for finding in result.findings)
+        code = exit_code(result) if result and not error else 1
+        return cls(row, code, json.dumps(whole, separators=(",", ":")), page)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The result; only of a row with a verdict."""
+        return Calibration.from_dict(json.loads(self.text)["calibration"])
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """Where the data came from."""
+        found: dict[str, Any] = json.loads(self.text)["inputs"]
+        return found
+
+    @property
+    def verdict(self) -> str:
+        """In a word, which may be "failed"."""
+        return "failed" if self.row["error"] else str(self.row["verdict"])
+
+
 # Does a task.
 Work = Callable[[Task], Outcome]
 
-# A task is tried so often if worker processes die of it.
-_MOST_DEATHS = 3
-
 
 def work(task: Task) -> Outcome:
-    """Do a task; what goes wrong becomes part of the outcome, so that the others go on.
-
-    It has ``name``, ``vehicle``, ``bags``, ``calibration`` (Calibration.to_dict or None),
-    ``findings``, ``inputs``, ``error`` (text or None), the ``page`` of the report if it is wanted,
-    and a ``traceback`` for defects of the program.
-    """
+    """Do a task; what goes wrong becomes part of the outcome, so that the others go on."""
     ReadingMemory.switch_on()  # this may be a process of its own
     try:
-        with local_copies(task.bags) as (paths, as_given):
-            return failed(task, None) | as_given(_calibrated(task, paths))
+        with remote.local_copies(task.bags) as (paths, as_given):
+            recording = read_recording([*map(Path, paths)], task.sources, task.options)
+            result, inputs = recording.solved(task.with_fingerprints), recording.inputs
+            page = rendered(result, recording.snapshot, inputs) if task.with_report else ""
+            failure = result.status.failure or None
+            return Outcome.of(task, failure, result, inputs, page, as_given)
     except HandEyeCalibError as error:
-        return failed(task, str(error))
+        return Outcome.of(task, str(error))
     except Exception as error:
         text = " ".join(f"unexpected {type(error).__name__}: {error}".split())
-        return failed(task, text) | {"traceback": traceback.format_exc()}
+        return Outcome.of(task, text, traceback=traceback.format_exc())
 
 
-def failed(task: Task, reason: str | None) -> Outcome:
-    """The outcome of a task that gave no calibration."""
-    return {
-        "name": task.name,
-        "vehicle": task.vehicle,
-        "bags": [public(bag) for bag in task.bags],
-        "calibration": None,
-        "findings": [],
-        "inputs": {},
-        "error": reason,
-    }
-
-
-def _calibrated(task: Task, paths: list[str]) -> Outcome:
-    """What a task adds to its outcome if nothing goes wrong."""
-    recording = read_paths(list(map(Path, paths)), task.sources, task.options, task.are_files)
-    calibration = recording.solved()
-    if task.with_fingerprints:
-        recording.with_fingerprints()
-    found: Outcome = {"inputs": recording.inputs, "error": calibration.status.failure or None}
-    if task.with_report:
-        found["page"] = rendered(calibration, recording.snapshot, recording.inputs)
-    return found | {
-        "calibration": calibration.to_dict(),
-        "findings": plain(calibration.findings),
-    }
+# ---------------------------------------------------------------------- many of them
 
 
 def outcomes(
@@ -82,57 +232,43 @@ def outcomes(
 ) -> Iterator[tuple[Task, Outcome]]:
     """Do tasks in so many processes of this machine, or on the Dask cluster at an address, whose
     workers must see the bags under the same paths; yields each with its outcome when it is done.
-    What a worker that dies had to do is done again.
+
+    If a worker dies, those tasks that may be to blame are done again one by one, and then the rest.
     """
-    with _on_dask(dask, do) if dask else _on_cores(jobs, do) as (executor, attempt):
-        futures = {executor.submit(attempt, task): task for task in tasks}
-        for future in as_completed([*futures]):
-            task = futures.pop(future)
-            if error := future.exception():
-                yield task, failed(task, f"the cluster lost it: {' '.join(str(error).split())}")
-            else:
-                yield task, future.result()
+    waiting = [[*tasks]]
+    while waiting:
+        some, lost = waiting.pop(0), dict[str, str]()
+        with _cluster(dask) if dask else _processes(min(jobs, len(some))) as executor:
+            futures = {executor.submit(do, task): task for task in some}
+            for future in as_completed([*futures]):
+                task = futures.pop(future)
+                if error := future.exception():
+                    lost[task.name] = " ".join(str(error).split())
+                else:
+                    yield task, future.result()
+        left = [task for task in some if task.name in lost]
+        if dask or len(some) == 1:
+            told = "worker processes die of it, perhaps for lack of memory: --jobs 1"
+            for task in left:
+                why = f"the cluster lost it: {lost[task.name]}" if dask else told
+                yield task, Outcome.of(task, why)
+        else:
+            # A pool begins its tasks in their order.
+            waiting[:0] = [[task] for task in left[:jobs]] + [left[jobs:]] * bool(left[jobs:])
 
 
 @contextmanager
-def _on_cores(jobs: int, do: Work) -> Iterator[tuple[Executor, Work]]:
-    """One pool for each process, so that one that dies takes no other task along."""
-    pools: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
-    for _ in range(jobs):
-        pools.put(_one_process())
-    is_over = threading.Event()
-
-    def attempt(task: Task) -> Outcome:
-        pool = pools.get()
-        try:
-            for _ in range(_MOST_DEATHS):
-                try:
-                    return pool.submit(do, task).result()
-                except BrokenProcessPool:
-                    pool = _one_process()
-                    if is_over.is_set():
-                        break
-        finally:
-            pools.put(pool)
-        return failed(task, "worker processes die of it, perhaps for lack of memory: --jobs 1")
-
-    with ThreadPoolExecutor(jobs) as threads:
-        try:
-            yield threads, attempt
-        except BaseException:
-            is_over.set()
-            threads.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-        finally:
-            for _ in range(jobs):
-                pools.get().shutdown()
-
-
-def _one_process() -> ProcessPoolExecutor:
-    """A worker process, spawned: forking a program with threads is not safe."""
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin)
+def _processes(jobs: int) -> Iterator[Executor]:
+    """Worker processes, spawned: forking a program with threads is not safe."""
+    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    executor.shutdown()
 
 
 def _begin() -> None:
@@ -151,7 +287,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _on_dask(address: str, do: Work) -> Iterator[tuple[Executor, Work]]:
+def _cluster(address: str) -> Iterator[Executor]:
     try:
         from dask.distributed import Client
     except ModuleNotFoundError as error:
@@ -165,4 +301,4 @@ def _on_dask(address: str, do: Work) -> Iterator[tuple[Executor, Work]]:
         reason = " ".join(str(error).split())
         raise InputError(f"no Dask scheduler at {address}: {reason}") from None
     with client:
-        yield client.get_executor(pure=False), do
+        yield client.get_executor(pure=False)
