@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from hand_eye_calib.cli.reading import feed
+from hand_eye_calib.cli.reading import _feed as feed
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -90,12 +91,11 @@ def with_ours(path):
     """Seconds to read, to hand everything to the engine as well, and to solve."""
     start = time.process_time()
     with PoseBag(path) as bag:
-        for _ in bag.blocks(*TOPICS.values()):
-            pass
+        bag.poses(*TOPICS.values())
     read = time.process_time()
     calibrator = Calibrator()
     with PoseBag(path) as bag:
-        feed(calibrator, bag.blocks(*TOPICS.values()), TOPICS)
+        feed(calibrator, bag.poses(*TOPICS.values()), TOPICS)
     fed = time.process_time()
     calibrator.estimate()
     return read - start, fed - read, time.process_time() - fed
@@ -149,7 +149,7 @@ def images(folder, gigabytes, console):
             writer.add_connection(topic, ODOMETRY, typestore=TYPESTORE) for topic in TOPICS.values()
         ]
         with PoseBag(_small_bag(folder, count)) as bag:
-            messages = (message for block in bag._messages(TOPICS.values()) for message in block)
+            messages = chain.from_iterable(bag._blocks(TOPICS.values()))
             for number, (kind, bag_ns, data) in enumerate(messages):
                 if number % (2 * count // n_images) == 0:
                     writer.write(connection, bag_ns, raw)

@@ -33,7 +33,7 @@ def storage_file(path):
 
 
 class Pose(NamedTuple):
-    """A row of a PoseBlock."""
+    """A row of a PoseTable."""
 
     stream: str
     number: int
@@ -46,11 +46,8 @@ class Pose(NamedTuple):
 
 def poses_of(bag, parent="/a", child="/b"):
     """The poses of an open bag one by one."""
-    found = []
-    for block in bag.blocks(parent, child):
-        columns = [column.tolist() for column in vars(block).values()]
-        found += [Pose(*row[:5], tuple(row[5]), row[6]) for row in zip(*columns, strict=True)]
-    return found
+    columns = [column.tolist() for column in vars(bag.poses(parent, child)).values()]
+    return [Pose(*row[:5], tuple(row[5]), row[6]) for row in zip(*columns, strict=True)]
 
 
 def all_poses(path, parent="/a", child="/b"):

@@ -204,7 +204,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
             is_sampled = each.count > 1 and bag.duration_s > 0
             topics.append(dict(each._asdict()))
             topics[-1]["rate_hz"] = (each.count - 1) / bag.duration_s if is_sampled else None
-            topics[-1]["frames"] = bag.frames_on(each.name)
+            topics[-1]["frames"] = bag.edges_on(each.name)
             topics[-1]["is_usable"] = each.type in SENSOR_TYPES
         document = {"bag": as_given(str(bag)), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
         document |= {"duration_s": bag.duration_s, "topics": topics}

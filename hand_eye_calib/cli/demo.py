@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     node = _node(arguments.out / "node.log")
     with waiting_for("playing"), node as check, Player(TOPICS, check) as player:
         with PoseBag(bag_path) as bag:
-            player.play(bag.blocks(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
+            player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
         online = player.wait_for_extrinsic(offline.stamp_ns)
     note("3/4 calibrated live; the report follows")
     document = _document(drive, offline, online) | {"bag": str(bag_path)}

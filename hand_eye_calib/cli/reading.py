@@ -8,7 +8,6 @@ from argparse import Namespace
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -25,8 +24,7 @@ from hand_eye_calib.text import names_of_files
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.calibrator import Calibrator
-    from hand_eye_calib.io.bags import PoseBag, PoseBlock
-    from hand_eye_calib.io.bags.topics import Source
+    from hand_eye_calib.io.bags import PoseBag, PoseTable, Source
 
 _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
@@ -179,7 +177,7 @@ def select(
 ) -> tuple[dict[str, "Source"], dict[str, str]]:
     """The sources of "parent" and "child" in a bag, and what each measures."""
     given = {stream: source_of(text) for stream, text in wanted.items()}
-    chosen = bag.topics.select(given.get("parent"), given.get("child"))
+    chosen = bag.select(given.get("parent"), given.get("child"))
     if len(given) < len(STREAMS):
         parent, child = chosen
         note(
@@ -199,12 +197,10 @@ def read_sources(
     """The whole trajectories of sources of a bag, each with what it measures, and what was wrong
     with their stamps.
     """
-    from hand_eye_calib.io.bags import trajectory_of
-
     found = []
     for source, kind in measures:
         with waiting_for(f"reading {source}"):
-            found.append(trajectory_of(bag, source, kind))
+            found.append(bag.trajectory(source, kind))
     for text in bag.warnings:
         note(text)
     return [poses for poses, _ in found], [text for _, notes in found for text in notes]
@@ -222,56 +218,40 @@ def _read_bags(
         of_streams: dict[str, Any] = {f"{stream}_measures": measures[stream] for stream in STREAMS}
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
         bag.shown = with_progress
-        blocks = bag.blocks(sources["parent"], sources["child"], config.max_gap, measures)
-        # What is read whole, as transforms and scans, is read before the first block.
-        with waiting_for(f"opening {bag}"):
-            first = list(islice(blocks, 1))
-        expected = bag.expected(*sources.values())
-        shown = with_progress(chain(first, blocks), expected, f"reading {bag}", len)
-        found = _feed(calibrator, shown, sources) + bag.n_left_out
+        poses = bag.poses(sources["parent"], sources["child"], config.max_gap, measures)
+        _feed(calibrator, poses, sources)
         for stream, source in sources.items():
             if not calibrator.frame(stream):
                 calibrator.set_frame(stream, str(source).strip("/"))
         warnings = list(bag.warnings)
         files = bag.files()
-    if expected is not None and found != expected:
-        warnings.append(
-            f"{bag} says it has {expected} messages on these topics, but {found} could be read; it "
-            "may be damaged"
-        )
     for text in warnings:
         note(text)
     inputs = {"bag": str(bag), **calibrator.inputs(sources)}
     return Recording(calibrator.snapshot(), inputs, files, tuple(warnings))
 
 
-def _feed(
-    calibrator: "Calibrator", blocks: "Iterable[PoseBlock]", topics: Mapping[str, Any]
-) -> int:
-    """Give every pose to the engine; returns how many there were. The first message that cannot be
-    used is an InputError with topic, message number and stamp.
+def _feed(calibrator: "Calibrator", poses: "PoseTable", topics: Mapping[str, Any]) -> None:
+    """Give every pose to the engine. The first message that cannot be used is an InputError with
+    topic, message number and stamp.
     """
     # A message without a frame name changes nothing.
     frames: set[tuple[str, str | None]] = {(stream, None) for stream in topics}
-    count = 0
-    for block in blocks:
-        count += len(block)
-        columns = (block.streams, block.sensor_frames, block.stamps_ns, block.poses)
-        row = 0
-        try:
-            rows = zip(*(column.tolist() for column in columns), strict=True)
-            for row, (stream, frame, stamp_ns, pose) in enumerate(rows):  # noqa: B007
-                if (stream, frame) not in frames:
-                    calibrator.set_frame(stream, frame)
-                    frames.add((stream, frame))
-                calibrator.add_pose(stream, stamp_ns, pose[:3], pose[3:])
-        except InputError as error:
-            seconds, nanoseconds = divmod(int(block.stamps_ns[row]), 1_000_000_000)
-            raise InputError(
-                f"{topics[block.streams[row]]}, message {block.message_numbers[row]}, stamp "
-                f"{seconds}.{nanoseconds:09d}: {error}"
-            ) from error
-    return count
+    columns = (poses.streams, poses.sensor_frames, poses.stamps_ns, poses.poses)
+    row = 0
+    try:
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for row, (stream, frame, stamp_ns, pose) in enumerate(rows):  # noqa: B007
+            if (stream, frame) not in frames:
+                calibrator.set_frame(stream, frame)
+                frames.add((stream, frame))
+            calibrator.add_pose(stream, stamp_ns, pose[:3], pose[3:])
+    except InputError as error:
+        seconds, nanoseconds = divmod(int(poses.stamps_ns[row]), 1_000_000_000)
+        raise InputError(
+            f"{topics[poses.streams[row]]}, message {poses.message_numbers[row]}, stamp "
+            f"{seconds}.{nanoseconds:09d}: {error}"
+        ) from error
 
 
 def refuse_recordings(paths: Sequence[Path], sources: "Collection[Source]") -> None:
@@ -309,7 +289,7 @@ class _Part(NamedTuple):
         with PoseBag(path) as bag:
             for source in sources:
                 with suppress(InputError):
-                    bag.topics.check(source)
+                    bag.check(source)
                     has.add(source)
             return cls(bag.start_ns or 0, bag.end_ns or 0, path, has)
 

@@ -3,7 +3,7 @@ the middleware, for ``demo``.
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import rclpy
@@ -20,7 +20,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
 
 if TYPE_CHECKING:  # what reads bags is not needed to play poses
-    from hand_eye_calib.io.bags import PoseBlock
+    from hand_eye_calib.io.bags import PoseTable
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -73,20 +73,18 @@ class Player:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def play(self, blocks: Iterable["PoseBlock"], speed: float) -> None:
+    def play(self, poses: "PoseTable", speed: float) -> None:
         """Publish poses ``speed`` times as fast as they were recorded, once the node listens to
         both topics.
         """
         publishers = self._publishers.values()
         self._wait(lambda: all(each.get_subscription_count() for each in publishers), "subscribe")
-        start_s, first_ns = time.monotonic(), None
-        for block in blocks:
-            for row, stamp_ns in enumerate(block.stamps_ns.tolist()):
-                first_ns = stamp_ns if first_ns is None else first_ns
-                due_s = start_s + (stamp_ns - first_ns) * 1e-9 / speed
-                while (remaining_s := due_s - time.monotonic()) > 0:
-                    self._executor.spin_once(timeout_sec=remaining_s)
-                self._publishers[block.streams[row]].publish(_odometry(block, row))
+        start_s, first_ns = time.monotonic(), int(poses.stamps_ns[0])
+        for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
+            due_s = start_s + (stamp_ns - first_ns) * 1e-9 / speed
+            while (remaining_s := due_s - time.monotonic()) > 0:
+                self._executor.spin_once(timeout_sec=remaining_s)
+            self._publishers[poses.streams[row]].publish(_odometry(poses, row))
         self._check()
 
     def wait_for_extrinsic(self, stamp_ns: int) -> LiveExtrinsic:
@@ -118,12 +116,12 @@ class Player:
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
 
-def _odometry(block: "PoseBlock", row: int) -> Odometry:
+def _odometry(poses: "PoseTable", row: int) -> Odometry:
     message = Odometry()
-    message.header.stamp = to_time(int(block.stamps_ns[row]))
-    message.header.frame_id = block.world_frames[row]
-    message.child_frame_id = block.sensor_frames[row] or ""
+    message.header.stamp = to_time(int(poses.stamps_ns[row]))
+    message.header.frame_id = poses.world_frames[row]
+    message.child_frame_id = poses.sensor_frames[row] or ""
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
-    position.x, position.y, position.z, *quat_xyzw = block.poses[row].tolist()
+    position.x, position.y, position.z, *quat_xyzw = poses.poses[row].tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw
     return message

@@ -74,7 +74,7 @@ def read(path):
     """Poses and warnings, or None and the one line of an error."""
     try:
         with PoseBag(path) as bag:
-            poses = poses_of(bag, *bag.topics.select())
+            poses = poses_of(bag, *bag.select())
             found = poses, bag.warnings
     except InputError as error:
         found = None, [str(error)]
@@ -232,7 +232,7 @@ def test_paths_that_are_no_bag(tmp_path):
         "absent": "no bag at .*absent",
         "notes.txt": r"notes\.txt is not a bag; expected",
         "folder": r"no bag in .*: expected files that end in .*check the path",
-        "fifo.mcap": "is not a regular file",
+        "fifo.mcap": r"fifo\.mcap is not a bag; expected",
     }
     for suffix in ("bag", "mcap", "db3"):
         (tmp_path / f"empty.{suffix}").touch()

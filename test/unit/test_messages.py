@@ -19,7 +19,7 @@ from hand_eye_calib.io.bags.messages import (
     unpack_transforms,
 )
 
-ENCODINGS = ("cdr little-endian", "cdr big-endian", "ros1")
+ENCODINGS = ("cdr", "ros1")
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 
 names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
@@ -49,8 +49,7 @@ def serialized(encoding, message_type, make):
     """Bytes of the message ``make(typestore)``, and whether they are of ROS 1."""
     if encoding == "ros1":
         return bytes(NOETIC.serialize_ros1(make(NOETIC), message_type)), True
-    is_little = encoding == "cdr little-endian"
-    return bytes(JAZZY.serialize_cdr(make(JAZZY), message_type, little_endian=is_little)), False
+    return bytes(JAZZY.serialize_cdr(make(JAZZY), message_type)), False
 
 
 def encoded(encoding, message_type, pose):

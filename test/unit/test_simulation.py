@@ -238,14 +238,14 @@ def test_command_writes_the_published_layout(tmp_path, capsys):
     ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
 )
 def test_command_writes_bags(tmp_path, capsys, storage, name):
-    from hand_eye_calib.io.bags import PoseBag, PoseBlock
+    from hand_eye_calib.io.bags import PoseBag
 
     given = f"--drive hilly --poses 30 --bag {storage}".split()
     assert simulate(capsys, "--out", tmp_path / "sims", *given)[0] == 0
     drive = simulate_drive((0, 0), dataclasses.replace(HILLY_DRIVE, poses=30), REALISTIC)
     with PoseBag(tmp_path / "sims" / "run_01" / name) as bag:
         topics = simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC
-        poses = PoseBlock.concatenate(bag.blocks(*topics))
+        poses = bag.poses(*topics)
     for stream, trajectory in (("parent", drive.parent), ("child", drive.child)):
         ours = poses[poses.streams == stream]
         assert ours.stamps_ns.tolist() == trajectory.stamps_ns.tolist()

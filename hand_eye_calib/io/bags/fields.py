@@ -5,7 +5,7 @@ in csv files, with their units; vx, vy, vz, wx, wy, wz are integrated.
 
 import json
 from collections.abc import Callable, Iterable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.mcap_files import MessageKind
 from hand_eye_calib.io.trajectory_files.columns import TWIST
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import AUTO, table_of
@@ -76,28 +77,31 @@ class FieldReader:
         self._names = [name for name, _ in pairs]
         self._paths = [path.split(".") for _, path in pairs]
 
-    def cells(self, message: Any) -> list[str]:
-        """The values of a message, stamps in seconds with all their digits; an InputError if it
-        lacks one.
+    def cells_of(self, kind: MessageKind) -> Callable[[bytes], list[str]]:
+        """What reads the values of a message of this kind, stamps in seconds with all their digits;
+        an InputError if it lacks one.
         """
+        decode = _decoder(kind)
+        return lambda data: self._cells(decode(data))
+
+    def _cells(self, message: Any) -> list[str]:
         return [self._text(message, path) for path in self._paths]
 
-    def _text(self, message: Any, path: list[str]) -> str:
-        value = message
-        for part in path:
-            try:
+    def _text(self, value: Any, path: list[str]) -> str:
+        try:
+            for part in path:
                 if isinstance(value, dict):
                     value = value[part]
                 else:
                     value = value[int(part)] if part.isdecimal() else getattr(value, part)
-            except (AttributeError, KeyError, IndexError, TypeError):
-                raise InputError(
-                    f"{self._topic}: a message has no {'.'.join(path)}; name other fields"
-                ) from None
-        get = value.get if isinstance(value, dict) else partial(getattr, value)
-        if (whole := get("sec", None)) is None:
+        except (AttributeError, KeyError, IndexError, TypeError):
+            raise InputError(
+                f"{self._topic}: a message has no {'.'.join(path)}; name other fields"
+            ) from None
+        stamp = value if isinstance(value, dict) else getattr(value, "__dict__", {})
+        if "sec" not in stamp:
             return str(value)
-        return f"{whole}.{get('nanosec', 0) or get('nsec', 0) or get('nanosecs', 0):09d}"
+        return f"{stamp['sec']}.{stamp.get('nanosec', stamp.get('nsec', 0)):09d}"
 
     def poses(self, rows: Iterable[list[str]]) -> tuple[IntArray, FloatArray, list[str]]:
         """Stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of the cells of messages, and
@@ -130,37 +134,32 @@ def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
 
 
 @lru_cache
-def decoder(name: str, encoding: str, definition: Any = None) -> Callable[[bytes], Any]:
-    """What makes a message of its bytes, by the name and the encoding of its type and the
-    rosbags.interfaces.MessageDefinition of the bag.
-
-    Raises
-    ------
-    InputError
-        If there is none, or the encoding is not known.
+def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
+    """What makes a message of its bytes; an InputError if its definition or encoding is not
+    known.
     """
-    if encoding == "json":
+    name, definition = kind.type, kind.definition
+    if kind.encoding == "json":
         return json.loads
-    if encoding not in ("cdr", "ros1"):
+    if kind.encoding not in ("cdr", "ros1"):
         raise InputError(
-            f"messages of type {name} are encoded as {encoding[:40]!r}; expected cdr, ros1 or json"
+            f"messages of type {name} are encoded as {kind.encoding[:40]!r}; expected cdr, ros1 or "
+            "json"
         )
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    is_ros1 = encoding == "ros1"
-    types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+    types = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
     text = getattr(definition, "data", "")
     try:
         if text and name not in types.types:
             is_idl = definition.format.name == "IDL"
             known = get_types_from_idl(text) if is_idl else get_types_from_msg(text, name)
             types.register({key: each for key, each in known.items() if key not in types.types})
-        if name not in types.types:
-            raise KeyError(name)
+        types.types[name]
     except Exception as error:  # of many kinds, at damaged definitions
         raise InputError(
             f"the bag has no definition of {name} that can be read; record it as mcap, which "
             "stores definitions"
         ) from error
-    read = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+    read = types.deserialize_ros1 if kind.is_ros1 else types.deserialize_cdr
     return lambda data: read(data, name)

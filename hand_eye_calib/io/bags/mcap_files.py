@@ -3,9 +3,9 @@ that are cut off record by record with the library mcap.
 """
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
-from io import BytesIO
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
+from io import BufferedReader
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
@@ -15,24 +15,32 @@ from hand_eye_calib.io.limits import LONGEST_NAME
 
 
 class MessageKind(NamedTuple):
-    """What the messages of one connection have in common; encoding is "cdr", "ros1" or "json" of
-    what can be read, and bag counts those that are read together.
+    """What the messages of a topic have in common; encoding is "cdr", "ros1" or "json" of what can
+    be read, definition that of rosbags, or None.
     """
 
     topic: str
     type: str
     encoding: str
-    bag: int
+    definition: Any = None
 
-    @classmethod
-    def of(cls, topic: str, message_type: str, encoding: str, bag: int) -> "MessageKind":
-        """With names as they can be printed."""
-        topic, message_type = (printable(name[:LONGEST_NAME]) for name in (topic, message_type))
-        return cls(topic, message_type, encoding, bag)
+    @property
+    def is_ros1(self) -> bool:
+        """Whether they are packed as by ROS 1."""
+        return self.encoding == "ros1"
 
 
 # A message as it was recorded: its kind, its bag time in ns and its bytes.
 Message: TypeAlias = tuple[MessageKind, int, bytes]
+
+
+@lru_cache
+def message_kind(topic: str, message_type: str, *others: Any) -> MessageKind:
+    """One for all connections that are alike, with names as they can be printed."""
+    return MessageKind(
+        printable(topic[:LONGEST_NAME]), printable(message_type[:LONGEST_NAME]), *others
+    )
+
 
 # Of a chunk: opcode and length of the record, times of its messages, size and checksum.
 _CHUNK = struct.Struct("<BQQQQI")
@@ -71,23 +79,19 @@ def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iter
                 yield kinds[key], bag_ns, content[start + _MESSAGE_SIZE : position]
 
 
-class _WholeReads:
+class _WholeReads(BufferedReader):
     """A file that never returns less than was asked for: the library mcap takes that for a whole
     record.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-
-    def read(self, size: int) -> bytes:
-        """Read exactly so many bytes."""
-        data = self._file.read(size)
-        if len(data) < size:
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        if len(data) < (size or 0):
             raise EOFError("it ends in the middle of a record")
         return data
 
 
-def recovered_messages(path: Path, bag: int, lose: Callable[[str], None]) -> Iterator[Message]:
+def recovered_messages(path: Path, lose: Callable[[str], None]) -> Iterator[Message]:
     """Messages of an mcap file in the order of the file, as far as it goes; what is lost is told.
 
     Raises
@@ -97,7 +101,7 @@ def recovered_messages(path: Path, bag: int, lose: Callable[[str], None]) -> Ite
     """
     try:
         from mcap import records as mcap
-        from mcap.stream_reader import StreamReader, get_chunk_data_stream
+        from mcap.stream_reader import StreamReader
     except ImportError as error:
         raise MissingDependencyError(
             f"{path} is cut off or has no index; to read it needs mcap, which is not installed: "
@@ -105,31 +109,17 @@ def recovered_messages(path: Path, bag: int, lose: Callable[[str], None]) -> Ite
         ) from error
     schemas: dict[int, str] = {}
     kinds: dict[int, MessageKind] = {}
-
-    def records(source: Any, is_chunk: bool = False) -> Iterator[Any]:
-        whole_reads: Any = _WholeReads(source)
-        return StreamReader(whole_reads, skip_magic=is_chunk, emit_chunks=True).records
-
-    def messages(found: Iterable[Any]) -> Iterator[Message]:
-        for record in found:
-            if isinstance(record, mcap.Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, mcap.Channel):
-                names = record.topic, schemas.get(record.schema_id, ""), record.message_encoding
-                kinds[record.id] = MessageKind.of(*names, bag)
-            elif isinstance(record, mcap.Message) and record.channel_id in kinds:
-                yield kinds[record.channel_id], record.log_time, record.data
-
-    def inside(chunk: mcap.Chunk, is_whole: bool = True) -> Iterator[Message]:
-        stream, size = get_chunk_data_stream(chunk, validate_crc=is_whole)
-        with suppress(EOFError):  # the end of the chunk
-            yield from messages(records(BytesIO(stream.read(size)), is_chunk=True))
-
     position = 0
-    with path.open("rb") as file:
+    with _WholeReads(path.open("rb", buffering=0)) as file:
         try:
-            for record in records(file):
-                yield from inside(record) if isinstance(record, mcap.Chunk) else messages([record])
+            for record in StreamReader(file, validate_crcs=True).records:
+                if isinstance(record, mcap.Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, mcap.Channel):
+                    schema = schemas.get(record.schema_id, "")
+                    kinds[record.id] = message_kind(record.topic, schema, record.message_encoding)
+                elif isinstance(record, mcap.Message) and record.channel_id in kinds:
+                    yield kinds[record.channel_id], record.log_time, record.data
                 position = file.tell()
         except MemoryError:
             raise
@@ -139,21 +129,6 @@ def recovered_messages(path: Path, bag: int, lose: Callable[[str], None]) -> Ite
                 f"it is cut off or damaged after {position / max(size, 1):.0%} of its {size} bytes "
                 f"({reason_of(error)}), what came later is lost"
             )
-            file.seek(position)
-            chunk = _chunk_cut_off(file)
-            if chunk is not None and not chunk.compression:  # its first messages
-                yield from inside(chunk, is_whole=False)
-
-
-def _chunk_cut_off(file: BinaryIO) -> Any:
-    """The chunk at the end of a file; None if there is something else."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.opcode import Opcode
-    from mcap.records import Chunk
-
-    opcode = file.read(_RECORD.size)[:1]
-    chunk = Chunk.read(ReadDataStream(file)) if opcode == bytes([Opcode.CHUNK]) else None
-    return chunk if file.read(1) == b"" else None
 
 
 def reason_of(error: BaseException) -> str:

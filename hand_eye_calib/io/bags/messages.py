@@ -8,7 +8,8 @@ of a whole message and needs no type definitions. A new type is a row in :data:`
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from hand_eye_calib.io.transforms import PoseFields
 MALFORMED = (struct.error, ValueError)
 
 Buffer = bytes | memoryview
+T = TypeVar("T")
 
 _NS_PER_S = STAMP_UNITS["s"]
 _POSE_SIZE = struct.calcsize("=7d")
@@ -43,30 +45,24 @@ class MalformedMessage(ValueError):
 
 # ---- bytes
 
-# How a message is packed: byte order, whether its parts are aligned, and the format of a stamp; in
-# CDR by its first bytes.
-_CDR = {b"\x00\x00": (">", True, "iI"), b"\x00\x01": ("<", True, "iI")}
-_ROS1 = ("<", False, "II")
 # CDR begins with 4 bytes that say how it is encoded, and alignment counts from there. A ROS 1
-# header begins with 4 bytes of sequence number.
-_START = 4
+# header begins with 4 bytes of sequence number, and nothing is aligned.
+_START, _CDR = 4, b"\x00\x01"
 
 
 class Cursor:
     """Reads the parts of a message one after the other."""
 
     def __init__(self, data: Buffer, is_ros1: bool) -> None:
-        found = _ROS1 if is_ros1 else _CDR.get(bytes(data[:2]))
-        if found is None:
+        if not is_ros1 and bytes(data[:2]) != _CDR:
             raise ValueError(f"expected plain CDR, found encoding 0x{bytes(data[:2]).hex()}")
-        self.order, self.is_aligned, self.time = found
-        self.data, self.position = data, 0 if is_ros1 else _START
+        self.data, self.is_ros1, self.position = data, is_ros1, 0 if is_ros1 else _START
 
     def read(self, format_: str) -> tuple[float, ...]:
         """Read numbers of one kind, by their format in struct."""
-        if self.is_aligned:
+        if not self.is_ros1:
             self.position += (_START - self.position) % struct.calcsize(format_[-1])
-        values = struct.unpack_from(self.order + format_, self.data, self.position)
+        values = struct.unpack_from(f"<{format_}", self.data, self.position)
         self.position += struct.calcsize(f"={format_}")
         return values
 
@@ -76,7 +72,7 @@ class Cursor:
 
     def stamp_ns(self) -> int:
         """Read a stamp."""
-        seconds, nanoseconds = map(int, self.read(self.time))
+        seconds, nanoseconds = self.number("I" if self.is_ros1 else "i"), self.number()
         if nanoseconds >= _NS_PER_S:
             raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
         return seconds * _NS_PER_S + nanoseconds
@@ -89,20 +85,20 @@ class Cursor:
             raise ValueError("a text does not fit into the message")
         if length > LONGEST_NAME:
             raise ValueError(f"the name of a frame has {length} bytes, more than {LONGEST_NAME}")
-        end = self.position - self.is_aligned
+        end = self.position - (not self.is_ros1)
         return printable(str(self.data[start : max(end, start)], "utf-8"))
 
     def header(self) -> tuple[int, str]:
         """Read stamp and frame."""
-        if not self.is_aligned:
+        if self.is_ros1:
             self.number()  # sequence number
         return self.stamp_ns(), self.name()
 
-    def count(self, what: str) -> int:
+    def count(self) -> int:
         """Read the length of an array of poses, each with a header."""
         count = self.number()
         if count > len(self.data) // _POSE_SIZE:
-            raise ValueError(f"{count} {what} do not fit into {len(self.data)} bytes")
+            raise ValueError(f"{count} poses do not fit into {len(self.data)} bytes")
         return count
 
 
@@ -215,57 +211,73 @@ def unpack_stamp_ns(data: Buffer) -> int:
     return Cursor(data, is_ros1=False).stamp_ns()
 
 
-def _unpack(cursor: Cursor, row: MessageType) -> tuple[int, str, str | None, Sequence[float]]:
-    """Stamp in ns, the header's frame, the sensor's behind it, and values."""
-    stamp_ns, frame = cursor.header()
-    return stamp_ns, frame, cursor.name() if row.has_child_frame else None, row.unpack(cursor)
-
-
-def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -> PoseColumns:
-    """Unpack one or more messages of one of MESSAGE_TYPES, poses together if they differ only in
-    stamps and values.
+def each_unpacked(
+    messages: Sequence[Buffer],
+    unpack: Callable[[Any], T],
+    errors: type[Exception] | tuple[type[Exception], ...] = MALFORMED,
+) -> list[T]:
+    """What is unpacked of each message.
 
     Raises
     ------
     MalformedMessage
-        At the first that is not such a message.
+        At the first that raises one of the errors.
+    InputError
+        If it is one already.
+    """
+    found = []
+    for index, data in enumerate(messages):
+        try:
+            found.append(unpack(data))
+        except InputError:
+            raise
+        except errors as error:
+            raise MalformedMessage(index, error) from error
+    return found
+
+
+_Unpacked = tuple[int, str, str | None, Sequence[float], int]
+
+
+def _unpack(row: MessageType, is_ros1: bool, data: Buffer) -> _Unpacked:
+    """Stamp in ns, the header's frame, the sensor's behind it, values, and where these end."""
+    cursor = Cursor(data, is_ros1)
+    stamp_ns, frame = cursor.header()
+    sensor_frame = cursor.name() if row.has_child_frame else None
+    return stamp_ns, frame, sensor_frame, row.unpack(cursor), cursor.position
+
+
+def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -> PoseColumns:
+    """Unpack one or more messages of one of MESSAGE_TYPES, poses together if they differ only in
+    stamps and values. Raises as :func:`each_unpacked`.
     """
     row, size = MESSAGE_TYPES[message_type], len(messages[0])
-    if message_type in POSE_TYPES and len(messages) > 1 and {*map(len, messages)} == {size}:
-        try:
-            first = Cursor(messages[0], is_ros1)
-            _, world, sensor, _ = _unpack(first, row)
-        except MALFORMED as error:
-            raise MalformedMessage(0, error) from error
+    unpack = partial(_unpack, row, is_ros1)
+    if row.unpack is _pose and len(messages) > 1 and {*map(len, messages)} == {size}:
+        ((_, world, sensor, _, end),) = each_unpacked(messages[:1], unpack)
         bytes_of = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
         # The sequence number of ROS 1 may differ, the encoding of CDR may not.
         is_alike = is_ros1 or bool((bytes_of[:, :2] == bytes_of[0, :2]).all())
-        found = _unpack_together(bytes_of[:, _START : first.position], first)
+        found = _unpack_together(bytes_of[:, _START:end], is_ros1)
         if found is not None and is_alike:
             return PoseColumns.of_frames(*found, world, sensor)
-    rows = []
-    for index, data in enumerate(messages):
-        try:
-            rows.append(_unpack(Cursor(data, is_ros1), row))
-        except MALFORMED as error:
-            raise MalformedMessage(index, error) from error
-    stamps_ns, worlds, sensors, values = zip(*rows, strict=True)
+    stamps_ns, worlds, sensors, values, _ = zip(*each_unpacked(messages, unpack), strict=True)
     return PoseColumns(np.array(stamps_ns, dtype=np.int64), [*worlds], [*sensors], np.array(values))
 
 
-def _unpack_together(rows: np.ndarray, like: Cursor) -> tuple[IntArray, FloatArray] | None:
+def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatArray] | None:
     """Stamps and poses of rows of bytes (N, size) that begin with a stamp and end with a pose; None
     if what is between them, the frames, differs, or a stamp cannot be right.
     """
-    frames, order = rows[:, 8:-_POSE_SIZE], like.order
+    frames = rows[:, 8:-_POSE_SIZE]
     seconds, nanoseconds = (
-        np.ascontiguousarray(rows[:, at : at + 4]).view(f"{order}{kind}4")[:, 0].astype(np.int64)
-        for at, kind in zip((0, 4), ("iu" if like.is_aligned else "uu"), strict=True)
+        np.ascontiguousarray(rows[:, at : at + 4]).view(kind)[:, 0].astype(np.int64)
+        for at, kind in ((0, "<u4" if is_ros1 else "<i4"), (4, "<u4"))
     )
     if (frames != frames[0]).any() or (nanoseconds >= _NS_PER_S).any():
         return None
-    poses = np.ascontiguousarray(rows[:, -_POSE_SIZE:]).view(f"{order}f8")
-    return seconds * _NS_PER_S + nanoseconds, poses.astype(np.float64, copy=False)
+    poses = np.ascontiguousarray(rows[:, -_POSE_SIZE:]).view("<f8")
+    return seconds * _NS_PER_S + nanoseconds, poses
 
 
 def unpack_path(data: Buffer, is_ros1: bool) -> tuple[str, IntArray, FloatArray]:
@@ -274,7 +286,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> tuple[str, IntArray, FloatArray]
     """
     cursor = Cursor(data, is_ros1)
     _, world_frame = cursor.header()
-    count = cursor.count("poses")
+    count = cursor.count()
     stamps_ns, poses = np.empty(count, dtype=np.int64), np.empty((count, 7))
     for index in range(count):
         start = cursor.position
@@ -285,7 +297,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> tuple[str, IntArray, FloatArray]
         size = cursor.position - start
         if index == 1 and len(data) - start >= (count - 1) * size:
             rest = np.frombuffer(data, np.uint8, (count - 1) * size, start).reshape(-1, size)
-            found = _unpack_together(rest[:, _START * is_ros1 :], cursor)
+            found = _unpack_together(rest[:, _START * is_ros1 :], is_ros1)
             if found is not None:
                 stamps_ns[1:], poses[1:] = found
                 break
@@ -295,7 +307,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> tuple[str, IntArray, FloatArray]
 def unpack_transforms(data: Buffer, is_ros1: bool) -> list[PoseFields]:
     """Unpack the transforms of a tf message, frames without a leading slash; raises MALFORMED."""
     cursor, found = Cursor(data, is_ros1), []
-    for _ in range(cursor.count("transforms")):
+    for _ in range(cursor.count()):
         stamp_ns, world_frame = cursor.header()
         frames = world_frame.lstrip("/"), cursor.name().lstrip("/")
         values = _pose(cursor)
@@ -303,24 +315,7 @@ def unpack_transforms(data: Buffer, is_ros1: bool) -> list[PoseFields]:
     return found
 
 
-def frames_in(data: Buffer, message_type: str, is_ros1: bool) -> set[str]:
-    """The frames of a message with a header or of TF_TYPES: ``world:sensor`` as far as it says;
-    raises MALFORMED.
-    """
-    if message_type in TF_TYPES:
-        found = unpack_transforms(data, is_ros1)
-        return {f"{each.world_frame}:{each.sensor_frame}" for each in found}
-    cursor = Cursor(data, is_ros1)
-    _, frame = cursor.header()
-    row = MESSAGE_TYPES.get(message_type)
-    sensor_frame = cursor.name() if row and row.has_child_frame else ""
-    return {":".join(filter(None, (frame, sensor_frame)))}
-
-
 # ---- what the messages of a topic measure
-
-# What an IMU or a GNSS receiver says that it does not have, in words.
-_LACKS = {"rates": "angular rates", "rotations": "orientation", "positions": "fix"}
 
 
 class MessageReader:
@@ -399,7 +394,7 @@ class MessageReader:
         """
         try:
             if self._are_poses:
-                stamp_ns, world, sensor, of_pose = _unpack(Cursor(data, False), self._row)
+                stamp_ns, world, sensor, of_pose, _ = _unpack(self._row, False, data)
                 return PoseFields(stamp_ns, world, sensor, of_pose[:3], of_pose[3:])
             columns, is_usable = self.columns([data], is_ros1=False)
         except InputError:
@@ -407,7 +402,7 @@ class MessageReader:
         except MALFORMED as error:
             raise InputError(f"not a message of type {self._row.name}: {error}") from error
         if not is_usable.all():
-            raise InputError(f"the message has no {_LACKS.get(self._measures, self._measures)}")
+            raise InputError(f"the message has no {self._measures}")
         values = columns.poses[0].tolist()
-        frames = columns.world_frames[0], columns.sensor_frames[0]
-        return PoseFields(int(columns.stamps_ns[0]), *frames, values[:3], values[3:])
+        world, sensor = columns.world_frames[0], columns.sensor_frames[0]
+        return PoseFields(int(columns.stamps_ns[0]), world, sensor, values[:3], values[3:])

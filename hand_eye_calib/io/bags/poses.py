@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry.trajectory import Trajectory
 
-ObjectArray = NDArray[np.object_]
-
 # A delay against the bag's time is of a wrong stamp if it is this many times farther from both
 # neighbours than these from each other (and than the usual step), and this far.
 _FACTOR, _SMALLEST_JUMP_S = 10.0, 0.5
@@ -30,7 +28,7 @@ class PoseColumns(NamedTuple):
     """
 
     stamps_ns: IntArray
-    world_frames: list[str]
+    world_frames: Sequence[str]
     sensor_frames: Sequence[str | None]
     poses: FloatArray
 
@@ -43,8 +41,8 @@ class PoseColumns(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PoseBlock:
-    """N poses of streams in columns.
+class PoseTable:
+    """N poses of streams in columns, in the order of bag time.
 
     Attributes
     ----------
@@ -60,11 +58,11 @@ class PoseBlock:
         x y z qx qy qz qw.
     """
 
-    streams: ObjectArray
+    streams: NDArray[np.object_]
     message_numbers: IntArray
     stamps_ns: IntArray
-    world_frames: ObjectArray
-    sensor_frames: ObjectArray
+    world_frames: NDArray[np.object_]
+    sensor_frames: NDArray[np.object_]
     poses: FloatArray
     bag_ns: IntArray
 
@@ -72,25 +70,27 @@ class PoseBlock:
         return len(self.stamps_ns)
 
     def __getitem__(self, index: Any) -> Self:
-        """A part of the block: any slice, mask or index array."""
+        """A part of the table: any slice, mask or index array."""
         return type(self)(*(column[index] for column in vars(self).values()))
 
     @classmethod
-    def concatenate(cls, blocks: Iterable["PoseBlock"]) -> "PoseBlock":
-        """Join blocks in their order."""
-        columns = zip(*(vars(block).values() for block in blocks), strict=True)
-        joined: Any = [*map(np.concatenate, columns)]
-        return cls(*joined)
+    def of_columns(
+        cls, stream: str, columns: PoseColumns, bag_ns: Any, first_number: int = 1
+    ) -> "PoseTable":
+        """Of one stream."""
+        stamps_ns, *frames, poses = columns
+        numbers = first_number + np.arange(len(stamps_ns))
+        streams = np.full(len(stamps_ns), stream, dtype=object)
+        world, sensor = (np.array(each, dtype=object) for each in frames)
+        bag_ns = np.array(bag_ns, dtype=np.int64)
+        return cls(streams, numbers, stamps_ns, world, sensor, poses, bag_ns)
 
     @classmethod
-    def of_columns(
-        cls, stream: str, message_numbers: IntArray, columns: PoseColumns, bag_ns: IntArray
-    ) -> "PoseBlock":
-        """Make a block of unpacked messages of one stream."""
-        streams = np.full(len(message_numbers), stream, dtype=object)
-        world, sensor = (np.array(each, dtype=object) for each in columns[1:3])
-        stamps_ns, *_, poses = columns
-        return cls(streams, message_numbers, stamps_ns, world, sensor, poses, bag_ns)
+    def joined(cls, tables: Iterable["PoseTable"]) -> "PoseTable":
+        """The rows of one or more tables in the order of bag time."""
+        columns = zip(*(vars(table).values() for table in tables), strict=True)
+        whole: Any = [*map(np.concatenate, columns)]
+        return cls(*whole)[np.argsort(whole[-1], kind="stable")]
 
     def trajectory(self) -> Trajectory:
         """Poses of one stream in the order of stamps; of those with equal stamps the first."""

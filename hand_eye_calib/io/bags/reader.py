@@ -1,43 +1,72 @@
 """Reading the poses of two streams from bags."""
 
 import heapq
-from collections import Counter
+import re
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
 from itertools import chain, pairwise
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
-from hand_eye_calib.io.bags import scans
-from hand_eye_calib.io.bags.fields import FIELDS, FieldReader, decoder, split_fields
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags.fields import FIELDS, split_fields
 from hand_eye_calib.io.bags.mcap_files import Message, MessageKind
 from hand_eye_calib.io.bags.messages import (
-    MALFORMED,
     MESSAGE_TYPES,
     PATH_TYPE,
     POINTS_TYPE,
+    POSE_TYPES,
+    SENSOR_TYPES,
     TF_TYPES,
     MalformedMessage,
-    MessageReader,
-    frames_in,
+    each_unpacked,
     measured_as,
-    unpack_path,
     unpack_transforms,
 )
-from hand_eye_calib.io.bags.poses import PoseBlock, PoseColumns, are_believable
-from hand_eye_calib.io.bags.storage import BLOCK_SIZE, message_blocks, open_bags
-from hand_eye_calib.io.bags.topics import Source, Topics, joined_parts
+from hand_eye_calib.io.bags.poses import PoseTable
+from hand_eye_calib.io.bags.sources import (
+    FieldReading,
+    JoinedReading,
+    PathReading,
+    Reading,
+    ScanReading,
+    Source,
+    TopicReading,
+    TransformReading,
+    is_static,
+)
+from hand_eye_calib.io.bags.storage import message_blocks, open_bags
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 
-T = TypeVar("T")
+# A topic with fewer poses is not one of the two sensors: goals and initial poses are published
+# once.
+_FEWEST_POSES = 3
+# Words of a topic's name that say which stream it is, the likeliest parent first.
+_WORDS = ("parent", "base", "lidar", "", "child")
+# Transforms that a message lists.
+_MOST_FRAMES = 20
+
+
+class TopicInfo(NamedTuple):
+    """A topic of a bag: its name, its message type (empty if publishers disagree), and how many
+    messages it has.
+    """
+
+    name: str
+    type: str
+    count: int  # type: ignore[assignment]
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.type or 'several types'}, {self.count} messages)"
 
 
 class PoseBag:
@@ -52,10 +81,13 @@ class PoseBag:
 
     Attributes
     ----------
-    topics : Topics
-        By their names, in the order of these; chooses those that are meant.
+    topics : dict of str to TopicInfo
+        In the order of their names.
     start_ns, end_ns : int or None
         Bag time of the first and last message; None if there is none.
+    shown : callable
+        Passes on items, here blocks of messages, and may show how far they are; of the items, the
+        sum of their sizes, what is being done, and the size of an item.
 
     Raises
     ------
@@ -65,18 +97,19 @@ class PoseBag:
 
     def __init__(self, *paths: str | Path) -> None:
         self.paths = [Path(path) for path in paths]
-        # Passes on messages that take long, and may show how far they are.
-        self.shown: Callable[[Iterable[Message], int, str], Iterable[Message]] = (
-            lambda messages, count, doing: messages
-        )
-        self._n_wrong_stamps = Counter[str]()
-        self._readers: dict[str, MessageReader] = {}
+        self.shown: Callable[..., Iterable[list[Message]]] = lambda blocks, *_: blocks
         self._notes: list[str] = []
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
-        found = chain(*(storage.topics for storage in self._storages))
-        self.topics = Topics.of_connections(found, str(self), self._first_transforms)
+        types, counts = defaultdict[str, set[str]](set), Counter[str]()
+        for kind, count in chain(*(storage.counts.items() for storage in self._storages)):
+            types[kind.topic].add(kind.type)
+            counts[kind.topic] += count
+        self.topics = {
+            name: TopicInfo(name, "" if len(types[name]) > 1 else types[name].pop(), counts[name])
+            for name in sorted(types)
+        }
         spans = [(each.start_ns, each.end_ns) for each in self._storages]
         known = [(first, last) for first, last in spans if first is not None and last is not None]
         self.start_ns = min((first for first, _ in known), default=None)
@@ -86,10 +119,6 @@ class PoseBag:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the files."""
         self._opened.close()
 
     def __str__(self) -> str:
@@ -99,26 +128,7 @@ class PoseBag:
     def warnings(self) -> list[str]:
         """What could not be read, and poses that cannot be right; complete after reading."""
         losses = [f"{each.path}: {loss}" for each in self._storages for loss in each.losses]
-        wrong = [
-            f"{name}: {count} stamps jump away and back against the bag's own time; their poses "
-            "were left out, the bag may be damaged"
-            for name, count in (+self._n_wrong_stamps).items()
-        ]
-        without = [
-            f"{name}: {reader.n_left_out} messages without a fix, or without what they were read "
-            "for, were left out"
-            for name, reader in self._readers.items()
-            if reader.n_left_out
-        ]
-        return [*self._notes, *losses, *wrong, *without]
-
-    @property
-    def n_left_out(self) -> int:
-        """Messages left out because their stamps cannot be right, or without a fix; complete after
-        reading.
-        """
-        without = sum(reader.n_left_out for reader in self._readers.values())
-        return self._n_wrong_stamps.total() + without
+        return [*self._notes, *losses]
 
     @property
     def duration_s(self) -> float:
@@ -131,35 +141,26 @@ class PoseBag:
 
     # ---- topics
 
-    def _first_transforms(self) -> list[str]:
-        """Pairs of frames in the first messages of transforms."""
-        return sorted({pair for name in self._of_transforms() for pair in self.frames_on(name)})
+    def _listing(self) -> str:
+        if not self.topics:
+            return f"There are no topics in {self}"
+        return f"The bag has {', '.join(map(str, self.topics.values()))}"
+
+    def _type_of(self, source: Source) -> str:
+        """Message type of a topic; empty for frames, and for what is not there."""
+        return self.topics[source].type if source in self.topics else ""
 
     def _of_transforms(self) -> list[str]:
         return [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
 
-    def frames_on(self, topic: str) -> list[str]:
-        """Pairs of frames in the first messages of a topic: ``world:sensor`` of poses, as far as
-        they say, ``parent:child`` of transforms.
-
-        Raises
-        ------
-        InputError
-            If a message cannot be read.
+    def edges_on(self, topic: str) -> list[str]:
+        """Pairs of frames, ``parent:child``, in the first messages of a topic of transforms, if it
+        is one. An InputError if they cannot be read.
         """
-        if self.topics.type_of(topic) not in {*MESSAGE_TYPES, PATH_TYPE, POINTS_TYPE, *TF_TYPES}:
+        if topic not in self._of_transforms():
             return []
-        block = next(self._blocks([topic]), [])
-        found = _decoded(block, lambda kind, data: frames_in(data, kind.type, _is_ros1(kind)))
-        return sorted(set[str]().union(*(frames for _, _, frames in found)))
-
-    def expected(self, *sources: Source | None) -> int | None:
-        """Number of poses that the sources will give, as far as the bag says; None for paths and
-        transforms.
-        """
-        if not all(self.topics.type_of(source) in MESSAGE_TYPES for source in sources):
-            return None
-        return sum(self.topics[str(source)].count for source in sources)
+        first = self._transforms(next(self._blocks([topic]), []))
+        return sorted({f"{each.world_frame}:{each.sensor_frame}" for each, _ in first})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
         """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
@@ -170,22 +171,91 @@ class PoseBag:
         ConfigError
             If its messages do not have what is wanted.
         """
-        return measured_as(self.topics.type_of(source), wanted, source)
+        return measured_as(self._type_of(source), wanted, source)
+
+    def check(self, source: Source) -> None:
+        """Refuse a topic without poses, and frames of a bag without transforms.
+
+        Raises
+        ------
+        InputError
+            The message lists the topics that are there.
+        """
+        if isinstance(source, TfSource):
+            if not self._of_transforms():
+                raise InputError(f"no transforms in {self}. {self._listing()}")
+            return
+        topic, fields = split_fields(source)
+        parts = self._parts_of(topic)
+        for part in parts:
+            if part not in self.topics:
+                raise InputError(f"no topic {part} in {self}. {self._listing()}")
+        if len(parts) > 1:
+            for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
+                self.measured(part, wanted)
+        elif not fields and (type_ := self._type_of(topic)) not in SENSOR_TYPES:
+            hint = "read others by their fields, TOPIC?t=header.stamp,x=..."
+            if type_ in TF_TYPES:
+                hint = "name two of its frames with --parent-tf and --child-tf"
+            raise InputError(
+                f"topic {source} of {self} is of type {type_ or 'several types'}; accepted are "
+                f"{', '.join(SENSOR_TYPES)}; {hint}. {self._listing()}"
+            )
+
+    def select(
+        self, parent: Source | None = None, child: Source | None = None
+    ) -> tuple[Source, Source]:
+        """Choose the sources of the parent's and the child's poses.
+
+        What is not named is chosen if there is only one way to do it: with neither named, the bag
+        has exactly two topics of poses. The parent is the one whose name has the word parent, base
+        or lidar, or the first in alphabetical order. Topics of paths count if there are not enough
+        others.
+
+        Raises
+        ------
+        InputError
+            If a named source cannot be used, both are the same, or there is a choice to make.
+        """
+        named = [source for source in (parent, child) if source]
+        for source in named:
+            self.check(source)
+        if len(named) == 2 and named[0] == named[1]:
+            raise InputError(
+                f"parent and child topic are both {parent}; name two topics. {self._listing()}"
+            )
+        free = [topic for name, topic in self.topics.items() if name not in named]
+        poses = [topic for topic in free if topic.type in POSE_TYPES]
+        moving = [topic for topic in poses if topic.count >= _FEWEST_POSES]
+        paths = [topic for topic in free if topic.type == PATH_TYPE]
+        wanted = 2 - len(named)
+        choices = [topics for topics in (poses, moving, moving + paths) if len(topics) == wanted]
+        if wanted and not choices:
+            found = sorted({edge for name in self.topics for edge in self.edges_on(name)})
+            more = f" and {len(found) - _MOST_FRAMES} more" if len(found) > _MOST_FRAMES else ""
+            raise InputError(
+                "name the topics of poses with --parent-topic and --child-topic, or frames with "
+                f"--parent-tf and --child-tf. {self._listing()}"
+                + (f". Transforms are {', '.join(found[:_MOST_FRAMES])}{more}" if found else "")
+            )
+        chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
+        return parent or chosen.pop(0), child or chosen.pop(0)
+
+    def _parts_of(self, topic: str) -> list[str]:
+        """The topics of positions and of orientations of ``/fix+/imu``; otherwise the topic."""
+        parts = topic.split("+")
+        return parts if topic not in self.topics and len(parts) == 2 and all(parts) else [topic]
 
     # ---- poses
 
-    def blocks(
+    def poses(
         self,
         parent: Source,
-        child: Source | None,
+        child: Source | None = None,
         max_gap_s: float = CalibratorConfig.max_gap,
         measures: Mapping[str, str] | None = None,
-    ) -> Iterator[PoseBlock]:
-        """Iterate over the poses of both streams in the order of the bag's time, many at once.
-
-        A path's poses are those of its newest message, and before its first stamp those of older
-        messages; they count as recorded when they first appeared. Transforms are composed at the
-        stamps of the moving transform with the lowest rate in the chain.
+    ) -> PoseTable:
+        """The poses of one or two streams in the order of the bag's time.
 
         Parameters
         ----------
@@ -201,166 +271,85 @@ class PoseBag:
         InputError
             If the bag is damaged, or the transforms do not lead from one frame to the other.
         """
+        measures = measures or {}
         sources = {"parent": parent} | ({"child": child} if child else {})
-        self._n_wrong_stamps = Counter()
-        self._readers = {}
-        direct: dict[str, str] = {}
-        others, transforms = dict[str, str](), dict[str, TfSource]()
-        for stream, source in sources.items():
-            if isinstance(source, TfSource):
-                transforms[stream] = source
-            elif (type_ := self.topics.type_of(source)) in MESSAGE_TYPES:
-                direct[source] = stream
-                measured = self.measured(source, (measures or {}).get(stream, "auto"))
-                self._readers[source] = MessageReader(type_, measured)
-            else:
-                others[stream] = source
-        blocks = self._direct_blocks(direct) if direct else iter(())
-        if others or transforms:
-            whole = [*blocks, *(self._other_poses(*each) for each in others.items())]
-            whole += self._transformed_poses(transforms, max_gap_s) if transforms else []
-            poses = _in_bag_order(PoseBlock.concatenate(whole))
-            blocks = (poses[k : k + BLOCK_SIZE] for k in range(0, len(poses), BLOCK_SIZE))
-        yield from filter(len, blocks)
-
-    def _direct_blocks(self, streams: dict[str, str]) -> Iterator[PoseBlock]:
-        """Poses of topics that carry one in each message."""
-        counts = dict.fromkeys(streams, 0)
-        for block in self._blocks(streams):
-            found = []
-            for kind in {id(each): each for each, _, _ in block}.values():
-                name, reader = kind.topic, self._readers[kind.topic]
-                messages = [data for each, _, data in block if each is kind]
-                bag_ns = np.array([each_ns for each, each_ns, _ in block if each is kind])
-                numbers = counts[name] + 1 + np.arange(len(messages))
-                counts[name] += len(messages)
+        readings = [
+            self._reading(stream, source, measures.get(stream, "auto"), max_gap_s)
+            for stream, source in sources.items()
+        ]
+        takers = defaultdict[str, list[Reading]](list)
+        for reading in readings:
+            for topic in reading.topics:
+                takers[topic].append(reading)
+        count = sum(self.topics[topic].count for topic in takers)
+        done = Counter[str]()
+        for block in self.shown(self._blocks(takers), count, f"reading {self}", len):
+            for kind, messages, bag_ns in _by_kind(block):
                 try:
-                    columns, keep = reader.columns(messages, _is_ros1(kind))
+                    for reading in takers[kind.topic]:
+                        reading.take(kind, messages, bag_ns)
                 except MalformedMessage as error:
-                    raise _unreadable(kind, numbers[error.index], error) from error
-                except InputError as error:
-                    raise InputError(f"{name}: {error}") from None
-                is_right = are_believable(columns.stamps_ns, bag_ns)
-                self._n_wrong_stamps[name] += int((~is_right).sum())
-                poses = PoseBlock.of_columns(streams[name], numbers, columns, bag_ns)
-                found.append(poses[keep & is_right])
-            yield _in_bag_order(PoseBlock.concatenate(found))
+                    raise _unreadable(kind, done[kind.topic], error) from error
+                done[kind.topic] += len(messages)
+        tables = [reading.table() for reading in readings]
+        self._notes += [note for reading in readings for note in reading.notes]
+        return PoseTable.joined(tables)
 
-    def _whole(self, stream: str, columns: PoseColumns, bag_ns: Any) -> PoseBlock:
-        """All poses of a source that is no topic of poses, in the order of bag time."""
-        numbers, bag_ns = 1 + np.arange(len(bag_ns)), np.array(bag_ns, dtype=np.int64)
-        return _in_bag_order(PoseBlock.of_columns(stream, numbers, columns, bag_ns))
-
-    def _other_poses(self, stream: str, source: str) -> PoseBlock:
-        """Poses of a path, of scans, of two topics that are joined, or of fields of messages."""
-        type_, (topic, fields) = self.topics.type_of(source), split_fields(source)
+    def _reading(self, stream: str, source: Source, measures: str, max_gap_s: float) -> Reading:
+        if isinstance(source, TfSource):
+            tree = self.static_frames()
+            tree.route(*source)  # or it raises
+            of_tree = TfStream(source, max_gap_s, tree)
+            return TransformReading(stream, of_tree, self._of_transforms())
+        (topic, fields), type_ = split_fields(source), self._type_of(source)
+        if type_ in MESSAGE_TYPES:
+            return TopicReading(stream, topic, type_, self.measured(source, measures))
         if type_ == PATH_TYPE:
-            return self._path_poses(stream, source)
+            return PathReading(stream, topic)
         if type_ == POINTS_TYPE:
-            return self._scan_poses(stream, source)
-        if topic not in self.topics:
-            return self._joined_poses(stream, source, *joined_parts(topic))
-        read = FieldReader(topic, fields or FIELDS[type_])
-        definitions = (each.definition(topic) for each in self._storages)
-        definition = next(filter(None, definitions), None)
-
-        def cells(kind: MessageKind, data: bytes) -> list[str]:
-            return read.cells(decoder(kind.type, kind.encoding, definition)(data))
-
-        # The library's errors are of many kinds.
-        found = list(_decoded(self._messages([topic]), cells, Exception))
-        stamps_ns, poses, notes = read.poses(row for _, _, row in found)
-        self._notes += notes
-        bag_ns = [message_ns for _, message_ns, _ in found]
-        return self._whole(stream, PoseColumns.of_frames(stamps_ns, poses), bag_ns)
-
-    def _joined_poses(self, stream: str, source: str, fix: str, imu: str) -> PoseBlock:
-        """Positions of one topic with the orientations of another, interpolated."""
-        found = []
-        for topic, measured in ((fix, "positions"), (imu, "rotations")):
-            self._readers[topic] = MessageReader(self.topics[topic].type, measured)
-            found.append(PoseBlock.concatenate(self._direct_blocks({topic: stream})))
-        positions, orientations = found
-        if not len(positions) or not len(orientations):
-            raise InputError(f"{source}: no positions with a fix, or no orientations")
-        turning = orientations.trajectory()
-        inside = (positions.stamps_ns >= turning.stamps_ns[0]) & (
-            positions.stamps_ns <= turning.stamps_ns[-1]
+            return ScanReading(stream, topic, self.paths[0], self.files())
+        if topic in self.topics:
+            return FieldReading(stream, topic, fields or FIELDS[type_])
+        parts = zip(self._parts_of(topic), ("positions", "rotations"), strict=True)
+        return JoinedReading(
+            *(TopicReading(stream, part, self._type_of(part), wanted) for part, wanted in parts)
         )
-        positions, quats = positions[inside], positions.poses[inside, 3:]
-        if len(turning) > 1 and len(positions):
-            quats = se3.to_quat_xyzw(turning.at(positions.stamps_ns))
-        poses = np.c_[positions.poses[:, :3], quats]
-        frame = orientations.sensor_frames[0]
-        columns = PoseColumns.of_frames(positions.stamps_ns, poses, "", frame)
-        return self._whole(stream, columns, positions.bag_ns)
 
-    def _path_poses(self, stream: str, topic: str) -> PoseBlock:
-        """Poses of a path that is published again and again as it grows, perhaps with all poses
-        corrected.
+    def trajectory(self, source: Source, measures: str = "auto") -> tuple[Trajectory, list[str]]:
+        """The trajectory of one source.
+
+        Parameters
+        ----------
+        source : str or TfSource
+        measures : str
+            What to read of the poses, see :meth:`measured`.
+
+        Returns
+        -------
+        Trajectory
+            In the order of stamps; of those with equal stamps the first.
+        notes : list of str
+            What a person should know.
+
+        Raises
+        ------
+        InputError
+            If the bag or a pose cannot be read.
         """
-        stamps_ns, bag_ns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-        poses, world_frame = np.empty((0, 7)), ""
-        messages = self._messages([topic])
-        unpacked = _decoded(messages, lambda kind, data: unpack_path(data, _is_ros1(kind)))
-        for _, message_ns, (frame, new_stamps_ns, new_poses) in unpacked:
-            world_frame = frame
-            if not len(new_stamps_ns):
-                continue
-            order = np.argsort(new_stamps_ns, kind="stable")
-            new_stamps_ns = new_stamps_ns[order]
-            new_bag_ns = _first_seen(new_stamps_ns, message_ns, stamps_ns, bag_ns)
-            older = stamps_ns < new_stamps_ns[0]
-            stamps_ns = np.concatenate([stamps_ns[older], new_stamps_ns])
-            bag_ns = np.concatenate([bag_ns[older], new_bag_ns])
-            poses = np.concatenate([poses[older], new_poses[order]])
-        if len(stamps_ns) > 1 and not stamps_ns.any():
-            raise InputError(
-                f"the poses of path {topic} have no stamps: all are zero; use the odometry that "
-                "the path was made from"
+        self.check(source)
+        poses = self.poses(source, measures={"parent": measures})
+        if not len(poses):
+            raise InputError(f"no poses on {source} of {self}")
+        trajectory, notes = poses.trajectory(), []
+        if len(trajectory) < len(poses):
+            notes.append(
+                f"{source}: {len(poses) - len(trajectory)} of {len(poses)} poses had a stamp that "
+                "was there already and were dropped"
             )
-        columns = PoseColumns.of_frames(stamps_ns, poses, world_frame)
-        return self._whole(stream, columns, bag_ns)
-
-    def _scan_poses(self, stream: str, topic: str) -> PoseBlock:
-        """Odometry from the points of a lidar, which is kept beside the bag for the next time."""
-        place = scans.kept_file(self.paths[0], topic)
-        found = scans.read_kept(place, self.files())
-        if found is None:
-            count, doing = self.topics[topic].count, f"odometry of {topic}"
-            messages = self.shown(self._messages([topic]), count, doing)
-            unpacked = _decoded(
-                messages, lambda kind, data: scans.unpack_scan(data, _is_ros1(kind))
-            )
-            found = scans.odometry(topic, ((scan, bag_ns) for _, bag_ns, scan in unpacked))
-            scans.keep(place, self.files(), found)
-        about = f"{topic}: odometry from {len(found.poses)} scans"
-        lost = f", {found.n_failed} of which could not be registered" if found.n_failed else ""
-        self._notes.append(f"{about}{lost}; it is kept in {place}")
-        columns = PoseColumns.of_frames(found.stamps_ns, found.poses, "scans", found.frame)
-        return self._whole(stream, columns, found.bag_ns)
-
-    def _transformed_poses(self, sources: dict[str, TfSource], max_gap_s: float) -> list[PoseBlock]:
-        """A PoseBlock for each stream whose poses come from the transform tree."""
-        tree, blocks = self.static_frames(), []
-        streams = {name: TfStream(source, max_gap_s, tree) for name, source in sources.items()}
-        found: dict[str, list[Any]] = {name: [] for name in streams}
-        for source in sources.values():
-            tree.route(*source)
-        for transform, is_static, bag_ns in self._transforms():
-            for name, stream in streams.items() if not is_static else ():
-                found[name] += ((bag_ns, *each) for each in stream.edges_at(transform, False))
-        for name, stream in streams.items():
-            if not found[name]:
-                raise InputError(f"{sources[name]}: {stream.describe_missing()}")
-            bag_times_ns, stamps_ns, rows = zip(*found[name], strict=True)
-            Ts = stream.composed(
-                {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
-            )
-            values = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
-            columns = PoseColumns.of_frames(np.array(stamps_ns), values, *sources[name])
-            blocks.append(self._whole(name, columns, bag_times_ns))
-        return blocks
+        if (np.diff(poses.stamps_ns) < 0).any():
+            notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
+        kind: Any = self.measured(source, measures)
+        return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes
 
     def static_frames(self) -> FrameTree:
         """The frames of the bag and their static transforms; of repeated ones the last. As in tf2,
@@ -372,31 +361,29 @@ class PoseBag:
             If the transforms form no tree or are damaged.
         """
         tree, notes = FrameTree("the bag's transforms"), {}
-        for transform, is_static, _ in self._transforms():
+        blocks = self._blocks(self._of_transforms())
+        for transform, is_fixed in chain.from_iterable(map(self._transforms, blocks)):
             parent, frame, pose = transform.world_frame, transform.sensor_frame or "", None
-            if is_static:
+            if is_fixed:
                 try:
                     pose = checked_pose(transform.position, transform.quat_xyzw)
                 except InputError as error:
                     notes[frame] = f"transform {parent}:{frame} was left out: {error}"
                     continue
-            tree.add(parent, frame, pose, is_static)
+            tree.add(parent, frame, pose, is_fixed)
         self._notes += notes.values()
         return tree
 
-    def _transforms(self) -> Iterator[tuple[PoseFields, bool, int]]:
-        """Transforms, whether each is static, and its bag time."""
-        messages = self._messages(self._of_transforms())
-        unpacked = _decoded(messages, lambda kind, data: unpack_transforms(data, _is_ros1(kind)))
-        for kind, bag_ns, transforms in unpacked:
-            for transform in transforms:
-                yield transform, kind.topic.endswith("tf_static"), bag_ns
-
     # ---- messages
 
-    def _messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Messages of some topics in the order of bag time."""
-        return chain.from_iterable(self._blocks(topics))
+    def _transforms(self, block: list[Message]) -> Iterator[tuple[PoseFields, bool]]:
+        """Transforms, and whether each is static."""
+        for kind, messages, _ in _by_kind(block):
+            try:
+                lists = each_unpacked(messages, partial(unpack_transforms, is_ros1=kind.is_ros1))
+            except MalformedMessage as error:
+                raise _unreadable(kind, 0, error) from error
+            yield from ((each, is_static(kind.topic)) for each in chain.from_iterable(lists))
 
     def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Messages of some topics in the order of bag time, many at once."""
@@ -407,45 +394,23 @@ class PoseBag:
         return message_blocks(heapq.merge(*streams, key=itemgetter(1)))
 
 
-def _decoded(
-    messages: Iterable[Message],
-    decode: Callable[[MessageKind, bytes], T],
-    errors: type[Exception] | tuple[type[Exception], ...] = MALFORMED,
-) -> Iterator[tuple[MessageKind, int, T]]:
-    """Kind, bag time and content of messages; one that cannot be unpacked is named."""
-    for number, (kind, bag_ns, data) in enumerate(messages, start=1):
-        try:
-            found = decode(kind, data)
-        except InputError:
-            raise
-        except errors as error:
-            raise _unreadable(kind, number, error) from error
-        yield kind, bag_ns, found
+def _by_kind(block: list[Message]) -> Iterator[tuple[MessageKind, list[bytes], Any]]:
+    """The messages of each kind in a block, and their bag times (N,)."""
+    for kind in {id(each): each for each, _, _ in block}.values():
+        messages = [data for each, _, data in block if each is kind]
+        yield kind, messages, np.array([bag_ns for each, bag_ns, _ in block if each is kind])
 
 
-def _unreadable(kind: MessageKind, number: int, error: Exception) -> InputError:
-    """The error of a message that cannot be unpacked."""
+def _unreadable(kind: MessageKind, n_before: int, error: MalformedMessage) -> InputError:
+    """The error of a message that cannot be unpacked, after others of its topic."""
     return InputError(
-        f"{kind.topic}, message {number}: not a readable {kind.type} ({error}); "
-        "the bag is damaged, record it again"
+        f"{kind.topic}, message {n_before + error.index + 1}: not a readable {kind.type} "
+        f"({error}); the bag is damaged, record it again"
     )
 
 
-def _is_ros1(kind: MessageKind) -> bool:
-    return kind.encoding == "ros1"
-
-
-def _in_bag_order(poses: PoseBlock) -> PoseBlock:
-    return poses[np.argsort(poses.bag_ns, kind="stable")]
-
-
-def _first_seen(
-    new_stamps_ns: IntArray, message_ns: int, stamps_ns: IntArray, bag_ns: IntArray
-) -> IntArray:
-    """Bag time at which each stamp appeared first; ``stamps_ns`` are sorted."""
-    first_ns = np.full(len(new_stamps_ns), message_ns, dtype=np.int64)
-    if len(stamps_ns):
-        index = np.minimum(np.searchsorted(stamps_ns, new_stamps_ns), len(stamps_ns) - 1)
-        is_known = stamps_ns[index] == new_stamps_ns
-        first_ns[is_known] = bag_ns[index[is_known]]
-    return first_ns
+def _parent_first(topic: str) -> tuple[int, str]:
+    """Sorts the likelier parent first: by name, then alphabetically."""
+    words = {*re.split(r"[/_]+", topic.lower()), ""}
+    word = "child" if "child" in words else next(each for each in _WORDS if each in words)
+    return _WORDS.index(word), topic

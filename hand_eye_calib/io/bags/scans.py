@@ -7,14 +7,15 @@ of them: they look the same on flat ground whatever the pitch, and pitch and rol
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.errors import InputError, MissingDependencyError, printable
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import Buffer, Cursor
 
@@ -24,7 +25,6 @@ _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
 # A scan lasts so long (s): tells the unit of the times of its points.
 _SHORTEST_S, _LONGEST_S = 0.005, 1.0
-_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 
 # Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
 _NEAREST_M, _FARTHEST_M = 1.0, 80.0
@@ -67,55 +67,67 @@ def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
     cursor = Cursor(data, is_ros1)
     header_ns, frame = cursor.header()
     height, width = cursor.number(), cursor.number()
-    fields = {}
+    formats, offsets = {}, {}
     for _ in range(cursor.number()):
-        name, offset, kind = cursor.name(), cursor.number(), cursor.number("B")
+        name, offsets[name], kind = cursor.name(), cursor.number(), cursor.number("B")
         cursor.number()
         if not 0 < kind < len(_DATATYPES):
             raise ValueError(f"field {name} of the points has datatype {kind}")
-        fields[name] = (_DATATYPES[kind], offset)
+        formats[name] = _DATATYPES[kind]
     order = ">" if cursor.number("B") else "<"
     step, _, size = cursor.number(), cursor.number(), cursor.number()
-    if not {"x", "y", "z"} <= fields.keys():
-        raise ValueError(f"points have no x, y, z, but {', '.join(fields)}")
+    if not {"x", "y", "z"} <= formats.keys():
+        raise ValueError(f"points have no x, y, z, but {', '.join(formats)}")
     if size < height * width * step or cursor.position + size > len(data):
         raise ValueError(f"{height * width} points do not fit into {size} bytes")
-    names = list(fields)
     layout = np.dtype(
         {
-            "names": names,
-            "formats": [order + fields[name][0] for name in names],
-            "offsets": [fields[name][1] for name in names],
+            "names": [*formats],
+            "formats": [order + each for each in formats.values()],
+            "offsets": [*offsets.values()],
             "itemsize": step,
         }
     )
     table = np.frombuffer(data, layout, height * width, cursor.position)
     points = np.stack([table[axis].astype(float) for axis in "xyz"], axis=-1)
-    of_time = next((name for name in _TIMES if name in fields), None)
+    of_time = next((name for name in _TIMES if name in formats), None)
     times = table[of_time].astype(float) if of_time else np.zeros(len(points))
     ranges = np.linalg.norm(points, axis=1)
     is_used = (ranges > _NEAREST_M) & (ranges < _FARTHEST_M)  # nor those that are not finite
     points, times = points[is_used], times[is_used]
-    if not len(points):
-        return Scan(points, times, header_ns, frame)
-    phases, last_ns = _timed(times, header_ns)
-    return Scan(points, phases, last_ns, frame)
+    span = np.ptp(times) if len(times) else 0.0
+    units_s = [unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if _SHORTEST_S <= span * unit <= _LONGEST_S]
+    if not units_s:
+        return Scan(points, np.ones(len(times)), header_ns, frame)
+    # Times may be relative to the stamp of the header, or absolute.
+    last_s = float(times.max() * units_s[0])
+    stamp_ns = round(last_s * 1e9) + header_ns * (last_s <= _LONGEST_S)
+    return Scan(points, (times - times.min()) / span, stamp_ns, frame)
 
 
-def _timed(times: FloatArray, header_ns: int) -> tuple[FloatArray, int]:
-    """When each point was taken, from 0 to 1, and the stamp of the last. Times may be relative to
-    the stamp of the header, or absolute.
+class Odometry(NamedTuple):
+    """Poses (N, 7) x y z qx qy qz qw of a lidar in the frame of its first scan, each at the end of
+    its scan; their stamps and bag times (N,), its frame, and how many scans could not be
+    registered.
     """
-    first, span = times.min(), np.ptp(times)
-    unit = next((u for u in _UNITS_S if _SHORTEST_S <= span * u <= _LONGEST_S), None)
-    if unit is None:
-        return np.ones(len(times)), header_ns
-    last_s = float(times.max() * unit)
-    return (times - first) / span, round(last_s * 1e9) + header_ns * (last_s <= _LONGEST_S)
+
+    poses: np.ndarray
+    stamps_ns: np.ndarray
+    bag_ns: np.ndarray
+    frame: np.ndarray
+    n_failed: np.ndarray
 
 
 class ScanOdometry:
-    """Poses of a lidar from its scans, each at the end of its scan, in the frame of the first.
+    """Registers the scans on a topic of a bag one after the other; what is found is kept beside the
+    bag for the next time.
+
+    Attributes
+    ----------
+    place : Path
+        Where it is kept.
+    kept : Odometry or None
+        What was kept for files of the same sizes and times.
 
     Raises
     ------
@@ -123,7 +135,15 @@ class ScanOdometry:
         If small_gicp is not installed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, topic: str, bag: Path, files: Sequence[Path]) -> None:
+        self._topic, states = topic, [file.stat() for file in files]
+        self._state = np.array([[each.st_size, each.st_mtime_ns] for each in states])
+        self.place = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
+        self.kept: Odometry | None = None
+        # The errors are of many kinds: it is not there, cut off, or of an older version.
+        with suppress(Exception), np.load(self.place, allow_pickle=False) as kept:
+            if np.array_equal(kept["files"], self._state):
+                self.kept = Odometry(*(kept[name] for name in Odometry._fields))
         try:
             import small_gicp
         except ImportError:
@@ -132,20 +152,41 @@ class ScanOdometry:
                 "install 'hand_eye_calib[lidar]'; or record the odometry of a lidar SLAM"
             ) from None
         self._gicp = small_gicp
-        self.pose = np.eye(4)
-        self._step = np.eye(4)
-        self._voxel_m = 0.0
+        self._pose, self._step, self._frame = np.eye(4), np.eye(4), ""
+        self._voxel_m, self._n_failed = 0.0, 0
         self._keys: list[tuple[FloatArray, FloatArray]] = []
-        self.n_failed = 0
+        self._found: list[tuple[FloatArray, int, int]] = []
 
-    def add(self, scan: Scan) -> FloatArray:
-        """Pose (4, 4) of the lidar at the end of the next scan."""
+    def add(self, scan: Scan, bag_ns: int) -> None:
+        """Register the next scan."""
+        if len(scan.points) > _NEIGHBOURS:
+            self._register(scan)
+            self._found.append((self._pose, scan.stamp_ns, bag_ns))
+            self._frame = scan.frame
+
+    def odometry(self) -> Odometry:
+        """What was found; an InputError if most scans could not be registered."""
+        if self.kept is not None:
+            return self.kept
+        if 2 * self._n_failed >= len(self._found):
+            raise InputError(
+                f"{self._topic}: {self._n_failed} of {len(self._found)} scans could not be "
+                "registered; use the odometry of a lidar SLAM"
+            )
+        poses, stamps_ns, bag_ns = (np.array(each) for each in zip(*self._found, strict=True))
+        rows = np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
+        found = rows, stamps_ns, bag_ns, np.array(self._frame), np.array(self._n_failed)
+        with suppress(OSError):  # the folder may be read-only
+            np.savez(self.place, files=self._state, **Odometry(*found)._asdict())
+        return Odometry(*found)
+
+    def _register(self, scan: Scan) -> None:
         if not self._keys:
             share = _VOXEL_SHARE * float(np.median(np.linalg.norm(scan.points, axis=1)))
             self._voxel_m = min(max(share, _LEAST_VOXEL_M), _MOST_VOXEL_M)
             self._add_to_map(scan.points)
-            return self.pose
-        before, step, pose = self.pose, self._step, self.pose
+            return
+        before, step, pose = self._pose, self._step, self._pose
         for n_voxels in _MATCH_VOXELS:
             points = self._gicp.voxelgrid_sampling(_without_motion(scan, step), self._voxel_m)
             self._gicp.estimate_covariances(points, None, _NEIGHBOURS, _N_THREADS)
@@ -158,23 +199,22 @@ class ScanOdometry:
             )
             if found.num_inliers < _LEAST_MATCHED * points.size():
                 pose, step = before, np.eye(4)  # rather than on and away from the map
-                self.n_failed += 1
+                self._n_failed += 1
                 break
             pose = np.array(found.T_target_source)
             # Rounding must not grow from scan to scan.
             pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
             step = se3.inverse(before) @ pose
-        self.pose, self._step = pose, step
-        moved = se3.inverse(self._keys[-1][0]) @ self.pose
+        self._pose, self._step = pose, step
+        moved = se3.inverse(self._keys[-1][0]) @ pose
         is_new = len(self._keys) < 5 or np.linalg.norm(moved[:3, 3]) > _KEY_M
         if is_new or se3.rotation_angle(moved[:3, :3]) > _KEY_RAD:
             self._add_to_map(_without_motion(scan, step))
-        return self.pose
 
     def _add_to_map(self, points: FloatArray) -> None:
-        placed = points @ self.pose[:3, :3].T + self.pose[:3, 3]
+        placed = points @ self._pose[:3, :3].T + self._pose[:3, 3]
         sampled = self._gicp.voxelgrid_sampling(placed, self._voxel_m / 2.0)
-        self._keys = [*self._keys, (self.pose, np.array(sampled.points()[:, :3]))][-_N_KEYS:]
+        self._keys = [*self._keys, (self._pose, np.array(sampled.points()[:, :3]))][-_N_KEYS:]
         whole = np.concatenate([each for _, each in self._keys])
         self._map = self._gicp.preprocess_points(whole, self._voxel_m, _NEIGHBOURS, _N_THREADS)
 
@@ -186,72 +226,3 @@ def _without_motion(scan: Scan, step: FloatArray) -> FloatArray:
     part = np.minimum((scan.phases * _PARTS).astype(int), _PARTS - 1)
     turned = np.einsum("nij,nj->ni", Ts[part, :3, :3], scan.points)
     return np.asarray(np.where(scan.phases[:, None] < 1.0, turned + Ts[part, :3, 3], scan.points))
-
-
-class Odometry(NamedTuple):
-    """Poses (N, 7) x y z qx qy qz qw of a lidar, their stamps and bag times (N,), its frame, and
-    how many scans could not be registered.
-    """
-
-    poses: FloatArray
-    stamps_ns: IntArray
-    bag_ns: IntArray
-    frame: str
-    n_failed: int
-
-
-def odometry(topic: str, scans: Iterable[tuple[Scan, int]]) -> Odometry:
-    """Register all scans of a topic, each with its bag time (ns).
-
-    Raises
-    ------
-    InputError
-        If most scans cannot be registered.
-    MissingDependencyError
-        If small_gicp is not installed.
-    """
-    lidar, frame = ScanOdometry(), ""
-    found: list[tuple[FloatArray, int, int]] = []
-    for scan, bag_ns in scans:
-        frame = scan.frame
-        if len(scan.points) > _NEIGHBOURS:
-            found.append((lidar.add(scan), scan.stamp_ns, bag_ns))
-    if 2 * lidar.n_failed >= len(found):
-        raise InputError(
-            f"{topic}: {lidar.n_failed} of {len(found)} scans could not be registered; use the "
-            "odometry of a lidar SLAM"
-        )
-    poses, stamps_ns, times_ns = (np.array(column) for column in zip(*found, strict=True))
-    rows = np.concatenate([poses[:, :3, 3], se3.to_quat_xyzw(poses)], axis=1)
-    return Odometry(rows, stamps_ns, times_ns, frame, lidar.n_failed)
-
-
-def kept_file(bag: Path, topic: str) -> Path:
-    """Where the odometry of a bag's scans is kept: beside the bag."""
-    return bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
-
-
-def read_kept(path: Path, files: Sequence[Path]) -> Odometry | None:
-    """Odometry that was kept for files of this size and time; None if there is none."""
-    try:
-        with np.load(path, allow_pickle=False) as kept:
-            if not np.array_equal(kept["files"], _state_of(files)):
-                return None
-            columns = (kept["poses"], kept["stamps_ns"], kept["bag_ns"])
-            return Odometry(*columns, printable(str(kept["frame"])), int(kept["n_failed"]))
-    except Exception:  # of many kinds: it is not there, cut off, or of an older version
-        return None
-
-
-def keep(path: Path, files: Sequence[Path], found: Odometry) -> None:
-    """Keep odometry for the next time, if the folder can be written to."""
-    try:
-        with open(path, "wb") as file:
-            np.savez(file, files=_state_of(files), **found._asdict())
-    except OSError:
-        path.unlink(missing_ok=True)
-
-
-def _state_of(files: Sequence[Path]) -> IntArray:
-    found = [file.stat() for file in files]
-    return np.array([[each.st_size, each.st_mtime_ns] for each in found], dtype=np.int64)

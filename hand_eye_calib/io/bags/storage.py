@@ -3,19 +3,21 @@
 An mcap file that rosbags cannot open is read record by record: see mcap_files.py.
 """
 
-import re
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePath
 from typing import Any
+from urllib.parse import quote
 
 from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.io.bags.mcap_files import (
     Message,
     MessageKind,
     indexed_messages,
+    message_kind,
     reason_of,
     recovered_messages,
 )
@@ -26,8 +28,8 @@ from hand_eye_calib.io.limits import (
     ReadingMemory,
 )
 
-#: Messages that are unpacked at once.
-BLOCK_SIZE = 2048
+# Messages that are unpacked at once.
+_BLOCK_SIZE = 2048
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {
@@ -40,12 +42,12 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 class Storage:
     """A storage file opened for reading: ``path`` is its name for a person, ``file`` where it is,
-    unpacked, ``memory`` that of all that are read together, and ``bag`` the number of its bag.
+    unpacked, ``memory`` that of all that are read together.
 
     Attributes
     ----------
-    topics : list of (str, str, int)
-        Topic, message type and number of messages of each connection.
+    counts : Counter of MessageKind
+        Number of messages of each kind.
     start_ns, end_ns : int or None
         Bag time of the first and last message; None if there is none.
     losses : list of str
@@ -57,9 +59,9 @@ class Storage:
         If nothing in it can be read.
     """
 
-    def __init__(self, path: Path, file: Path, memory: ReadingMemory, bag: int) -> None:
-        self.path, self._file, self._memory, self._bag = path, file, memory, bag
-        self.topics: list[tuple[str, str, int]] = []
+    def __init__(self, path: Path, file: Path, memory: ReadingMemory) -> None:
+        self.path, self._file, self._memory = path, file, memory
+        self.counts = Counter[MessageKind]()
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self.losses: list[str] = []
@@ -88,31 +90,24 @@ class Storage:
             raise ValueError("it has no index of its messages")
         for each in reader.connections:
             encoding = getattr(each.ext, "serialization_format", "ros1")
-            kind = MessageKind.of(each.topic, each.msgtype, encoding, self._bag)
+            kind = message_kind(each.topic, each.msgtype, encoding, each.msgdef)
             self._kinds[each.id] = kind
-            self.topics.append((kind.topic, kind.type, each.msgcount))
+            self.counts[kind] += each.msgcount
         if reader.message_count:
             self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
 
     def _search(self, reason: Exception) -> None:
         """Go through a file that rosbags cannot open."""
-        counts: dict[MessageKind, int] = {}
         times_ns = []
-        for kind, bag_ns, _ in recovered_messages(self._file, self._bag, self.losses.append):
-            counts[kind] = counts.get(kind, 0) + 1
+        for kind, bag_ns, _ in recovered_messages(self._file, self.losses.append):
+            self.counts[kind] += 1
             times_ns.append(bag_ns)
         if self.losses and not times_ns:
             raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
-        self.topics = [(kind.topic, kind.type, count) for kind, count in counts.items()]
         if times_ns:
             self.start_ns, self.end_ns = min(times_ns), max(times_ns)
             about = f"{len(times_ns)} messages covering {(self.end_ns - self.start_ns) * 1e-9:.1f}"
             self.losses = [f"{loss}; recovered are {about} s" for loss in self.losses]
-
-    def definition(self, topic: str) -> Any:
-        """How the messages of a topic are built, as rosbags has it; None if it is not known."""
-        connections = self._reader.connections if self._reader is not None else ()
-        return next((each.msgdef for each in connections if each.topic == topic), None)
 
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over the messages of some topics in the order of bag time, many at once. Chunks
@@ -133,7 +128,7 @@ class Storage:
 
     def _messages(self, topics: Collection[str]) -> Iterable[Message]:
         if self._reader is None:  # what is lost was said when it was opened
-            found = recovered_messages(self._file, self._bag, lambda _: None)
+            found = recovered_messages(self._file, lambda _: None)
             return (message for message in found if message[0].topic in topics)
         kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
         if self._file.suffix == ".mcap":
@@ -152,7 +147,7 @@ class Storage:
         try:
             with self._memory:
                 yield
-        except (InputError, MissingDependencyError):
+        except MissingDependencyError:
             raise
         except Exception as error:
             # NoMemError is SQLite's, as rosbags uses it.
@@ -177,6 +172,8 @@ def _opened(file: Path) -> Any:
             "reading bags needs rosbags, which is not installed: pip install rosbags"
         ) from error
     reader: Any = rosbag1.Reader(file) if file.suffix == ".bag" else rosbag2.Reader(file)
+    if file.suffix == ".db3":  # whose path SQLite reads as an address
+        reader.storage.path = Path(quote(str(file)))
     reader.open()
     return reader
 
@@ -198,7 +195,7 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
             data = bytes(_zstd().decompress(data))
         rows.append((kind, bag_ns, data))
         size += len(data)
-        if len(rows) == BLOCK_SIZE or size > BLOCK_BYTES:
+        if len(rows) == _BLOCK_SIZE or size > BLOCK_BYTES:
             yield rows
             rows, size = [], 0
     if rows:
@@ -227,46 +224,45 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
         If there is no bag or it cannot be read; one line that names the path.
     """
     memory, found = ReadingMemory(), list[Storage]()
-    for number, path in enumerate(paths):
-        _check_path(path)
-        for file in [path] if path.is_file() else _files_in(path):
-            readable, lost = file, ""
-            is_packed = file.suffix == ".zstd"
-            if is_packed or re.search("[?#%]", str(file.absolute())):
-                folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
-                readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
-                if is_packed:
-                    lost = _unpack(file, readable)
-                else:  # which SQLite would read as parts of an address
-                    readable.symlink_to(file.absolute())
-            storage = Storage(file, readable, memory, number)
-            opened.callback(storage.close)
-            storage.losses[:0] = filter(None, [lost])
-            found.append(storage)
+    for file in [file for path in paths for file in _files_of(path)]:
+        readable, lost = file, ""
+        if file.suffix == ".zstd":
+            folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
+            readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
+            lost = _unpack(file, readable)
+        storage = Storage(file, readable, memory)
+        opened.callback(storage.close)
+        storage.losses[:0] = filter(None, [lost])
+        found.append(storage)
     return sorted(found, key=lambda storage: (storage.start_ns is None, storage.start_ns or 0))
 
 
 def _unpack(file: Path, target: Path) -> str:
     """Unpack a file that is compressed as a whole, as far as it goes; what is lost."""
-    zstd, left = _zstd(), SMALLEST_UNPACKED + LARGEST_RATIO * file.stat().st_size
+    zstd, most = _zstd(), SMALLEST_UNPACKED + LARGEST_RATIO * file.stat().st_size
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
-        while left >= 0:
-            try:
-                piece = packed.read(BLOCK_BYTES)
-            except (EOFError, zstd.ZstdError) as error:
-                return f"its compression is damaged ({reason_of(error)})"
-            if not piece:
-                return ""
-            left -= len(piece)
-            unpacked.write(piece)
-    raise InputError(
-        f"cannot read bag {file}: its content unpacks to more than {LARGEST_RATIO} times its "
-        "size, which is not believable"
-    )
+        try:
+            for piece in iter(lambda: packed.read(BLOCK_BYTES), b""):
+                if unpacked.tell() + unpacked.write(piece) > most:
+                    raise InputError(
+                        f"cannot read bag {file}: its content unpacks to more than "
+                        f"{LARGEST_RATIO} times its size, which is not believable"
+                    )
+        except (EOFError, zstd.ZstdError) as error:
+            return f"its compression is damaged ({reason_of(error)})"
+    return ""
 
 
-def _files_in(path: Path) -> list[Path]:
-    """The files of a directory that hold messages; those that are there unpacked, too, once."""
+def _files_of(path: Path) -> list[Path]:
+    """The files of a bag that hold messages; those that are there unpacked, too, once. Refuses
+    mistakes that are easily made and easily explained.
+    """
+    if not path.exists():
+        raise InputError(f"no bag at {path}; expected {_EXPECTED}")
+    if not path.is_dir():
+        if not (_suffix(path) and path.is_file()):
+            raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
+        return [path]
     found = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
     found -= {file for file in found if file.suffix == ".zstd" and file.with_suffix("") in found}
     if not found:
@@ -280,15 +276,3 @@ def _suffix(file: Path) -> str:
     """.mcap, .db3 or .bag, also of a compressed file; empty for any other."""
     suffix = PurePath(file.name.removesuffix(".zstd")).suffix
     return suffix if suffix in _REPAIRS else ""
-
-
-def _check_path(path: Path) -> None:
-    """Refuse mistakes that are easily made and easily explained."""
-    if not path.exists():
-        raise InputError(f"no bag at {path}; expected {_EXPECTED}")
-    if path.is_dir():
-        return
-    if not _suffix(path):
-        raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
-    if not path.is_file():
-        raise InputError(f"{path} is not a regular file; expected {_EXPECTED}")

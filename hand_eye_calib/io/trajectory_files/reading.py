@@ -102,11 +102,11 @@ def read_trajectory(
             raise ConfigError(
                 "topic and tf are for bags: give one of them and none of the options of text files"
             )
-        from hand_eye_calib.io.bags import PoseBag, trajectory_of
+        from hand_eye_calib.io.bags import PoseBag
 
         with PoseBag(source) as bag:
             of = TfSource.parse(tf) if tf else topic or ""
-            trajectory, notes = trajectory_of(bag, of, measures)
+            trajectory, notes = bag.trajectory(of, measures)
             notes = [*bag.warnings, *notes]
     elif isinstance(source, _Path):
         if not isinstance(times, _Path | None):
