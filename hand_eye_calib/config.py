@@ -28,6 +28,7 @@ EXPORT_FORMATS = (
     *("easy_handeye2", "opencv", "numpy"),
 )
 MEASURES = ("poses", "positions", "rotations", "rates")
+PAIR_BY = ("time", "row", "name")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
     "auto",

@@ -3,9 +3,10 @@ and as they type them. Every place that prints or reads a quantity takes it from
 """
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import PurePath
 from typing import TypeAlias
 
 from hand_eye_calib.errors import ConfigError
@@ -124,14 +125,15 @@ def listing(words: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
-def names_of_files(paths: Sequence[Path]) -> list[str]:
-    """A name for each of some files: their stems or, if those are equal, their folders; none if
-    those are equal, too.
+def told_apart(paths: Sequence[str]) -> list[str]:
+    """Paths without the beginning and the end that all share: monday and tuesday of a/monday/bag
+    and a/tuesday/bag.
     """
-    for names in ([path.stem for path in paths], [path.parent.name for path in paths]):
-        if all(names) and len({*names}) == len(paths):
-            return names
-    return [""] * len(paths)
+    whole = [PurePath(path).parts for path in paths]
+    first = len(os.path.commonprefix(whole))
+    parts = [each[first:] or each[-1:] for each in whole]
+    shared = len(os.path.commonprefix([each[::-1] for each in parts]))
+    return ["/".join(each[: len(each) - shared] or each[-1:]) for each in parts]
 
 
 def counted(count: int, noun: str) -> str:

@@ -4,10 +4,10 @@ import argparse
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import told_apart, waiting_for
+from hand_eye_calib.cli.console import waiting_for
 from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.errors import InputError, printable
-from hand_eye_calib.text import amount
+from hand_eye_calib.text import amount, told_apart
 
 if TYPE_CHECKING:
     from hand_eye_calib.results.calibration import Calibration

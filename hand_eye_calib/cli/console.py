@@ -3,12 +3,10 @@ command line spells options.
 """
 
 import dataclasses
-import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import PurePath
 from typing import TypeVar
 
 from hand_eye_calib.config import CalibratorConfig, option_name
@@ -23,7 +21,7 @@ _STYLES = {"USE": "\x1b[1;32m", "USE WITH CARE": "\x1b[1;33m", "DO NOT USE": "\x
 
 OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(CalibratorConfig)}
 
-_OF_FILES = ("format", "columns", "times", "stamp_unit")
+_OF_FILES = ("format", "columns", "times", "stamp_unit", "pair_by")
 _OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for name in _OF_FILES)}
 
 # Names in backticks; and names that are no words of the language, such as max_gap and prior.z,
@@ -103,14 +101,3 @@ def print_result(text: str) -> None:
     if sys.stdout.isatty() and verdict in _STYLES:
         text = f"{_STYLES[verdict]}{verdict}\x1b[0m{colon}{rest}"
     print(text, flush=True)
-
-
-def told_apart(paths: Sequence[str]) -> list[str]:
-    """Paths without the beginning and the end that all share: monday and tuesday of a/monday/bag
-    and a/tuesday/bag.
-    """
-    whole = [PurePath(path).parts for path in paths]
-    first = len(os.path.commonprefix(whole))
-    parts = [each[first:] or each[-1:] for each in whole]
-    shared = len(os.path.commonprefix([each[::-1] for each in parts]))
-    return ["/".join(each[: len(each) - shared] or each[-1:]) for each in parts]

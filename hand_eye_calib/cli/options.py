@@ -15,6 +15,7 @@ from typing import Any
 
 from hand_eye_calib.cli.console import OPTION_FIELDS, STREAMS, flag, note
 from hand_eye_calib.config import (
+    PAIR_BY,
     STAMP_UNITS,
     TRAJECTORY_FORMATS,
     CalibratorConfig,
@@ -230,6 +231,11 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         for stream in STREAMS:
             of_one = settings | {"help": f"the same for {stream.upper()} only"}
             group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **of_one)
+    pair_by = (
+        "time: by the stamps; row: poses without stamps, in their order; name: poses of images of "
+        "the same name. For both files"
+    )
+    group.add_argument("--pair-by", choices=PAIR_BY, default=PAIR_BY[0], help=pair_by)
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:

@@ -20,7 +20,6 @@ from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.text import names_of_files
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.calibrator import Calibrator
@@ -105,9 +104,9 @@ def read_pair(arguments: Namespace, options: Mapping[str, Any]) -> Recording:
 def read_files(
     arguments: Namespace, paths: Sequence[Path | str], options: Mapping[str, Any]
 ) -> tuple[list[Trajectory], list[str]]:
-    """The trajectories of files, named like the files that name no frame, and what was wrong with
-    their stamps; a note says what was guessed. How each is read is among the arguments: of two, its
-    own options go before those for both. ``options`` say what the sensors measure.
+    """The trajectories of files, and what was wrong with their stamps; a note says what was
+    guessed. How each is read is among the arguments: of two, its own options go before those for
+    both. ``options`` say what the sensors measure.
     """
     from hand_eye_calib.io.trajectory_files import FileOptions, read_trajectory_files
 
@@ -119,6 +118,7 @@ def read_files(
     for path, stream in zip(paths, streams, strict=True):
         given = {name: getattr(arguments, f"{stream}_{name}", None) for name in FILE_OPTIONS}
         given = {name: value or getattr(arguments, name) for name, value in given.items()}
+        given["pair_by"] = arguments.pair_by
         given = {"format": "auto"} | {name: value for name, value in given.items() if value}
         measures = options.get(f"{stream}_measures", "auto")
         files.append((Path(path), FileOptions(**given, measures=measures, repair=True)))
@@ -128,12 +128,9 @@ def read_files(
         for text in reading.guesses:
             named_as = rf"`{stream}_\1`" if stream else r"`\1`"
             note(re.sub(f"`({'|'.join(FILE_OPTIONS)})`", named_as, text))
-    names = names_of_files([Path(path) for path in paths])
-    trajectories = [
-        dataclasses.replace(each.trajectory, sensor_frame=each.trajectory.sensor_frame or name)
-        for each, name in zip(readings, names, strict=True)
+    return [each.trajectory for each in readings], [
+        text for reading in readings for text in reading.repairs
     ]
-    return trajectories, [text for reading in readings for text in reading.repairs]
 
 
 # ------------------------------------------------------------ bags and journals

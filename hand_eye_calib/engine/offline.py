@@ -4,36 +4,23 @@ import inspect
 import textwrap
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from os import PathLike
-from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias
-
-import numpy as np
+from typing import Any, Literal, TypeAlias
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import compare_answers, other_answers
 from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import Snapshot, name_frames
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
-from hand_eye_calib.text import AXIS_UNITS, Prior, names_of_files
+from hand_eye_calib.text import AXIS_UNITS, Prior
 from hand_eye_calib.upstairs import upstairs
 
 # Pose pairs that are used unless an option says otherwise: the noise model takes 8 kB for each, and
 # hours at ten a second hold as many.
 _MOST_PAIRS = 100_000
 
-
-class Table(Protocol):
-    """``pandas.DataFrame``, or another table with named columns."""
-
-    columns: Any
-
-
-#: A trajectory, or what :func:`hand_eye_calib.read_trajectory` makes one of: a path, rows, a table.
-TrajectoryLike: TypeAlias = Trajectory | str | PathLike[str] | np.ndarray | Table
 MethodName: TypeAlias = Literal[
     "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive"
 ]
@@ -122,7 +109,9 @@ def calibrate(
     for name in ("parent", "child", "prior", "checks", "progress"):
         del options[name]
     options = {name: value for name, value in options.items() if value is not None}
-    first, second = _as_trajectories(parent, child)
+    first, second = parent, child
+    if not (isinstance(first, Trajectory) and isinstance(second, Trajectory)):
+        first, second = upstairs("io.trajectory_files.reading", "read_trajectories")(first, second)
     options = _of_streams(first, second) | options | prior_fields(prior or {})
     snapshot = whole_snapshot(CalibratorConfig(**options), first, second)
     found = run(snapshot, checks=checks, progress=progress)
@@ -144,22 +133,6 @@ def _options_in_words() -> str:
 
 if calibrate.__doc__:  # not with python -OO
     calibrate.__doc__ = calibrate.__doc__.replace("OPTIONS", _options_in_words())
-
-
-def _as_trajectories(*given: object) -> list[Trajectory]:
-    """Trajectories from what :data:`TrajectoryLike` names."""
-    read_trajectory = upstairs("io.trajectory_files.reading", "read_trajectory")
-    are_paths = [isinstance(each, str | PathLike) for each in given]
-    read: list[Trajectory] = []
-    for each, is_path in zip(given, are_paths, strict=True):
-        if not isinstance(each, Trajectory):
-            each = read_trajectory(each, *(["auto"] if is_path else []))
-        read.append(each)
-    if all(are_paths):
-        names = names_of_files([Path(str(each)) for each in given])
-        for k, name in enumerate(names):
-            read[k] = replace(read[k], sensor_frame=read[k].sensor_frame or name)
-    return read
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:

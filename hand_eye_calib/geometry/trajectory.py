@@ -2,7 +2,8 @@
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from os import PathLike
+from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -300,6 +301,16 @@ class Trajectory:
             twists = corners(self.stamps_ns, self.poses, before[bent], fraction[bent])
             poses[bent] = poses[bent] @ se3.exp(twists)
         return poses
+
+
+class Table(Protocol):
+    """``pandas.DataFrame``, or another table with named columns."""
+
+    columns: Any
+
+
+#: A trajectory, or what :func:`hand_eye_calib.read_trajectory` makes one of: a path, rows, a table.
+TrajectoryLike: TypeAlias = Trajectory | str | PathLike[str] | np.ndarray | Table
 
 
 def far_position(x: float, y: float, z: float) -> str:

@@ -23,7 +23,7 @@ from motions import disturbed, write_pair
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
-from hand_eye_calib.cli.console import fail, note, told_apart, waiting_for, with_progress
+from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.present import as_text, static_transform_command
 from hand_eye_calib.config import CalibratorConfig, option_name
@@ -33,6 +33,7 @@ from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.finding import Finding, Severity
+from hand_eye_calib.text import told_apart
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from motions import as_trajectory, geodetic, wandering_poses
 
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -127,59 +129,109 @@ def of_iso():
 
 
 def of_decimal_comma():
-    rows = ([repr(each).replace(".", ",") for each in [SECONDS[k], *P[k], *Q[k]]] for k in range(N))
-    rows = [[each.replace("np,float64(", "").rstrip(")") for each in row] for row in rows]
+    values = np.c_[SECONDS, P, Q].tolist()
+    rows = [[repr(each).replace(".", ",") for each in row] for row in values]
     return "t;x;y;z;qx;qy;qz;qw\n" + joined(rows, ";")
 
 
-@pytest.mark.parametrize(
-    ("text", "measures", "starts_at_0", "note"),
-    [
-        (of_nmea(), "positions", False, ""),
-        (of_gpx(), "positions", False, "above the sea"),
-        (of_rtklib(), "positions", False, "18 s ahead of UTC"),
-        (of_rtklib(weeks=True), "positions", False, "18 s ahead of UTC"),
-        (of_colmap(), "poses", False, ""),
-        (of_nerfstudio(), "poses", False, "not those of OpenGL"),
-        (of_motive(), "poses", False, "rigid body drone"),
-        (of_vicon(), "poses", True, "rotation vectors"),
-        (of_iso(), "poses", False, ""),
-        (of_decimal_comma(), "poses", False, ""),
-    ],
-    ids=[
-        *("nmea", "gpx", "rtklib", "rtklib_weeks", "colmap"),
-        *("nerfstudio", "motive", "vicon", "iso", "decimal_comma"),
-    ],
-)
-def test_a_file_of_another_program_has_the_same_poses(tmp_path, text, measures, starts_at_0, note):
+def of_csv(unit, per_metre, time, per_second):
+    """In the units that the header names."""
+    names = ",".join(f"{axis} [{unit}]" for axis in "xyz")
+    head = f"time [{time}],{names},q_w,q_x,q_y,q_z\n"
+    stamps = (f"{stamp * per_second // 10**9}" for stamp in TRUTH.stamps_ns.tolist())
+    rows = zip(stamps, P * per_metre, Q[:, [3, 0, 1, 2]], strict=True)
+    return head + joined(([t, *p, *q] for t, p, q in rows), ",")
+
+
+def of_euroc():
+    rows = zip(TRUTH.stamps_ns, P, Q[:, [3, 0, 1, 2]], strict=True)
+    return joined(([t, *p, *q, 0.5] for t, p, q in rows), ", ")
+
+
+FORMATS = {
+    "tum": (joined(np.c_[SECONDS, P, Q].tolist()), ""),
+    "kitti": (joined(TRUTH.poses[:, :3].reshape(-1, 12)), "stamps read from"),
+    "euroc": (of_euroc(), "looks like format euroc"),
+    "csv_mm_ms": (of_csv("mm", 1e3, "ms", 1000), ""),
+    "csv_cm_us": (of_csv("cm", 1e2, "us", 10**6), ""),
+    "csv_m_ns": (of_csv("m", 1.0, "ns", 10**9), ""),
+    "iso": (of_iso(), ""),
+    "decimal_comma": (of_decimal_comma(), ""),
+    "colmap": (of_colmap(), ""),
+    "nerfstudio": (of_nerfstudio(), "not those of OpenGL"),
+    "motive": (of_motive(), "rigid body drone"),
+    "vicon": (of_vicon(), "rotation vectors"),
+    "nmea": (of_nmea(), "positions alone"),
+    "gpx": (of_gpx(), "above the sea"),
+    "rtklib": (of_rtklib(), "18 s ahead of UTC"),
+    "rtklib_weeks": (of_rtklib(weeks=True), "18 s ahead of UTC"),
+}
+MOUNT = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, -1.0, 0.7]))
+
+
+def calibrated(parent, child):
+    return hec.calibrate(parent, child, method="dnlo", reference="B5", checks=False).T_parent_child
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path, name):
+    text, note = FORMATS[name]
     path = tmp_path / "anything.txt"
     path.write_bytes(text.encode())
+    (tmp_path / "times.txt").write_text("\n".join(map(repr, SECONDS.tolist())))
     found = read_trajectory_file(path, AUTO)
     trajectory = found.trajectory
-    assert trajectory.measures == measures
-    assert len(trajectory) == N
-    start_ns = TRUTH.stamps_ns[0] if starts_at_0 else 0
+    start_ns = TRUTH.stamps_ns[0] if name == "vicon" else 0
     np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
     expected = TRUTH.poses.copy()
-    if measures == "positions":
+    if trajectory.measures == "positions":
         expected[:, :3, :3], expected[:, :3, 3] = np.eye(3), P - P[0]
     np.testing.assert_allclose(trajectory.poses, expected, atol=2e-6)
     assert note in " ".join(found.guesses)
+    assert trajectory.measures == ("positions" if name in [*FORMATS][-4:] else "poses")
+    if trajectory.measures == "poses":
+        child = Trajectory(trajectory.stamps_ns, TRUTH.poses @ MOUNT)
+        np.testing.assert_allclose(calibrated(trajectory, child), MOUNT, atol=1e-6)
 
 
 def test_arrays_and_graphs(tmp_path):
-    rows = np.c_[SECONDS, P, Q]
-    np.save(tmp_path / "a.npy", rows)
-    names = [(name, float) for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")]
-    np.save(tmp_path / "b.npy", np.array([tuple(row) for row in rows], dtype=names))
-    for name in ("a.npy", "b.npy"):
-        found = read_trajectory_file(tmp_path / name, AUTO).trajectory
-        np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+    np.save(tmp_path / "a.npy", np.c_[SECONDS, P, Q])
     (tmp_path / "a.g2o").write_text(of_g2o())
-    found = read_trajectory_file(tmp_path / "a.g2o", AUTO)
-    np.testing.assert_allclose(found.trajectory.poses, TRUTH.poses, atol=1e-12)
+    for name in ("a.npy", "a.g2o"):
+        found = read_trajectory_file(tmp_path / name, AUTO)
+        np.testing.assert_allclose(found.trajectory.poses, TRUTH.poses, atol=1e-12)
     assert found.trajectory.stamps_ns[1] == 1_000_000_000
     assert "numbers of its vertices are taken for seconds" in found.guesses[0]
+
+
+def images(names, poses):
+    frames = [
+        {"file_path": f"images/{name}.png", "transform_matrix": (pose @ OPENGL).tolist()}
+        for name, pose in zip(names, poses, strict=True)
+    ]
+    return json.dumps({"frames": frames})
+
+
+def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_path, capsys):
+    names = [f"{chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(N)]
+    (tmp_path / "a.json").write_text(images(names, TRUTH.poses))
+    (tmp_path / "b.json").write_text(images(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1]))
+    for name, poses in (("a.kitti", TRUTH.poses), ("b.kitti", TRUTH.poses @ MOUNT)):
+        (tmp_path / name).write_text(joined(poses[:, :3].reshape(-1, 12)))
+    for kind, by in (("json", "name"), ("kitti", "row")):
+        command = ["calibrate", *(str(tmp_path / f"{name}.{kind}") for name in "ab")]
+        assert main([*command, "--pair-by", by, "--json"]) in (0, 3)
+        document = json.loads(capsys.readouterr().out)
+        assert (document["parent_frame"], document["child_frame"]) == ("a", "b")
+        np.testing.assert_allclose(document["T_parent_child"]["matrix"], MOUNT, atol=1e-6)
+        assert main(command) == 2
+        assert "the poses have no stamps" in capsys.readouterr().err
+    mixed = ["calibrate", str(tmp_path / "a.json"), str(tmp_path / "b.json"), "--pair-by", "row"]
+    assert main(mixed) == 1
+    assert "files need as many poses each; found [40, 35]" in capsys.readouterr().err
+    kitti = ["calibrate", *(str(tmp_path / f"{name}.kitti") for name in "ab"), "--pair-by", "name"]
+    assert main(kitti) == 1
+    assert "no image has a name that is in all files" in capsys.readouterr().err
 
 
 def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
@@ -221,6 +273,7 @@ def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
         (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),
         (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
         (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
+        (of_nmea()[of_nmea().index("$GN") :].encode(), "record RMC sentences, too"),
         (b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n", "set out-solformat to llh, degrees"),
         (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
         (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),
@@ -232,7 +285,6 @@ def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
             b"'shape': (10000000000, 8), }" + b" " * 42 + b"\n",
             "cannot read",
         ),
-        (of_colmap().replace(str(TRUTH.stamps_ns[3]), "a").encode(), "has no number in its name"),
     ],
 )
 def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message):

@@ -21,7 +21,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hand_eye_calib.cli.console import STREAMS, told_apart
+from hand_eye_calib.cli.console import STREAMS
 from hand_eye_calib.cli.options import Options
 from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.cli.reading import read_recording
@@ -31,6 +31,7 @@ from hand_eye_calib.io import remote
 from hand_eye_calib.io.limits import ReadingMemory
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
+from hand_eye_calib.text import told_apart
 
 STATE, TABLE, INDEX, VEHICLES = "batch.jsonl", "rows.csv", "index.html", "vehicles"
 _BAGS = (".bag", ".mcap", ".db3")

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -61,17 +62,14 @@ _ALIASES = {
     **_ends("q", "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_"),
 }
 # Names that stand for a part of an orientation, even if it is not known which.
-_ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.IGNORECASE)
+_ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.I).search
 
 # Units as names have them, with a slash for what separates words.
 _UNITS = {
-    **{
-        unit: unit for unit in ("m", "mm", "cm", "km", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)
-    },
+    **{unit: unit for unit in ("m", "mm", "cm", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)},
     **dict.fromkeys(("degree", "degrees", "°"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
-    **dict.fromkeys(("dps", "degps", "deg/ps", "°/s"), "deg/s"),
-    **dict.fromkeys(("radps", "rad/ps"), "rad/s"),
+    **dict.fromkeys(("dps", "°/s"), "deg/s"),
 }
 
 
@@ -95,8 +93,8 @@ class Columns(NamedTuple):
 
 
 def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -> Columns:
-    """Find the columns of stamp and of what is measured: position and orientation, or what there
-    is of them, or angular rates.
+    """Find the columns of the stamp, if there is one, and of what is measured: position and
+    orientation, or what there is of them, or angular rates.
 
     Raises
     ------
@@ -105,12 +103,11 @@ def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -
     """
     found = _matches(names)
     # The stamp of the message's header rather than the time of its arrival.
-    stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",)
+    stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",) * ("t" in found)
     if measures == "auto":
         measures = _what_is_there(found, names)
     measured = _quantities(found, measures)
-    missing = [name for name in (*stamp, *measured) if name not in found]
-    if missing:
+    if missing := [name for name in measured if name not in found]:
         raise InputError(
             f"{path}: no column for {', '.join(missing)} among {listed(names)}; name all columns "
             "with `columns`, such as t,x,y,z,qw,qx,qy,qz"
@@ -123,7 +120,7 @@ def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -
             )
     at = {name: found[name][0] for name in measured}
     units = {name: unit for name, column in at.items() if (unit := _split(names[column])[1])}
-    unit = "ns" if stamp != ("t",) else _split(names[found["t"][0]])[1]
+    unit = _split(names[found["t"][0]])[1] if stamp == ("t",) else "ns" if stamp else ""
     return Columns([found[name][0] for name in stamp], at, measures, unit, units)
 
 
@@ -142,14 +139,10 @@ def _quantities(found: dict[str, list[int]], measures: str) -> tuple[str, ...]:
 
 def _what_is_there(found: dict[str, list[int]], names: Sequence[str]) -> str:
     """What the columns measure; poses in doubt, so that what is missing is named."""
-
-    def has_any(groups: Groups) -> bool:
-        return any(name in found for group in groups for name in group)
-
     if _complete(_ALL_POSITIONS, found):
-        is_oriented = has_any(_ALL_ORIENTATIONS) or any(map(_ORIENTED.search, names))
+        is_oriented = found.keys() & {*chain(*_ALL_ORIENTATIONS)} or any(map(_ORIENTED, names))
         return "poses" if is_oriented else "positions"
-    if has_any(_POSITIONS):
+    if found.keys() & {*chain(*_POSITIONS)}:
         return "poses"
     if _complete((RATES,), found):
         return "rates"

@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -24,6 +23,7 @@ from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_TEXT
 
 _POSE = "x,y,z,qx,qy,qz,qw"
+_PLACE = "t [s],lat [deg],lon [deg],height [m]"
 _HEAD_BYTES = 4096
 # Binary files by their first bytes: what they are, and what to do.
 _NOT_READ = {
@@ -43,11 +43,14 @@ _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 class Rows(NamedTuple):
-    """The rows of a file under names of columns, and what a person should know."""
+    """The rows of a file under names of columns, what a person should know, and the names of the
+    images whose poses they are.
+    """
 
     header: str
     rows: Iterable[Sequence[Any]]
     notes: tuple[str, ...] = ()
+    images: Sequence[str] = ()
 
 
 def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
@@ -71,43 +74,37 @@ def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
         if head.startswith(start):
             raise InputError(f"{path}: {sentence}")
     text = head.decode("utf-8-sig", "replace").lstrip()
-    read: Callable[[], Rows] | None = None
-    if head.startswith(b"\x93NUMPY"):
-        read = partial(_of_numpy, path)
-    elif head.startswith(b"ULog\x01\x12\x35"):
-        read = partial(_of_ulog, path)
-    else:
-        of_text = next((each for pattern, each in _FORMATS if re.search(pattern, text)), None)
-        if of_text is not None:
-            read = partial(of_text, read_text(path, "a trajectory", LARGEST_TEXT), choice)
+    of_bytes = next((read for start, read in _BINARY.items() if head.startswith(start)), None)
+    of_text = next((read for pattern, read in _TEXT.items() if re.search(pattern, text)), None)
     try:
-        return read() if read is not None else None
+        if of_bytes is not None:
+            return of_bytes(path)
+        if of_text is not None:
+            return of_text(read_text(path, "a trajectory", LARGEST_TEXT), choice)
     except MissingDependencyError:
         raise
     except Exception as error:  # of many kinds, in a file that is not what it begins like
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: {reason or type(error).__name__}") from None
+    return None
 
 
 # ---- positions on the earth
 
 
 def _of_nmea(text: str, _: str | None) -> Rows:
-    """GGA sentences; the day is that of RMC, if there is one."""
+    """GGA sentences; the day is that of the RMC sentence before."""
     rows: list[Sequence[float]] = []
-    day, has_date, before = 0.0, False, 0.0
+    day = None
     for line in text.splitlines():
         cells = line.partition("*")[0].strip().split(",")
-        kind = cells[0][-3:]
-        if kind == "RMC" and len(cells) > 9 and cells[9]:
+        if cells[0][-3:] == "RMC" and len(cells) > 9 and cells[9]:
             day = datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-            has_date = True
-        elif kind == "GGA" and len(cells) > 11 and cells[6] not in ("", "0") and cells[9]:
+        elif cells[0][-3:] == "GGA" and len(cells) > 11 and cells[6] not in ("", "0") and cells[9]:
+            if day is None:
+                raise ValueError("NMEA without a date: record RMC sentences, too")
             clock, lat, north, lon, east = cells[1:6]
             now = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
-            if not has_date and now < before - 43_200:  # past midnight
-                day += 86_400
-            before = now
             degrees = (
                 (-1 if side in "SW" else 1) * (int(each[:n]) + float(each[n:]) / 60)
                 for each, n, side in ((lat, 2, north), (lon, 3, east))
@@ -115,8 +112,7 @@ def _of_nmea(text: str, _: str | None) -> Rows:
             rows.append([day + now, *degrees, float(cells[9]) + float(cells[11] or 0)])
     if not rows:
         raise ValueError("NMEA without positions: expected GGA sentences with a fix")
-    note = () if has_date else ("NMEA without a date: stamps are seconds of the day, in UTC",)
-    return Rows("t [s],lat [deg],lon [deg],height [m]", rows, note)
+    return Rows(_PLACE, rows)
 
 
 def _of_gpx(text: str, _: str | None) -> Rows:
@@ -126,19 +122,14 @@ def _of_gpx(text: str, _: str | None) -> Rows:
         if time is None:
             raise ValueError("a point of the GPX track has no time; record it with times")
         rows.append((time, point.attrib["lat"], point.attrib["lon"], height or "0"))
-    return Rows("t,lat [deg],lon [deg],height [m]", rows, ("heights of GPX are above the sea",))
+    return Rows(_PLACE, rows, ("heights of GPX are above the sea",))
 
 
 def _of_rtklib(text: str, _: str | None) -> Rows:
-    lines = text.splitlines()
-    header = next(line for line in lines if re.match(r"%\s+(GPST|UTC|JST)\b", line))
-    columns = "lat [deg],lon [deg],height [m]" if "latitude(deg)" in header else "x,y,z"
-    if columns == "x,y,z" and not ("e-baseline" in header or "x-ecef" in header):
-        raise ValueError(
-            "RTKLIB with angles in degrees, minutes, seconds: set out-solformat to llh, degrees"
-        )
+    if "latitude(deg)" not in text:
+        raise ValueError("RTKLIB without degrees: set out-solformat to llh, degrees")
     gps_epoch, rows = 315_964_800, []
-    for line in lines:
+    for line in text.splitlines():
         cells = line.replace(",", " ").split()
         if cells and not cells[0].startswith("%"):
             if "/" in cells[0]:
@@ -147,24 +138,15 @@ def _of_rtklib(text: str, _: str | None) -> Rows:
                 stamp = repr(gps_epoch + 604_800 * int(cells[0]) + float(cells[1]))
             rows.append((stamp, *cells[2:5]))
     note = "stamps are of GPS time, 18 s ahead of UTC since 2017"
-    return Rows(f"t,{columns}", rows, (note,) if "GPST" in header else ())
+    return Rows(_PLACE, rows, (note,) if "GPST" in text else ())
 
 
 # ---- poses
 
 
 def _of_g2o(text: str, _: str | None) -> Rows:
-    rows = []
-    for line in text.splitlines():
-        tag, *cells = line.split() or [""]
-        if tag == "VERTEX_SE3:QUAT":
-            rows.append(cells[:8])
-        elif tag == "VERTEX_SE2":
-            half = float(cells[3]) / 2
-            rows.append([*cells[:3], "0", "0", "0", repr(np.sin(half)), repr(np.cos(half))])
-    if not rows:
-        raise ValueError("g2o without poses: expected VERTEX_SE3:QUAT or VERTEX_SE2")
-    rows.sort(key=lambda row: int(row[0]))
+    vertices = (line.split() for line in text.splitlines() if line.startswith("VERTEX_SE3:QUAT "))
+    rows = sorted((cells[1:9] for cells in vertices), key=lambda row: int(row[0]))
     return Rows(f"t [s],{_POSE}", rows, (_NUMBERED.format("vertices"),))
 
 
@@ -176,10 +158,9 @@ def _of_colmap(text: str, _: str | None) -> Rows:
         raise ValueError(
             "COLMAP images.txt: expected an image and its points in turn, on two lines"
         )
-    stamps, is_time = _stamps_of_names([image[9] for image in images])
     values = np.array([[float(each) for each in image[1:8]] for image in images])
     Ts_camera_world = se3.from_quat_xyzw(values[:, 4:], values[:, [1, 2, 3, 0]])
-    return _of_poses(stamps, se3.inverse(Ts_camera_world), is_time, "images")
+    return _of_images([image[9] for image in images], se3.inverse(Ts_camera_world))
 
 
 def _of_json(text: str, _: str | None) -> Rows:
@@ -187,14 +168,12 @@ def _of_json(text: str, _: str | None) -> Rows:
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames or "transform_matrix" not in frames[0]:
         raise ValueError("JSON that is not read; expected transforms.json of nerfstudio, or csv")
-    stamps, is_time = _stamps_of_names([str(each["file_path"]) for each in frames])
     matrices = np.array([each["transform_matrix"] for each in frames], dtype=float)
-    Ts_world_gl = np.tile(np.eye(4), (len(frames), 1, 1))
-    Ts_world_gl[:, :3] = matrices[:, :3]
-    Ts_world_gl[:, :3, :3] = Ts_world_gl[:, :3, :3] @ _FLIP
-    found = _of_poses(stamps, Ts_world_gl, is_time, "images")
+    Ts_world_camera = np.tile(np.eye(4), (len(frames), 1, 1))
+    Ts_world_camera[:, :3] = matrices[:, :3]
+    Ts_world_camera[:, :3, :3] = Ts_world_camera[:, :3, :3] @ _FLIP
     turned = "axes of the camera: x right, y down, z forward, not those of OpenGL in the file"
-    return found._replace(notes=(*found.notes, turned))
+    return _of_images([str(each["file_path"]) for each in frames], Ts_world_camera, turned)
 
 
 def _of_motive(text: str, choice: str | None) -> Rows:
@@ -234,14 +213,10 @@ def _of_vicon(text: str, choice: str | None) -> Rows:
     values = np.array([[float(each) for each in cells[at : at + 6]] for cells in rows])
     angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
     poses = se3.from_rotation_translation(se3.rotation_exp(angles), values[:, 3:])
-    quats, seconds = se3.to_quat_xyzw(poses), [int(cells[0]) / rate_hz for cells in rows]
+    seconds = [int(cells[0]) / rate_hz for cells in rows]
     note = f"poses of {body}; rotations read as rotation vectors"
-    joined = np.c_[seconds, values[:, 3:], quats].tolist()
+    joined = np.c_[seconds, values[:, 3:], se3.to_quat_xyzw(poses)].tolist()
     return Rows(_with_unit(units[at + 3]), joined, (note,))
-
-
-def _with_unit(unit: str) -> str:
-    return f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
 
 
 def _of_numpy(path: Path) -> Rows:
@@ -249,8 +224,6 @@ def _of_numpy(path: Path) -> Rows:
         values = np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
     except (OSError, ValueError, EOFError) as error:
         raise ValueError(f"cannot read the array: {error}") from None
-    if values.dtype.names:
-        return Rows(",".join(values.dtype.names), values.tolist())
     if values.ndim != 2 or values.shape[1] not in (4, 8) or values.dtype.kind not in "fiu":
         raise ValueError(
             f"an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, z, qx, "
@@ -268,13 +241,11 @@ def _of_ulog(path: Path) -> Rows:
             f"{path} is a log of PX4; to read it needs pyulog: pip install 'hand_eye_calib[px4]'"
         ) from None
     try:
-        log = ULog(str(path), ["vehicle_odometry", "vehicle_visual_odometry"])
-        by_name = {each.name: each.data for each in log.data_list}
-        data = by_name.get("vehicle_odometry") or by_name["vehicle_visual_odometry"]
-        stamps_us = data["timestamp_sample" if "timestamp_sample" in data else "timestamp"]
-        names = "xyz" if "x" in data else [f"position[{k}]" for k in range(3)]
+        (log,) = ULog(str(path), ["vehicle_odometry"]).data_list
+        names = "xyz" if "x" in log.data else [f"position[{k}]" for k in range(3)]
         names = [*names, *(f"q[{k}]" for k in (1, 2, 3, 0))]
-        values = np.stack([data[name] for name in names], axis=1).astype(float)
+        stamps = log.data["timestamp_sample" if "timestamp_sample" in log.data else "timestamp"]
+        values = np.stack([log.data[name] for name in names], axis=1).astype(float)
     except Exception as error:  # of many kinds, at damaged logs
         reason = f"{type(error).__name__} {error}"
         raise ValueError(f"a log of PX4 without vehicle_odometry ({reason})") from None
@@ -282,10 +253,11 @@ def _of_ulog(path: Path) -> Rows:
     positions, quats = values[good, :3], values[good, 3:]
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     rotations = _ENU_NED @ se3.from_quat_xyzw(positions, quats)[:, :3, :3] @ _FLIP
-    poses = se3.from_rotation_translation(rotations, positions @ _ENU_NED.T)
-    stamps = [f"{int(each) / 1e6:.6f}" for each in stamps_us[good]]
+    quats = se3.to_quat_xyzw(se3.from_rotation_translation(rotations, positions))
+    poses = np.c_[positions @ _ENU_NED.T, quats].tolist()
+    rows = [(int(stamp), *pose) for stamp, pose in zip(stamps[good], poses, strict=True)]
     note = "axes: x forward, y left, z up, in east, north, up; PX4 has forward, right, down"
-    return _of_poses(stamps, poses, True, "")._replace(notes=(note,))
+    return Rows(f"t [us],{_POSE}", rows, (note,))
 
 
 # ---- parts of several
@@ -293,28 +265,29 @@ def _of_ulog(path: Path) -> Rows:
 _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
 
 
-def _of_poses(stamps: Sequence[str], poses: FloatArray, is_time: bool, what: str) -> Rows:
+def _with_unit(unit: str) -> str:
+    return f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
+
+
+def _of_images(names: Sequence[str], poses: FloatArray, *notes: str) -> Rows:
+    """Poses (N, 4, 4) of images, whose stamps are the last numbers in their names; none if one has
+    no number.
+    """
     rotations = se3.nearest_rotation(poses[:, :3, :3])
     if np.abs(rotations - poses[:, :3, :3]).max() > 1e-3:
         raise ValueError("a matrix is no rotation")
     quats = se3.to_quat_xyzw(se3.from_rotation_translation(rotations, poses[:, :3, 3]))
-    values = np.c_[poses[:, :3, 3], quats].tolist()
+    values, images = np.c_[poses[:, :3, 3], quats].tolist(), [Path(name).stem for name in names]
+    numbers = [re.findall(r"\d+\.\d+|\d+", image) for image in images]
+    if not all(numbers):
+        return Rows(_POSE, values, notes, images)
+    stamps = [each[-1] for each in numbers]
     order = sorted(range(len(stamps)), key=lambda row: float(stamps[row]))
     rows = [(stamps[row], *values[row]) for row in order]
-    return Rows(f"t,{_POSE}", rows, () if is_time else (_NUMBERED.format(what),))
-
-
-def _stamps_of_names(names: Sequence[str]) -> tuple[list[str], bool]:
-    """The last number of each name of an image, and whether these are times."""
-    numbers = [re.findall(r"\d+\.\d+|\d+", Path(name).stem) for name in names]
-    if not all(numbers):
-        lacking = names[[bool(each) for each in numbers].index(False)]
-        raise ValueError(
-            f"image {lacking[:60]!r} has no number in its name, so that it has no time"
-        )
-    stamps = [each[-1] for each in numbers]
     # Seconds since 1970 have ten digits before the point, and no recording has so many images.
-    return stamps, min(len(each.partition(".")[0]) for each in stamps) >= 10
+    if min(len(each.partition(".")[0]) for each in stamps) < 10:
+        notes = (_NUMBERED.format("images"), *notes)
+    return Rows(f"t,{_POSE}", rows, notes, [images[row] for row in order])
 
 
 def _chosen(found: Any, choice: str | None, what: str) -> str:
@@ -328,14 +301,18 @@ def _chosen(found: Any, choice: str | None, what: str) -> str:
     return str(names[0])
 
 
-# The text of a file begins so.
-_FORMATS: tuple[tuple[str, Callable[[str, str | None], Rows]], ...] = (
-    (r"\A<\?xml[^>]*>\s*(<!--.*?-->\s*)*<gpx|\A<gpx", _of_gpx),
-    (r"\A\{", _of_json),
-    (r"(?m)\A\$[A-Z]{5},", _of_nmea),
-    (r"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)", _of_rtklib),
-    (r"(?m)\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW", _of_colmap),
-    (r"(?m)^VERTEX_SE(3:QUAT|2) ", _of_g2o),
-    (r"\AFormat Version,", _of_motive),
-    (r"\A(Segments|Objects|Trajectories)\b.*\r?\n\d+", _of_vicon),
-)
+# Files that begin so.
+_BINARY: dict[bytes, Callable[[Path], Rows]] = {
+    b"\x93NUMPY": _of_numpy,
+    b"ULog\x01\x12\x35": _of_ulog,
+}
+_TEXT: dict[str, Callable[[str, str | None], Rows]] = {
+    r"\A(<\?xml[^>]*>\s*)?<gpx": _of_gpx,
+    r"\A\{": _of_json,
+    r"\A\$[A-Z]{5},": _of_nmea,
+    r"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)": _of_rtklib,
+    r"\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW": _of_colmap,
+    r"(?m)^VERTEX_SE3:QUAT ": _of_g2o,
+    r"\AFormat Version,": _of_motive,
+    r"\A(Segments|Objects|Trajectories)\b.*\r?\n\d+": _of_vicon,
+}

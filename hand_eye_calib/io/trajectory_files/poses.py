@@ -1,5 +1,12 @@
-"""Stamps and poses from the numbers of a table, in whatever way it gives them."""
+"""Stamps and poses from the numbers of a table, in whatever way it gives them.
 
+The order of quaternions and the convention of angles that a file does not name are judged by the
+motion: a vehicle moves in a steady direction of its own body, forward as a rule. With orientations
+of a wrong convention that direction wanders as the vehicle turns. Hand-held sensors and drones move
+in all directions; of them this says nothing.
+"""
+
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
 import numpy as np
@@ -8,17 +15,14 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import FARTHEST_M, far_position
-from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
-from hand_eye_calib.io.trajectory_files.columns import MATRIX
-from hand_eye_calib.io.trajectory_files.orientations import (
-    LARGEST_RAD,
-    RADIANS,
-    Columns,
-    from_matrices,
-    orientations,
-    unit_of,
+from hand_eye_calib.geometry.trajectory import (
+    FARTHEST_M,
+    QUATERNION_NORM_TOLERANCE,
+    ROTATION_TOLERANCE,
+    far_position,
 )
+from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
+from hand_eye_calib.io.trajectory_files.columns import MATRIX, QUATERNION, UNNAMED
 from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.stats import median
 
@@ -26,20 +30,27 @@ _LARGEST_NS = int(np.iinfo(np.int64).max)
 # Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
 # mistaken.
 _LONGEST_INTERVAL_S = 10
-_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0}
-_RADIANS_PER_S = {"deg/s": np.pi / 180, "rad/s": 1.0}
-# No gyroscope measures more (rad/s): 2,000 deg/s.
-_FASTEST = 35.0
+# Units of lengths, angles and rates in m, rad and rad/s. Without a name it is the first, or the
+# second if a value is larger than the limit: a turn with room for rounding, and 2,000 deg/s, which
+# no gyroscope exceeds.
+_LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}, np.inf
+_ANGLES = {"rad": 1.0, "deg": np.pi / 180}, 2 * np.pi + 0.01
+_RATES = {"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0
+# A first orientation so close to the identity is where an odometry starts.
+_IDENTITY_WITHIN = 1e-8
+
+_COMPASS = "clockwise from north"
+_MATHEMATICAL = "counterclockwise from x (east)"
+# The inverse rotation in roll, pitch and yaw, as pyboreas has it.
+_INVERSE = "that of the world in the sensor's frame"
+
+# Steps are this share of the extent of the positions, and at least so many are needed.
+_STEPS_IN_EXTENT, _FEWEST_STEPS = 50, 10
+# The wrong convention scatters the direction at least so much, and so many times as much as the
+# right one.
+_SMALLEST_SCATTER, _CLEARLY = 0.05, 4.0
 
 # ---- stamps
-
-
-def unit_by_size(largest: Decimal | float) -> str:
-    """Unit of the largest stamp of a file: seconds since 1970 have ten digits, and each smaller
-    unit three more.
-    """
-    digits = {"ns": 17, "us": 14, "ms": 11}
-    return next((unit for unit, each in digits.items() if largest >= 10**each), "s")
 
 
 def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
@@ -53,7 +64,11 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     """
     unit = stamp_unit or table.columns.stamp_unit
     largest = max(map(abs, table.stamps))
-    recognised = unit or unit_by_size(largest)
+    # Seconds since 1970 have ten digits, and each smaller unit three more.
+    by_size = (
+        each for each, digits in (("ns", 17), ("us", 14), ("ms", 11)) if largest >= 10**digits
+    )
+    recognised = unit or next(by_size, "s")
     factor = STAMP_UNITS[recognised]
     is_large = np.array([abs(stamp) > Decimal(_LARGEST_NS) / factor for stamp in table.stamps])
     table.refuse(
@@ -78,7 +93,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Indices of the poses in the order of time, and what was repaired for that.
+    """Indices of the poses in the order of time, each stamp once, and what was repaired for that.
 
     Raises
     ------
@@ -97,17 +112,12 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
                 "and drop repeated timestamps, or have that done with `repair`"
             ),
         )
-    keep, repairs = sorted_stamps(stamps_ns)
-    return keep, [f"{table.path}: {repairs}"]
-
-
-def sorted_stamps(stamps_ns: IntArray) -> tuple[IntArray, str]:
-    """Indices of stamps that are out of order, sorted and each once, and what was done."""
     keep = np.unique(stamps_ns, return_index=True)[1]
     backward, n_dropped = int((np.diff(stamps_ns) < 0).sum()), len(stamps_ns) - len(keep)
     went_back = f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"
     dropped = f"dropped {n_dropped} whose stamp was there already"
-    return keep, "; ".join([went_back] * (backward > 0) + [dropped] * (n_dropped > 0))
+    said = "; ".join([went_back] * (backward > 0) + [dropped] * (n_dropped > 0))
+    return keep, [f"{table.path}: {said}"]
 
 
 def seconds(stamp_ns: int) -> str:
@@ -116,7 +126,7 @@ def seconds(stamp_ns: int) -> str:
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{nanoseconds:09d}"
 
 
-# ---- poses
+# ---- poses and rates
 
 
 def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, FloatArray]:
@@ -128,19 +138,41 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, FloatArray
     InputError
         For values that cannot be; the message names the line.
     """
-    values = _finite_values(table)
-    if MATRIX[0] in table.columns.quantities:
-        matrices = values.reshape(-1, 3, 4)
-        positions = _checked(table, matrices[:, :, 3])
-        return positions, from_matrices(table, matrices[:, :, :3])
-    columns = dict(zip(table.columns.quantities, values.T, strict=True))
-    if "lat" in columns:
-        return _in_local_frame(table, columns, convention)
-    positions = np.zeros((len(values), 3))
-    if "x" in columns:
-        names = ("x", "y", "height" if "height" in columns else "z")
-        positions = np.stack([_lengths(table, columns, name) for name in names], axis=1)
-    return _checked(table, positions), orientations(table, columns, positions, convention)
+    _check_finite(table)
+    quantities, positions, to_first = table.columns.quantities, np.zeros((len(table), 3)), None
+    up = next((name for name in ("z", "height") if name in quantities), None)
+    if "lat" in quantities:
+        lat, lon = _in_si(table, ("lat", "lon"), _ANGLES).T
+        table.refuse(
+            (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > _ANGLES[1]),
+            lambda row: (
+                f"found latitude {np.degrees(lat[row]):.7g} deg, longitude "
+                f"{np.degrees(lon[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps they "
+                "are swapped"
+            ),
+        )
+        height = _in_si(table, (up,), _LENGTHS)[:, 0] if up else positions[:, 2]
+        positions, to_first = LocalOrigin().local(lat, lon, height), rotations_to_first(lat, lon)
+        table.guess("latitude and longitude became metres east and north of the first position")
+    elif "x" in quantities:
+        names = ("x", "y", up) if up else ("x", "y")
+        positions[:, : len(names)] = _in_si(table, names, _LENGTHS)
+    elif MATRIX[0] in quantities:
+        matrices = table.columns_of(MATRIX).reshape(-1, 3, 4)
+        positions = matrices[:, :, 3]
+    if not up and {"x", "lat"} & quantities.keys():
+        table.guess("no column of heights: taken as 0")
+    table.refuse(
+        np.asarray(np.abs(positions).max(axis=1) > FARTHEST_M),
+        lambda row: f"{far_position(*positions[row])}; check its unit",
+    )
+    if MATRIX[0] in quantities:
+        return positions, _from_matrices(table, matrices[:, :, :3])
+    quats_xyzw = _orientations(table, positions, convention)
+    if to_first is not None:
+        in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
+        quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
+    return positions, quats_xyzw
 
 
 def rates_of(table: Table) -> FloatArray:
@@ -152,66 +184,150 @@ def rates_of(table: Table) -> FloatArray:
     InputError
         For values that cannot be; the message names the line.
     """
-    values = _finite_values(table)
-    units = {unit_of(table, name, _RADIANS_PER_S) for name in table.columns.quantities}
-    if len(units) > 1:
-        raise InputError(f"{table.path}: the columns of the rates have different units")
-    unit = units.pop()
-    if not unit:
-        largest = float(np.abs(values).max())
-        unit = "deg/s" if largest > _FASTEST else "rad/s"
-        table.guess(
-            f"angular rates read in {unit}, the largest is {largest:.4g}; to change that, name "
-            "their unit in the header, such as wx_deg_s"
-        )
-    return values * _RADIANS_PER_S[unit]
+    _check_finite(table)
+    return _in_si(table, [*table.columns.quantities], _RATES)
 
 
-def _finite_values(table: Table) -> FloatArray:
-    values = table.values
+def _check_finite(table: Table) -> None:
     table.refuse(
-        np.asarray(~np.isfinite(values).all(axis=1)),
+        np.asarray(~np.isfinite(table.values).all(axis=1)),
         lambda _: "found a value that is not finite; remove the line or repair its source",
     )
-    return values
 
 
-def _checked(table: Table, positions: FloatArray) -> FloatArray:
-    """The positions (N, 3), none of which is too far away."""
-    is_far = np.abs(positions).max(axis=1) > FARTHEST_M
-    table.refuse(np.asarray(is_far), lambda row: f"{far_position(*positions[row])}; check its unit")
-    return positions
+def _in_si(
+    table: Table, names: Sequence[str], kind: tuple[Mapping[str, float], float]
+) -> FloatArray:
+    """Columns (N, k) in m, rad or rad/s: in the unit that the header names, or by their size."""
+    known, largest_of_first = kind
+    values = table.columns_of(names)
+    named = {unit for name in names if (unit := table.columns.units.get(name))}
+    if len(named) > 1 or named - known.keys():
+        raise InputError(
+            f"{table.path}: columns {', '.join(names)} in {', '.join(sorted(named))}; expected one "
+            f"of {', '.join(known)}"
+        )
+    largest = float(np.abs(values).max())
+    unit = min(named) if named else [*known][largest > largest_of_first]
+    if not named and kind is not _LENGTHS:
+        table.guess(
+            f"{', '.join(names)} read in {unit}, the largest is {largest:.4g}; to change that, "
+            f"name the unit in the header, such as {names[-1]}_{unit.replace('/', '_')}"
+        )
+    return values * known[unit]
 
 
-def _lengths(table: Table, columns: Columns, name: str) -> FloatArray:
-    """A column of lengths in metres; zeros if there is none."""
-    if name in columns:
-        return columns[name] * _METRES[unit_of(table, name, _METRES)]
-    table.guess(f"no column of {'heights' if name == 'height' else name}: taken as 0")
-    return np.zeros(len(table.line_numbers))
+# ---- orientations
 
 
-def _in_local_frame(
-    table: Table, columns: Columns, convention: str
-) -> tuple[FloatArray, FloatArray]:
-    """Poses from latitude, longitude and height, in the frame of the first one."""
-    lats, lons = columns["lat"], columns["lon"]
-    named = unit_of(table, "lat", RADIANS) or unit_of(table, "lon", RADIANS)
-    is_small = max(np.abs(lats).max() * 2, np.abs(lons).max()) <= np.pi
-    unit = named or ("rad" if is_small else "deg")
-    lat, lon = lats * RADIANS[unit], lons * RADIANS[unit]
+def _from_matrices(table: Table, rotations: FloatArray) -> FloatArray:
+    """Quaternions (N, 4), scalar last, of the nearest rotations: files have few digits."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = np.swapaxes(rotations, 1, 2) @ rotations
+        is_rotation = np.abs(products - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
+    is_rotation[is_rotation] = np.linalg.det(rotations[is_rotation]) > 0
     table.refuse(
-        (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > LARGEST_RAD),
-        lambda index: (
-            f"found latitude {lats[index]:.7g}, longitude {lons[index]:.7g}; expected degrees or "
-            "radians, and no latitude beyond 90 deg: perhaps they are swapped"
+        ~is_rotation,
+        lambda _: (
+            f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
+            "of the values"
         ),
     )
-    positions = LocalOrigin().local(lat, lon, _lengths(table, columns, "height"))
-    by_size = "" if named else f", in {unit} by their size,"
-    table.guess(
-        f"latitude and longitude{by_size} became metres east and north of the first position"
+    return se3.to_quat_xyzw(se3.nearest_rotation(rotations))
+
+
+def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:
+    """Quaternions (N, 4), scalar last; level where there are none."""
+    quantities = table.columns.quantities
+    names = next((each for each in (QUATERNION, UNNAMED) if each[0] in quantities), None)
+    if names is None and {"yaw", "heading"} & quantities.keys():
+        return _from_angles(table, positions, convention)
+    if names is None:
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
+    quats = table.columns_of(names)
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(quats, axis=1)
+    table.refuse(
+        np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,
+        lambda index: (
+            f"found a quaternion of length {norms[index]:.4g}, expected 1 within "
+            f"{QUATERNION_NORM_TOLERANCE}; check the column order ({table.expected})"
+        ),
     )
-    quats_xyzw = orientations(table, columns, _checked(table, positions), convention)
-    in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
-    return positions, se3.to_quat_xyzw(rotations_to_first(lat, lon) @ in_local)
+    if names == QUATERNION:
+        return quats
+    # The order that motion and start speak for; the scalar is last if they say nothing.
+    ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
+    fitting = _fitting(positions, ways)
+    level = [way for way, each in ways.items() if abs(abs(each[0, 3]) - 1.0) < _IDENTITY_WITHIN]
+    reason = ""
+    if fitting == ["first"]:
+        reason = "the motion keeps a steady direction that way"
+    elif "first" in level and "first" in fitting:
+        reason = "the first orientation is the identity that way"
+    if reason:
+        table.guess(f"quaternions read with the scalar first, t x y z qw qx qy qz: {reason}")
+        return ways["first"]
+    if table.format != "tum" and fitting != ["last"] and "last" not in level:
+        table.guess(
+            "no columns are named, and nothing tells the order of the quaternion; read with the "
+            "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
+        )
+    return quats
+
+
+def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
+    """Quaternions (N, 4) from roll, pitch and yaw (about the fixed axes x, y, z) or heading."""
+    names = [
+        each for each in ("roll", "pitch", "yaw", "heading") if each in table.columns.quantities
+    ]
+    *tilt, angle = _in_si(table, names, _ANGLES).T
+    if not tilt:
+        table.guess("no columns of roll and pitch: taken as 0")
+    roll, pitch = tilt or np.zeros((2, len(angle)))
+    # With a compass heading, a positive pitch is nose up, as on aircraft and in INS; with a yaw it
+    # is about y, as in REP 103. Axes of the body are x forward, y left and z up, in a frame with z
+    # up.
+    compass, usual = (
+        se3.rotation_from_rpy(np.stack(rpy, axis=1))
+        for rpy in ((roll, -pitch, np.pi / 2 - angle), (roll, pitch, angle))
+    )
+    inverse = np.swapaxes(usual, 1, 2)
+    rotations = {_COMPASS: compass, _MATHEMATICAL: usual, _INVERSE: inverse}
+    ways = {way: se3.to_quat_xyzw(each) for way, each in rotations.items()}
+    expected = _COMPASS if names[-1] == "heading" else _MATHEMATICAL
+    table.conventions = sorted(_fitting(positions, ways), key=lambda way: way != expected)
+    way = convention or table.conventions[0]
+    if expected == _COMPASS or way != expected:
+        why = "" if way == expected else ", because the motion fits that and not the usual"
+        if convention:
+            why = ", because that fits the other file with the same columns, too"
+        axes = "x forward, y left, z up"
+        if way == _INVERSE:
+            axes = "x, y, z of the world where all angles are 0"
+        table.guess(f"{names[-1]} read as {way}{why}; axes of the sensor: {axes}")
+    return ways[way]
+
+
+def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]:
+    """Of ways to read the sensor's orientations (N, 4) in the frame of the positions (N, 3), those
+    that the motion does not contradict: another does not fit it clearly better.
+    """
+    step = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
+    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    rows = np.flatnonzero(np.diff(np.floor(travelled / (step or np.inf)), prepend=-1.0))
+    steps = np.diff(positions[rows], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    # Of a sensor that stands still, the noise of the positions adds up to a path.
+    is_step = lengths > step / 3
+    if is_step.sum() < _FEWEST_STEPS:
+        return [*ways]
+    directions, rows = steps[is_step] / lengths[is_step, None], rows[:-1][is_step]
+    scatters = {}
+    for way, quats in ways.items():
+        # Of the directions in the sensor's frame: 0 if all are the same, 1 if they go everywhere.
+        rotations = se3.from_quat_xyzw(directions, quats[rows])[:, :3, :3]
+        in_sensor = np.einsum("nji,nj->ni", rotations, directions)
+        scatters[way] = 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
+    largest = max(_SMALLEST_SCATTER, _CLEARLY * min(scatters.values()))
+    return [way for way, scatter in scatters.items() if scatter <= largest]

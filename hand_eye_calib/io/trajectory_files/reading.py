@@ -1,22 +1,25 @@
 """Reading a trajectory from a text file in any format."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.objects import PoseObject, trajectory_from_object
+from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, rates_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
 from hand_eye_calib.io.transforms import TfSource
+from hand_eye_calib.text import told_apart
 
-_Path = str | Path
-_USUAL = FileOptions.format
+# Time between poses that have no stamps.
+_STEP_NS = 100_000_000
 
 
 class FileReading(NamedTuple):
@@ -30,13 +33,13 @@ class FileReading(NamedTuple):
 
 
 def read_trajectory(
-    source: str | Path | PoseObject,
+    source: TrajectoryLike,
     format: str = "tum",
     *,
     topic: str | None = None,
     tf: str | None = None,
     columns: str | None = None,
-    times: str | Path | ArrayLike | None = None,
+    times: str | PathLike[str] | ArrayLike | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
     measures: str = "auto",
@@ -48,14 +51,12 @@ def read_trajectory(
     ----------
     source : str, path-like or object
         A file or a bag; or matrices (N, 4, 4) with ``times``, rows (N, 8) of t, x, y, z, qx, qy,
-        qz, qw or (N, 7) without t, or a pandas DataFrame with columns of these names.
+        qz, qw or (N, 7) without t, or a pandas DataFrame with columns named as in csv files.
     format : str
         "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
-    topic : str, optional
-        Of a bag: the topic of the poses. No other option goes with it.
-    tf : str, optional
-        Of a bag: the two frames, ``world:sensor``, whose transform is the trajectory, from ``/tf``
-        and ``/tf_static``.
+    topic, tf : str, optional
+        Of a bag: the topic of the poses; or two frames, ``world:sensor``, whose transform is the
+        trajectory, from ``/tf`` and ``/tf_static``. No other option but ``measures`` goes with it.
     columns : str, optional
         For csv without a header: the columns' names, such as
         ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other
@@ -96,93 +97,156 @@ def read_trajectory(
     >>> hec.read_trajectory(rows)
     Trajectory(2 poses over 0.100 s)
     """
+    path = Path(source) if isinstance(source, str | PathLike) else None
+    file_of_times = Path(times) if isinstance(times, str | PathLike) else None
+    has_options = format != FileOptions.format or columns is not None or file_of_times is not None
+    if isinstance(source, Trajectory):
+        return source
     if topic or tf:
-        of_text = (format != _USUAL, columns, times is not None, stamp_unit, repair)
-        if any(of_text) or (topic and tf) or not isinstance(source, _Path):
+        if has_options or times is not None or stamp_unit or repair or (topic and tf) or not path:
             raise ConfigError(
                 "topic and tf are for bags: give one of them and none of the options of text files"
             )
         from hand_eye_calib.io.bags import PoseBag
 
-        with PoseBag(source) as bag:
+        with PoseBag(path) as bag:
             of = TfSource.parse(tf) if tf else topic or ""
             trajectory, notes = bag.trajectory(of, measures)
             notes = [*bag.warnings, *notes]
-    elif isinstance(source, _Path):
-        if not isinstance(times, _Path | None):
-            raise ConfigError("stamps in memory are for poses in memory; of a kitti file name one")
-        trajectory, repairs, guesses = read_trajectory_file(
-            source,
-            format,
+    elif (has_options and not path) or (path and times is not None and not file_of_times):
+        raise ConfigError(
+            "format, columns and a file of times are for text files, other times for objects"
+        )
+    else:
+        options = FileOptions(
+            format=format,
             columns=columns,
-            times=times,
+            times=file_of_times,
             stamp_unit=stamp_unit,
             repair=repair,
             measures=measures,
         )
+        if path is not None:
+            table = read_table(path, options)
+        else:
+            from hand_eye_calib.io.trajectory_files.objects import table_of_object
+
+            table = table_of_object(source, times)
+        trajectory, repairs, guesses = _read(table, options)
         notes = [*guesses, *repairs]
-    else:
-        if format != _USUAL or columns or isinstance(times, _Path) or measures != AUTO:
-            raise ConfigError("format, columns, measures and a file of times are for text files")
-        trajectory, notes = trajectory_from_object(source, times, stamp_unit, repair)
     for text in notes:
         warnings.warn(text, UserWarning, stacklevel=2)
     return trajectory
 
 
-def read_trajectory_file(path: _Path, format: str = _USUAL, **options: Any) -> FileReading:
+def read_trajectory_file(
+    path: str | Path, format: str = FileOptions.format, **options: Any
+) -> FileReading:
     """Read a text file as :func:`read_trajectory`, with the options of FileOptions, and without
     warnings.
     """
-    return read_trajectory_files([(path, FileOptions(format=format, **options))])[0]
+    of_file = FileOptions(format=format, **options)
+    return _read(read_table(path, of_file), of_file)
 
 
-def read_trajectory_files(files: Sequence[tuple[_Path, FileOptions]]) -> list[FileReading]:
-    """Read text files that belong together: those with the same columns, which come from one
-    exporter, by one convention of their angles.
+def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
+    """Read text files that belong together, with sensors named after the files: those with the same
+    columns, which come from one exporter, by one convention of their angles.
 
     Raises
     ------
     InputError
         If a file cannot be read, or no convention fits the motion of all with the same columns.
     """
-    read = [_read(*each) for each in files]
-    for header in {table.header for _, table in read if table.conventions}:
-        rows = [row for row, (_, table) in enumerate(read) if table.header == header]
-        tables = [read[row][1] for row in rows]
-        if len({table.conventions[0] for table in tables}) > 1:
-            common = set(tables[0].conventions).intersection(*(each.conventions for each in tables))
+    tables = [read_table(*each) for each in files]
+    pairs = _pairs(tables, files[0][1].pair_by)
+    read = [
+        _read(table, options, rows)
+        for (_, options), table, rows in zip(files, tables, pairs, strict=True)
+    ]
+    for header in {table.header for table in tables if table.conventions}:
+        of_one = [k for k, table in enumerate(tables) if table.header == header]
+        conventions = [tables[k].conventions for k in of_one]
+        if len({each[0] for each in conventions}) > 1:
+            common = [way for way in conventions[0] if all(way in each for each in conventions)]
             if not common:
                 raise InputError(
-                    f"{' and '.join(str(table.path) for table in tables)} have the same columns, "
+                    f"{' and '.join(str(files[k][0]) for k in of_one)} have the same columns, "
                     "but no convention of their angles fits the motion of all; write quaternions "
                     "instead, or name the column of one yaw (counterclockwise) and of the other "
                     "heading (clockwise from north) if that is what they are"
                 )
-            way = next(each for each in tables[0].conventions if each in common)
-            for row in rows:
-                read[row] = _read(*files[row], convention=way)
-    return [reading for reading, _ in read]
+            for k in of_one:
+                read[k] = _read(read_table(*files[k]), files[k][1], pairs[k], common[0])
+    names = [path.stem for path, _ in files]
+    if len({*names}) < len(names):
+        names = told_apart([str(path.with_suffix("")) for path, _ in files])
+    names = names if len({*names}) == len(names) else [""] * len(names)
+    return [
+        each._replace(trajectory=replace(each.trajectory, sensor_frame=name))
+        for each, name in zip(read, names, strict=True)
+    ]
 
 
-def _read(path: _Path, options: FileOptions, convention: str = "") -> tuple[FileReading, Table]:
-    """The trajectory of a file, and the table it was made from."""
-    table = read_table(path, options)
-    if not table.stamps:
-        raise InputError(f"{path}: no poses in it; expected lines of {table.expected}")
-    stamps_ns = stamps_in_ns(table, options.stamp_unit)
-    measures = table.columns.measures
-    if measures == "rates":
-        rates = rates_of(table)
-        keep, repairs = in_order(table, stamps_ns, options.repair)
-        trajectory = Trajectory.from_rates(stamps_ns[keep], rates[keep])
-        return FileReading(trajectory, repairs, table.guesses), table
-    positions, quats_xyzw = poses_of(table, convention)
-    keep, repairs = in_order(table, stamps_ns, options.repair)
-    trajectory = Trajectory.from_quat_xyzw(stamps_ns[keep], positions[keep], quats_xyzw[keep])
-    if measures != "poses":
-        table.guess(f"{measures} alone, as its columns have it")
-    kind = measures if options.measures == AUTO else options.measures
+def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
+    """Trajectories that belong together from whatever each is: files as they look like, with
+    warnings as of :func:`read_trajectory`.
+    """
+    paths = [Path(each) for each in sources if isinstance(each, str | PathLike)]
+    if len(paths) < len(sources):
+        return [
+            read_trajectory(each, AUTO if isinstance(each, str | PathLike) else "tum")
+            for each in sources
+        ]
+    readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])
+    for text in (text for _, *texts in readings for text in sum(texts, [])):
+        warnings.warn(text, UserWarning, stacklevel=3)
+    return [reading.trajectory for reading in readings]
+
+
+def _pairs(tables: Sequence[Table], pair_by: str) -> list[IntArray | None]:
+    """The rows of each table that belong to those of the others, if stamps do not tell."""
+    if pair_by == "time":
+        return [None] * len(tables)
+    counts = [len(table) for table in tables]
+    if pair_by == "row" and len({*counts}) > 1:
+        raise InputError(f"to be paired by row, files need as many poses each; found {counts}")
+    keys = [[*table.images] if pair_by == "name" else [*range(len(table))] for table in tables]
+    common = sorted(set.intersection(*map(set, keys)))
+    if not common:
+        named = [len(each) for each in keys]
+        raise InputError(
+            f"no image has a name that is in all files; found {named} names; pair by time or row"
+        )
+    places = [{key: row for row, key in enumerate(each)} for each in keys]
+    return [np.array([place[key] for key in common]) for place in places]
+
+
+def _read(
+    table: Table, options: FileOptions, rows: IntArray | None = None, convention: str = ""
+) -> FileReading:
+    """The trajectory of a table, or of some of its rows in place of its stamps."""
+    if not len(table):
+        raise InputError(f"{table.path}: no poses in it; expected lines of {table.expected}")
+    if rows is None and not table.stamps:
+        raise ConfigError(
+            f"{table.path}: the poses have no stamps; name their column t, give `times`, or pair "
+            "poses by row with `pair_by`"
+        )
+    stamps_ns = stamps_in_ns(table, options.stamp_unit) if rows is None else np.array([])
+    kind = table.columns.measures
+    values = (rates_of(table),) if kind == "rates" else poses_of(table, convention)
+    if rows is None:
+        rows, repairs = in_order(table, stamps_ns, options.repair)
+        stamps_ns = stamps_ns[rows]
+    else:
+        stamps_ns, repairs = np.arange(len(rows)) * _STEP_NS, []
+    builders: Mapping[str, Callable[..., Trajectory]] = {"rates": Trajectory.from_rates}
+    build = builders.get(kind, Trajectory.from_quat_xyzw)
+    trajectory = build(stamps_ns, *(each[rows] for each in values))
+    if kind not in ("poses", "rates"):
+        table.guess(f"{kind} alone, as its columns have it")
+    kind = kind if options.measures == AUTO else options.measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
-    return FileReading(trajectory, repairs, table.guesses), table
+    return FileReading(trajectory, repairs, table.guesses)

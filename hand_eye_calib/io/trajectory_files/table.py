@@ -3,22 +3,22 @@ have, and what stands in which column.
 """
 
 import csv
+import os
 import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
-from itertools import takewhile
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.config import STAMP_UNITS, TRAJECTORY_FORMATS
+from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.files import read_text
+from hand_eye_calib.io.files import open_regular
 from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
@@ -44,12 +44,9 @@ TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _MOST_SHOWN = 100
 # A stamp in nanoseconds since 1970 has at least so many digits.
 _DIGITS_OF_NS = 17
-_NOT_EMPTY = re.compile("[^\n]+")
-_ISO = re.compile(
-    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d{1,18}))?\s*(Z|[-+]\d\d:?\d\d)?", re.IGNORECASE
-)
+# A number, or a time as of ISO 8601.
 _NUMBER = re.compile(
-    rf"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|nan|[-+]?inf|{_ISO.pattern}", re.IGNORECASE
+    r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan|[-+]?inf|\d{4}-\d\d-\d\d[t ]\d.*", re.IGNORECASE
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
@@ -60,7 +57,8 @@ _OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`.
+    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`. ``pair_by`` is of all
+    files that belong together: "time", or "row" or "name" (of images) in place of stamps.
 
     Raises
     ------
@@ -74,79 +72,52 @@ class FileOptions:
     stamp_unit: str | None = None
     repair: bool = False
     measures: str = AUTO
+    pair_by: str = PAIR_BY[0]
 
     def __post_init__(self) -> None:
-        check_stamp_unit(self.stamp_unit)
-        known = (*TRAJECTORY_FORMATS, AUTO)
-        if self.format not in known:
-            raise ConfigError(
-                f"unknown trajectory format {self.format!r}; known are {', '.join(known)}"
-            )
-        for given, of, what in (
+        for what, given, known in (
+            ("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,)),
+            ("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO)),
+        ):
+            if given not in known:
+                raise ConfigError(f"unknown {what} {given!r}; known are {', '.join(known)}")
+        for value, of, what in (
             (self.columns, "csv", "columns are named for"),
             (self.times, "kitti", "a file of times belongs to"),
         ):
-            if given is not None and self.format not in (of, AUTO):
+            if value is not None and self.format not in (of, AUTO):
                 raise ConfigError(f"{what} format {of} only; the format is {self.format}")
-
-
-def check_stamp_unit(unit: str | None) -> None:
-    """Refuse a unit of stamps that is not known, with a ConfigError."""
-    if unit is not None and unit not in STAMP_UNITS:
-        raise ConfigError(f"unknown unit of stamps {unit!r}; known are {', '.join(STAMP_UNITS)}")
 
 
 # ---- lines
 
 
-class Lines:
-    """The lines of a text file that are not empty, with their numbers; an InputError if it cannot
-    be read.
-
-    They are found anew each time: a list of them would take many times the memory of the text.
+def lines_of(path: _Path, expected: str = "a trajectory") -> Iterator[Line]:
+    """The lines of a text file that are not blank, with their numbers; an InputError if it cannot
+    be read. They are read anew each time: a list would take many times the memory of the text.
     """
+    try:
+        with open(open_regular(path), encoding="utf-8-sig") as file:
+            if os.fstat(file.fileno()).st_size > LARGEST_TEXT:
+                raise InputError(f"cannot read {path}: it is larger than {LARGEST_TEXT} bytes")
+            for number, text in enumerate(file, 1):
+                if len(text) > LONGEST_LINE:
+                    raise InputError(
+                        f"{path}, line {number}: longer than {LONGEST_LINE} characters"
+                    )
+                if stripped := text.strip():
+                    yield number, stripped
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected lines of {expected}") from None
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
 
-    def __init__(self, path: _Path, expected: str = "a trajectory") -> None:
-        text = read_text(path, f"lines of {expected}", LARGEST_TEXT)
-        self._path, self._text = path, text.replace("\r\n", "\n").replace("\r", "\n")
 
-    def __iter__(self) -> Iterator[Line]:
-        number, end = 1, 0
-        for found in _NOT_EMPTY.finditer(self._text):
-            number += self._text.count("\n", end, found.start())
-            end = found.end()
-            if end - found.start() > LONGEST_LINE:
-                raise InputError(
-                    f"{self._path}, line {number}: longer than {LONGEST_LINE} characters"
-                )
-            yield number, found.group()
-
-    def data(self, after: int = 0) -> Iterator[Line]:
-        """The lines after one that are neither blank nor comments."""
-        for number, text in self:
-            stripped = text.strip()
-            if number > after and stripped and not stripped.startswith("#"):
-                yield number, text
-
-    def first(self) -> Line:
-        """The first of them; 0 and nothing if there is none."""
-        return next(self.data(), (0, ""))
-
-    def header(self) -> tuple[list[str] | None, int]:
-        """Names of the columns, if the file has any, and the number of the line that they take.
-
-        They are the first line that is no comment, unless it is a row of numbers; otherwise the
-        last comment above the data that has as many cells.
-        """
-        number, row = self.first()
-        cells = _cells_of(row)
-        if number and not _is_row(cells):
-            return cells, number
-        header = None
-        for _, text in takewhile(lambda line: line[0] != number, self):
-            names = _cells_of(text.strip().lstrip("#").strip())
-            header = names if len(names) == len(cells) and not _is_row(names) else header
-        return header or None, 0
+def _data(path: _Path, expected: str = "a trajectory", after: int = 0) -> Iterator[Line]:
+    """The lines after one that are no comments."""
+    return (
+        line for line in lines_of(path, expected) if line[0] > after and not line[1].startswith("#")
+    )
 
 
 def _cells_of(text: str) -> list[str]:
@@ -168,27 +139,46 @@ def _is_row(cells: Sequence[str]) -> bool:
     return bool(cells) and all(_NUMBER.fullmatch(cell) for cell in cells if cell)
 
 
-# ---- what a file looks like
-
-
-def layout_of(lines: Lines) -> tuple[str, bool]:
-    """The format that lines have, one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum in
-    doubt, so that its reader says what is wrong; and whether the file itself names its columns.
+class Head(NamedTuple):
+    """The first line of a file that is no comment, its number and cells (0 and none if there is no
+    such line), and the names of the columns, if the file has any: that line, unless it is a row of
+    numbers; otherwise the last comment above it that has as many cells.
     """
-    data = lines.first()[1].strip()
-    cells = _cells_of(data)
-    is_separated, n_cells = "," in data or ";" in data, len(cells)
-    if not _is_row(cells):
-        is_table = is_separated or n_cells >= 8 or are_columns(cells)
-        return ("csv" if is_table else "tum"), is_table
-    names, _ = lines.header()
-    if names is not None and are_columns(names):
-        is_tum = not is_separated and " ".join(names).lower().endswith(TUM_COLUMNS[10:])
-        return ("tum" if is_tum else "csv"), True
-    if not is_separated:
-        return ("kitti" if n_cells == 12 else "tum"), False
-    is_ns = cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS
-    return ("euroc" if is_ns and n_cells >= 8 else "csv"), False
+
+    number: int
+    text: str
+    cells: list[str]
+    names: list[str] | None
+
+    @classmethod
+    def of(cls, path: _Path) -> Self:
+        """Read it."""
+        comments: dict[int, list[str]] = {}
+        for number, text in lines_of(path):
+            cells = _cells_of(text.lstrip("#").strip())
+            if not text.startswith("#"):
+                return cls(
+                    number, text, cells, comments.get(len(cells)) if _is_row(cells) else cells
+                )
+            if not _is_row(cells):
+                comments[len(cells)] = cells
+        return cls(0, "", [], None)
+
+    def layout(self) -> tuple[str, bool]:
+        """The format that a file has, one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum
+        in doubt, so that its reader says what is wrong; and whether it names its columns.
+        """
+        is_separated, n_cells = "," in self.text or ";" in self.text, len(self.cells)
+        if self.names is self.cells:
+            is_table = is_separated or n_cells >= 8 or are_columns(self.cells)
+            return ("csv" if is_table else "tum"), is_table
+        if self.names is not None and are_columns(self.names):
+            is_tum = " ".join(self.names).lower().endswith(TUM_COLUMNS[10:])
+            return ("tum" if is_tum and not is_separated else "csv"), True
+        if not is_separated:
+            return ("kitti" if n_cells == 12 else "tum"), False
+        is_ns = self.cells[0].isdecimal() and len(self.cells[0]) >= _DIGITS_OF_NS
+        return ("euroc" if is_ns and n_cells >= 8 else "csv"), False
 
 
 # ---- tables
@@ -196,17 +186,24 @@ def layout_of(lines: Lines) -> tuple[str, bool]:
 
 @dataclass
 class Table:
-    """The rows of a file: their line numbers, stamps, and values, one row after the other.
+    """The rows of a file: their line numbers, stamps (none without a column of them), and values,
+    one row after the other.
 
     Attributes
     ----------
+    path : str or path-like
+        What messages call it.
     expected : str
         What a row should be, for messages.
     columns : Columns
-    guesses : list of str
-        What a person should know of how the file was read.
+    format : str
+        One of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`.
     header : tuple of str
         The names of all columns; empty without.
+    images : sequence of str
+        The name of each row's image; empty without.
+    guesses : list of str
+        What a person should know of how the file was read.
     conventions : list of str
         Those of its angles that the motion does not contradict, the usual first.
     """
@@ -214,17 +211,27 @@ class Table:
     path: _Path
     expected: str
     columns: Columns
+    format: str = "csv"
     header: tuple[str, ...] = ()
+    images: Sequence[str] = ()
     line_numbers: "array[int]" = field(default_factory=lambda: array("q"))
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
     guesses: list[str] = field(default_factory=list)
     conventions: list[str] = field(default_factory=list)
 
+    def __len__(self) -> int:
+        return len(self.line_numbers)
+
     @property
     def values(self) -> FloatArray:
         """(N, k) array: the values of each row."""
         return np.asarray(self.numbers, dtype=float).reshape(-1, len(self.columns.quantities))
+
+    def columns_of(self, names: Sequence[str]) -> FloatArray:
+        """(N, k) array: the values of some quantities."""
+        places = [*self.columns.quantities]
+        return self.values[:, [places.index(name) for name in names]]
 
     def fill(
         self,
@@ -272,29 +279,41 @@ class Table:
 
 def _stamp(cells: Sequence[str]) -> Decimal:
     """A stamp as it is written, with no binary floating point in between; nanoseconds of one in two
-    columns.
+    columns; of a time of ISO 8601, in UTC if it names no zone, microseconds count.
     """
     if len(cells) == 2:
-        secs, nsecs = cells
-        if not (re.fullmatch(r"-?\d{1,18}", secs) and re.fullmatch(r"\d{1,9}", nsecs)):
-            raise ValueError(
-                f"expected whole seconds and nanoseconds; found {secs[:40]!r} and {nsecs[:40]!r}"
-            )
-        return Decimal(int(secs) * STAMP_UNITS["s"] + int(nsecs))
-    if date := _ISO.fullmatch(cells[0]):
-        day, clock, fraction, zone = date.groups()
-        moment = datetime.fromisoformat(f"{day}T{clock}{zone or 'Z'}")
-        return Decimal(int(moment.timestamp())) + Decimal(f"0.{fraction or 0}")
+        return Decimal(int(cells[0]) * STAMP_UNITS["s"] + int(cells[1]))
     try:
         stamp = Decimal(cells[0])
     except InvalidOperation:
-        stamp = Decimal("nan")
+        if not _NUMBER.fullmatch(cells[0]):
+            raise ValueError(f"found {cells[0]!r} for the timestamp") from None
+        moment = datetime.fromisoformat(cells[0])
+        moment = moment.replace(tzinfo=moment.tzinfo or UTC)
+        return Decimal(int(moment.timestamp())) + Decimal(moment.microsecond).scaleb(-6)
     if not stamp.is_finite() or stamp.adjusted() > 30:
         raise ValueError(f"found {cells[0]!r} for the timestamp")
     return stamp
 
 
 # ---- formats
+
+# Of the formats whose columns have an order: what a row is, the columns, and how it is split.
+_ORDERED: dict[str, tuple[str, Columns, Callable[[str], list[str]]]] = {
+    "tum": (f"8 numbers, {TUM_COLUMNS}", Columns.in_order(*POSITION, *QUATERNION), str.split),
+    "kitti": (
+        "12 numbers, the first three rows of a pose",
+        Columns.in_order(*MATRIX, has_stamp=False),
+        str.split,
+    ),
+    "euroc": (
+        "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
+        Columns.in_order(*POSITION, "qw", "qx", "qy", "qz", stamp_unit="ns"),
+        lambda text: [*map(str.strip, text.split(","))],
+    ),
+}
+# A stamp, a position and a quaternion, whose order is to be found.
+_UNNAMED = Columns.in_order(*POSITION, *UNNAMED)
 
 
 def read_table(path: _Path, options: FileOptions) -> Table:
@@ -304,96 +323,67 @@ def read_table(path: _Path, options: FileOptions) -> Table:
     ------
     InputError
         If a line cannot be used, or columns have no names.
-    ConfigError
-        If the stamps of format kitti are nowhere.
     """
     if (found := rows_of(path, options.columns)) is not None:
         names, rows = found.header.split(","), enumerate(found.rows, 1)
         table = table_of(path, names, rows, lambda row: [*map(str, row)], options.measures)
-        table.guesses += [f"{path}: {note}" for note in found.notes]
+        table.guesses, table.images = [f"{path}: {note}" for note in found.notes], found.images
         return table
-    lines = Lines(path)
-    format, is_named, guesses = options.format, True, list[str]()
-    columns, times = options.columns, options.times
-    if format == AUTO:
-        format, is_named = layout_of(lines)
-        if columns is None and times is None:
-            if not is_named and len(_cells_of(lines.first()[1])) == 4:
-                columns = _OF_FOUR.get(options.measures)
-                if columns is None:
-                    raise InputError(
-                        f"{path}: four columns without names; name them with `columns`: t,x,y,z "
-                        "for positions, t,wx,wy,wz for angular rates"
-                    )
-            elif format != "tum":
-                guesses = [f"{path} looks like format {format}; to change that, give `format`"]
-        if columns is not None or times is not None:
-            format, is_named = "csv" if columns is not None else "kitti", True
+    head, guesses = Head.of(path), list[str]()
+    format, columns, times = options.format, options.columns, options.times
+    is_named = True
+    if format == AUTO and (columns or times):
+        format = "csv" if columns else "kitti"
+    elif format == AUTO:
+        format, is_named = head.layout()
+        if not is_named and len(head.cells) == 4:
+            if (columns := _OF_FOUR.get(options.measures)) is None:
+                raise InputError(
+                    f"{path}: four columns without names; name them with `columns`: t,x,y,z for "
+                    "positions, t,wx,wy,wz for angular rates"
+                )
+            format = "csv"
+        elif format != "tum":
+            guesses = [f"{path} looks like format {format}; to change that, give `format`"]
         beside = Path(path).with_name(_TIMES)
-        if format == "kitti" and times is None and beside.is_file():
+        if format == "kitti" and beside.is_file():
             times = beside
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
     if format == "csv":
-        table = _read_csv(path, lines, columns, options)
-    elif format == "kitti":
-        table = _read_kitti(path, lines, times)
+        table = _read_csv(path, head, columns, options)
     else:
-        table = _read_poses(path, lines, format, is_named)
+        expected, places, cells_of = _ORDERED[format]
+        n_columns = len(places.stamp) + len(places.quantities)
+        table = Table(path, expected, places if is_named or format != "tum" else _UNNAMED, format)
+        table.fill(_data(path), cells_of, n_columns, may_have_more=format == "euroc")
+    if format == "kitti" and times is not None:
+        stamps = Table(times, "a stamp", Columns.in_order())
+        table.stamps = stamps.fill(_data(times, "stamps"), str.split, 1, True).stamps
+        if len(table.stamps) != len(table):
+            raise InputError(
+                f"{path}: {len(table)} poses, but {times} has {len(table.stamps)} stamps; they "
+                "belong to different recordings"
+            )
     table.guesses[:0] = guesses
     return table
 
 
-def _read_poses(path: _Path, lines: Lines, format: str, is_named: bool) -> Table:
-    """A stamp, a position and a quaternion, in the order of tum or of euroc."""
-    if format == "euroc":
-        expected = "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz"
-        places = Columns.in_order(*POSITION, "qw", "qx", "qy", "qz", stamp_unit="ns")
-        table = Table(path, expected, places)
-        return table.fill(lines.data(), lambda text: [*map(str.strip, text.split(","))], 8, True)
-    places = Columns.in_order(*POSITION, *(QUATERNION if is_named else UNNAMED))
-    return Table(path, f"8 numbers, {TUM_COLUMNS}", places).fill(lines.data(), str.split, 8)
-
-
-def _read_kitti(path: _Path, lines: Lines, times: _Path | None) -> Table:
-    """Matrices, whose stamps are in a file of their own."""
-    if times is None:
-        raise ConfigError(
-            f"{path}: the poses of format kitti have no stamps; name their file with `times`"
-        )
-    places = Columns.in_order(*MATRIX, has_stamp=False)
-    table = Table(path, "12 numbers, the first three rows of a pose", places)
-    table.fill(lines.data(), str.split, len(MATRIX))
-    stamps = Table(times, "a stamp", Columns.in_order())
-    table.stamps = stamps.fill(Lines(times, "stamps").data(), str.split, 1, True).stamps
-    if len(table.stamps) != len(table.line_numbers):
-        raise InputError(
-            f"{path}: {len(table.line_numbers)} poses, but {times} has {len(table.stamps)} "
-            "stamps; they belong to different recordings"
-        )
-    return table
-
-
-def _read_csv(path: _Path, lines: Lines, columns: str | None, options: FileOptions) -> Table:
+def _read_csv(path: _Path, head: Head, columns: str | None, options: FileOptions) -> Table:
     """Columns by the names in the header, or by those given."""
-    number, row = lines.first()
-    cells = _cells_of(row)
-    if columns is None:
-        header, after = lines.header()
-    else:
-        header = [name.strip() for name in columns.split(",")]
-        after = 0 if any(map(_NUMBER.fullmatch, cells)) else number
-    if header is not None:
-        return table_of(path, header, lines.data(after), _cells_of, options.measures)
-    if cells and not (options.format == AUTO and len(cells) == 8):
+    names, after = head.names, head.number if head.names is head.cells else 0
+    if columns is not None:
+        names = [name.strip() for name in columns.split(",")]
+        after = 0 if any(map(_NUMBER.fullmatch, head.cells)) else head.number
+    if names is not None:
+        return table_of(path, names, _data(path, after=after), _cells_of, options.measures)
+    if head.cells and not (options.format == AUTO and len(head.cells) == 8):
         raise InputError(
             f"{path}: the first line names no columns, so the order of the quaternion is "
             "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
-            f"{len(cells)}"
+            f"{len(head.cells)}"
         )
-    # A stamp, a position and a quaternion, whose order is to be found.
-    places = Columns.in_order(*POSITION, *UNNAMED)
-    table = Table(path, "8 columns: a stamp, a position and a quaternion", places)
-    return table.fill(lines.data(), _cells_of, 8)
+    table = Table(path, "8 columns: a stamp, a position and a quaternion", _UNNAMED)
+    return table.fill(_data(path), _cells_of, 8)
 
 
 def table_of(
@@ -410,6 +400,6 @@ def table_of(
     InputError
         If a column is missing, or a line cannot be used.
     """
-    expected = f"{len(names)} columns: {listed(names)}"
-    table = Table(path, expected, choose_columns(path, names, measures), tuple(names))
+    columns, expected = choose_columns(path, names, measures), listed(names)
+    table = Table(path, f"{len(names)} columns: {expected}", columns, header=tuple(names))
     return table.fill(lines, cells_of, len(names))
