@@ -33,7 +33,7 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.inputs import TfInput, TopicInput, qos_parameter_names
 from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
-from hand_eye_calib.ros.tf import Robot, RobotTree, TfBroadcaster, message_type, needs_tf
+from hand_eye_calib.ros.tf import TF, Robot, RobotTree, TfBroadcaster, message_type
 
 _DISCOVERY_PERIOD_S = 0.2
 _STATE_PERIOD_S = 1.0
@@ -78,7 +78,7 @@ class CalibratorNode(Node):
         self._session = LiveSession(self._log, config, others)
         tree = RobotTree(self, self._log)
         self._robot = Robot(self._log, options, tree)
-        if needs_tf(options):
+        if options.base_frame or options.installed == TF:
             tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
@@ -125,14 +125,15 @@ class CalibratorNode(Node):
         what = "watching" if options.monitor else "calibrating"
         children = ", ".join(each.topic for each in inputs[1:])
         given = self._options.given.items()
-        told = [f"{name} {value}" for name, value in given if name != "output_directory"]
-        base = self._output_base if options.output_directory else None
-        self._log.info(
-            f"{what} {children} against {inputs[0].topic}"
-            + (f"; files go to {base}" if base else "; nothing is saved: no output_directory")
-            + (f"; set are {', '.join(told)}" if told else "")
-            + ("" if options.enabled else "; no poses are accepted before ~/set_enabled")
-        )
+        set_to = [f"{name} {value}" for name, value in given if name != "output_directory"]
+        files = f"files go to {self._output_base}" if options.output_directory else ""
+        told = [
+            f"{what} {children} against {inputs[0].topic}",
+            files or "nothing is saved: no output_directory",
+            f"set are {', '.join(set_to)}" if set_to else "",
+            "" if options.enabled else "no poses are accepted before ~/set_enabled",
+        ]
+        self._log.info("; ".join(filter(None, told)))
 
     def _watch_mount(self) -> MountWatch:
         robot = self._robot
@@ -155,28 +156,20 @@ class CalibratorNode(Node):
         # A group of its own: while it awaits a solve, it would hold up every other callback of its
         # group.
         group, qos = ReentrantCallbackGroup(), _SERVICE_QOS
-        self.create_service(
-            Trigger, "~/solve", self._on_solve, qos_profile=qos, callback_group=group
-        )
-        for name, kind, act in (
-            ("reset", Trigger, self._reset),
-            ("save", Trigger, lambda request: self._saver.save(self._options.node)),
-            ("set_enabled", SetBool, self._set_enabled),
-        ):
-            self.create_service(kind, f"~/{name}", partial(_answer, act), qos_profile=qos)
+        serve = partial(self.create_service, qos_profile=qos)
+        serve(Trigger, "~/solve", self._on_solve, callback_group=group)
+        save = lambda request: self._saver.save(self._options.node)  # noqa: E731
+        serve(Trigger, "~/save", partial(_answer, save))
+        serve(Trigger, "~/reset", partial(_answer, self._reset))
+        serve(SetBool, "~/set_enabled", partial(_answer, self._set_enabled))
 
     def _start_timers(self) -> None:
         # Steady time: these go on while a bag, and with it simulated time, is paused.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._solve_timer, *_ = (
-            self.create_timer(period_s, callback, clock=steady)
-            for period_s, callback in (
-                (self._options.node.solve_period, self._on_solve_timer),
-                (_DISCOVERY_PERIOD_S, self._discover),
-                (_STATE_PERIOD_S, self._publish_state),
-                (FLUSH_PERIOD_S, self._session.flush_journal),
-            )
-        )
+        make = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._solve_timer = make(self._options.node.solve_period, self._on_solve_timer)
+        make(_DISCOVERY_PERIOD_S, self._discover)
+        make(_STATE_PERIOD_S, self._publish_state)
+        make(FLUSH_PERIOD_S, self._session.flush_journal)
 
     # ---------------------------------------------------------------- timers
 
@@ -197,7 +190,9 @@ class CalibratorNode(Node):
         progress = self._cycle.goal.progress
         faulty = "the streams are faulty" * progress.is_faulty
         why_not = "" if progress.done else faulty or "the goal is not reached"
-        self._tf.add(calibration, why_not or self._robot.lacks_base(calibration))
+        base_frame = self._options.node.base_frame
+        no_base = f"base_frame {base_frame} is not known" * (calibration.base_frame != base_frame)
+        self._tf.add(calibration, why_not or no_base)
 
     def _publish_state(self, has_ended: bool = False) -> None:
         self._tf.look()
@@ -266,18 +261,17 @@ class CalibratorNode(Node):
 
     def _check_options(self, options: NodeConfig) -> None:
         """Raise ConfigError if options cannot be had together, or not on this machine."""
-        if options.publish_tf:
-            message_type()
-        if wanted_by := needs_tf(options):
-            message_type(wanted_by)
+        of_tf = {name: getattr(options, name) for name in ("parent_tf", "child_tf")}
+        of_tf |= {"publish_tf": options.publish_tf, "base_frame": options.base_frame}
+        for name, wanted in (of_tf | {"installed": options.installed == TF}).items():
+            if wanted:
+                message_type(name)
+            if wanted and name in ("parent_tf", "child_tf"):
+                TfSource.parse(wanted)
         if options.monitor and not options.installed:
             raise ConfigError("monitor needs installed: what the mount is watched against")
         if options.monitor and options.other_children:
             raise ConfigError("monitor watches one child sensor: leave other_children at 0")
-        for name in ("parent_tf", "child_tf"):
-            if frames := getattr(options, name):
-                TfSource.parse(frames)
-                message_type(name)
         if self._output_base is not None and options.output_directory:
             output_path(options.output_directory, self._output_base)
 

@@ -105,27 +105,15 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
 def covariance_about_parent_axes(
     T_parent_child: FloatArray, cov_parent_child_in_child: FloatArray
 ) -> FloatArray:
-    """Covariance of a pose as ROS messages carry it (REP-103).
+    """Covariance (6, 6) of a pose as ROS messages carry it (REP-103): m and rad, of x, y, z and the
+    rotation about X, Y, Z of the parent frame.
 
     The engine's error is ``xi = (rho, phi)`` in ``T_parent_child @ exp(xi)``, in the child's axes.
     To first order it moves the child's origin by ``R rho`` and rotates the child by ``R phi`` about
     the parent's axes through that origin. Both blocks are rotated; there is no lever arm.
-
-    Parameters
-    ----------
-    T_parent_child : (4, 4) array
-    cov_parent_child_in_child : (6, 6) array
-        m and rad, order (rho, phi).
-
-    Returns
-    -------
-    (6, 6) array
-        Order x, y, z, rotation about X, Y, Z of the parent frame.
     """
-    R_parent_child = T_parent_child[:3, :3]
-    rotation = np.zeros((6, 6))
-    rotation[:3, :3] = rotation[3:, 3:] = R_parent_child
-    return rotation @ cov_parent_child_in_child @ rotation.T
+    to_parent = np.kron(np.eye(2), T_parent_child[:3, :3])
+    return np.asarray(to_parent @ cov_parent_child_in_child @ to_parent.T)
 
 
 def _xyz(kind: type[_Triple], T_target_source: FloatArray) -> _Triple:

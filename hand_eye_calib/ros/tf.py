@@ -2,6 +2,7 @@
 extrinsic is broadcast on ``/tf_static``, only once the goal is reached, never as a second parent.
 """
 
+import contextlib
 import math
 import time
 from collections import deque
@@ -46,9 +47,6 @@ _QOS = {
 # to 2.4 s.
 LOOK_S = 5.0
 
-# Own broadcasts that are recognised.
-_MOST_OWN = 100
-
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:
     """tf2_msgs/TFMessage, which this parameter needs.
@@ -68,11 +66,6 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
     return TFMessage
 
 
-def needs_tf(options: NodeConfig) -> str:
-    """The parameter for which the robot's transforms have to be listened to; empty if none."""
-    return "base_frame" * bool(options.base_frame) or "installed" * (options.installed == TF)
-
-
 class RobotTree(FrameTree):
     """The edges that others broadcast; of two parents of a frame the first counts. ``own`` is what
     this node has broadcast itself, which is not heard.
@@ -80,7 +73,7 @@ class RobotTree(FrameTree):
 
     def __init__(self, node: Node, log: NodeLog) -> None:
         super().__init__(STATIC_TOPIC)
-        self.own: deque[TransformStamped] = deque(maxlen=_MOST_OWN)
+        self.own: deque[TransformStamped] = deque(maxlen=100)
         self._node, self._log = node, log
         self._subscriptions: dict[str, Subscription] = {}
 
@@ -104,12 +97,9 @@ class RobotTree(FrameTree):
             if edge.parent == parent:
                 return f"{topic} has the edge {parent} -> {child} already, from another node"
             return f"{child} has the parent {edge.parent} on {topic} already, and a frame has one"
-        try:
-            is_below = child in self.above(parent)
-        except InputError:  # it is not there, or others have closed a circle
-            return ""
-        if is_below:
-            return f"{parent} is below {child} in the tree already: the edge would close a circle"
+        with contextlib.suppress(InputError):  # it is not there, or others have closed a circle
+            if child in self.above(parent):
+                return f"{parent} is below {child} already: the edge would close a circle"
         return ""
 
     def _hear(self, topic: str, message: Any) -> None:
@@ -183,11 +173,6 @@ class Robot:
         """Why a result is not compared with what is installed; empty if that was not asked for."""
         return (self.problem or "no result yet") if self._source else ""
 
-    def lacks_base(self, calibration: Calibration) -> str:
-        """Why a result has no pose in the base frame; empty if it has, or none was asked for."""
-        is_there = calibration.base_frame == self._base_frame
-        return "" if is_there else f"base_frame {self._base_frame} is not known"
-
     def _report(self, problem: str) -> None:
         self.problem = problem
         self._log.warning(problem)
@@ -210,39 +195,25 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
 
 class TfBroadcaster:
     """Broadcasts the result of a session that has reached its goal on ``/tf_static`` while that is
-    switched on.
+    switched on. ``state`` is what is done about it, and the reason.
     """
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
         self._node, self._log, self._tree = node, log, tree
         self._is_on, self._began_s = False, 0.0
         self._publisher: Publisher | None = None
-        self._sent: TransformStamped | None = None
         self.restart()
 
     def restart(self) -> None:
         """Begin a new session: what was broadcast is withdrawn."""
         self._result: Calibration | None = None
-        self._why_not, self._refused = "no result yet", ""
-        self._withdraw()
-
-    @property
-    def state(self) -> tuple[Broadcast, str]:
-        """What is done about it, and the reason."""
-        if not self._is_on:
-            return Broadcast.OFF, ""
-        if self._publisher is not None:
-            return Broadcast.ON, ""
-        if self._why_not:
-            return Broadcast.WAITING, self._why_not
-        if self._refused:
-            return Broadcast.REFUSED, self._refused
-        return Broadcast.WAITING, "the transform tree is looked at first"
+        self._why_not = "no result yet"
+        self.look()
 
     def switch(self, on: bool) -> None:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
         if on != self._is_on:
-            self._is_on, self._began_s, self._refused = on, time.monotonic(), ""
+            self._is_on, self._began_s = on, time.monotonic()
             if on:
                 self._tree.listen()
                 self._tree.listen(DYNAMIC_TOPIC)
@@ -257,43 +228,46 @@ class TfBroadcaster:
 
     def look(self) -> None:
         """Broadcast what is new, as far as the tree allows it now; to be called often."""
-        result = self._result
-        if not self._is_on or self._why_not or result is None:
-            self._withdraw()
-            return
-        unknown, edge = what_is_unknown(result), (result.mounting[0], result.child_frame)
-        if not unknown and time.monotonic() - self._began_s < LOOK_S:
-            return
-        before, self._refused = self._refused, unknown or self._tree.what_forbids(*edge)
-        if self._refused:
-            if self._refused != before and not unknown:
-                self._log.error(
-                    f"publish_tf is refused: {self._refused}. Put the result into the robot's "
-                    "description (extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf "
-                    "off"
-                )
-            self._withdraw()
-            return
-        self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
-        if self._publisher is None:
-            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
-            self._log.info("the result is broadcast on /tf_static from now on")
-        transform = to_transform(result, *result.mounting)
-        if transform != self._sent:
-            self._sent = transform
-            self._tree.own.append(transform)
-            self._publisher.publish(message_type()(transforms=[transform]))
-
-    def _withdraw(self) -> None:
-        """Give nothing to new listeners; those who have heard the edge keep it."""
-        self._sent = None
-        if self._publisher is not None:
+        self.state = self._judged()
+        if self._result is not None and self.state[0] is Broadcast.ON:
+            self._broadcast(self._result)
+        elif self._publisher is not None:  # new listeners get nothing; the others keep it
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
             self._log.warning(
                 "the edge on /tf_static is withdrawn; listeners that have heard it keep it until "
                 "they are restarted"
             )
+
+    def _judged(self) -> tuple[Broadcast, str]:
+        result = self._result
+        if not self._is_on:
+            return Broadcast.OFF, ""
+        if result is None or self._why_not:
+            return Broadcast.WAITING, self._why_not
+        if unknown := what_is_unknown(result):
+            return Broadcast.REFUSED, unknown
+        if time.monotonic() - self._began_s < LOOK_S:
+            return Broadcast.WAITING, "the transform tree is looked at first"
+        if forbidden := self._tree.what_forbids(result.mounting[0], result.child_frame):
+            self._log.error(
+                f"publish_tf is refused: {forbidden}. Put the result into the robot's description "
+                "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
+            )
+            return Broadcast.REFUSED, forbidden
+        return Broadcast.ON, ""
+
+    def _broadcast(self, result: Calibration) -> None:
+        self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
+        if self._publisher is None:
+            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
+            self._sent: TransformStamped | None = None
+            self._log.info("the result is broadcast on /tf_static from now on")
+        transform = to_transform(result, *result.mounting)
+        if transform != self._sent:
+            self._sent = transform
+            self._tree.own.append(transform)
+            self._publisher.publish(message_type()(transforms=[transform]))
 
 
 def what_is_unknown(calibration: Calibration) -> str:
