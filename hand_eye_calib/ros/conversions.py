@@ -71,17 +71,15 @@ def from_transform(message: TransformStamped) -> PoseFields:
     )
 
 
-def to_transform(
-    calibration: Calibration, mounted_on: str = "", T: FloatArray | None = None
-) -> TransformStamped:
-    """The extrinsic as geometry_msgs/TransformStamped: header.frame_id is the parent sensor,
-    child_frame_id the child sensor; or the child sensor's pose T (4, 4) in another frame that it
-    is mounted on.
+def to_transform(calibration: Calibration, is_mounting: bool = False) -> TransformStamped:
+    """The extrinsic as geometry_msgs/TransformStamped: header.frame_id is the parent sensor, or the
+    frame that the child is mounted on, child_frame_id the child sensor.
     """
-    T = calibration.T_parent_child if T is None else T
+    of_parent = calibration.parent_frame, calibration.T_parent_child
+    frame, T = calibration.mounting if is_mounting else of_parent
     message = TransformStamped()
     message.header.stamp = to_time(calibration.stamp_ns)
-    message.header.frame_id = mounted_on or calibration.parent_frame
+    message.header.frame_id = frame
     message.child_frame_id = calibration.child_frame
     message.transform.translation = _xyz(Vector3, T)
     message.transform.rotation = _quaternion(T)

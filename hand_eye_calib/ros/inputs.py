@@ -53,35 +53,43 @@ class TopicInput(PoseInput):
         super().__init__(name, node.resolve_topic_name(self._relative_topic), *parts)
         self._node, self._wanted_type = node, wanted_type
         self._subscription: Subscription | None = None
-        self._type_name, self._publishers = "", 0
+        self._n_publishers = 0
 
     def discover(self) -> None:
-        """Subscribe as soon as the type is known, and again if the publisher changes it; to be
-        called often.
+        """Subscribe as soon as the type is known; to be called often.
 
         Raises
         ------
         ConfigError
             If a type that is wanted cannot be used. A type that is found is refused in the log.
         """
-        is_wanted = self._wanted_type != "auto"
         # Of the topic as resolved: rclpy's count does not follow remaps itself.
         publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
+        self.problem, self._n_publishers = self._why_deaf(publishers), len(publishers)
+        is_wanted = self._wanted_type != "auto"
         offered = {each.topic_type for each in publishers}
-        type_name = self._wanted_type if is_wanted else self._choose_type(offered)
-        self.problem, self._publishers = self._why_deaf(publishers), len(publishers)
-        if type_name is not None and type_name != self._type_name:
-            try:
-                self._subscribe(type_name)
-            except ConfigError as error:
-                if is_wanted:
-                    raise
-                self.problem = str(error)
-                self._log.error(f"{self.topic} is not used: {error}")
+        usable = (
+            [self._wanted_type] if is_wanted else [each for each in MESSAGES if each in offered]
+        )
+        if self._subscription is not None:
+            return
+        try:
+            if usable:
+                self._subscribe(usable[0])
+        except ConfigError as error:
+            if is_wanted:
+                raise
+            self.problem = str(error)
+            self._log.error(f"{self.topic} is not used: {error}")
+        if offered and not usable:
+            self._log.warning(
+                f"{self.topic} has type {', '.join(sorted(offered))}; expected "
+                f"{', '.join(MESSAGES)}: remap {self._relative_topic} to a topic with poses"
+            )
 
     def describe_silence(self) -> str:
         """Why nothing has come yet, as far as the graph tells."""
-        return f"no pose yet on {self.topic} ({counted(self._publishers, 'publisher')})"
+        return f"no pose yet on {self.topic} ({counted(self._n_publishers, 'publisher')})"
 
     def _why_deaf(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Why the middleware brings nothing of these publishers; empty if it does."""
@@ -91,23 +99,9 @@ class TopicInput(PoseInput):
             return ""
         return "it is published best effort, and qos_overrides ask for reliable: leave them out"
 
-    def _choose_type(self, offered: set[str]) -> str | None:
-        """The type of the publishers; None if there is none that can be used."""
-        usable = [name for name in (self._type_name, *MESSAGES) if name in offered]
-        if offered and not usable:
-            self._log.warning(
-                f"{self.topic} has type {', '.join(sorted(offered))}; expected "
-                f"{', '.join(MESSAGES)}: remap {self._relative_topic} to a topic with poses"
-            )
-        return usable[0] if usable else None
-
     def _subscribe(self, type_name: str) -> None:
         measures = self.measures_as(type_name)
         self._session.set_measures(self.name, measures)
-        if self._subscription is not None:
-            self._log.warning(f"{self.topic} has changed its type from {self._type_name}")
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
         read = MessageReader(type_name, measures, self._session.origin(self.name))
 
         def on_message(data: Any, info: dict[str, Any]) -> None:
@@ -133,13 +127,12 @@ class TopicInput(PoseInput):
             raise ConfigError(
                 f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
             ) from error
-        self._type_name = type_name
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
     def receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
         """Take a message: the callback of the subscription."""
         # With several publishers, or none any more, the numbers of lost messages are not known.
-        self.count(info["publication_sequence_number"] if self._publishers == 1 else None)
+        self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
             stamp_ns = unpack_stamp_ns(data)
         except MALFORMED as error:

@@ -84,11 +84,10 @@ class Parameters:
             for name in overrides
             if name not in FIELDS and name not in qos_names
         ]
-        self.given = {
-            name: _start_value(field, overrides[name])
-            for name, field in FIELDS.items()
-            if name in overrides
-        }
+        if overrides.get("journal") is False:
+            overrides["journal"] = "off"  # of which YAML makes a false, without quotes
+        given = {name: field for name, field in FIELDS.items() if name in overrides}
+        self.given = {name: check_value(field, overrides[name]) for name, field in given.items()}
         self.calibrator, self.node = _configs(self.given)
         check(self.node)
         self._check_node, self._on_change = check, on_change
@@ -121,18 +120,6 @@ def _configs(values: dict[str, Any]) -> tuple[CalibratorConfig, NodeConfig]:
     of_node = {name: value for name, value in values.items() if name in _OF_NODE}
     of_calibrator = {name: value for name, value in values.items() if name not in _OF_NODE}
     return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(of_node)
-
-
-def _start_value(field: OptionField, value: Any) -> Any:
-    # ROS parameters have fixed types: rclpy refuses an integer for a double, and so does `ros2
-    # param set`.
-    if isinstance(field.default, float) and type(value) is int and not field.metadata["words"]:
-        raise ConfigError(
-            f"{option_name(field)} must be a double; got the integer {value}: write {value}.0"
-        )
-    if value is False and "off" in (field.metadata["choices"] or ()):
-        value = "off"  # which is what YAML makes of an off without quotes
-    return check_value(field, value)
 
 
 def _descriptor(field: OptionField) -> ParameterDescriptor:

@@ -31,8 +31,6 @@ class LiveExtrinsic(NamedTuple):
     """What the node published on ``~/extrinsic``; the stamp is of the newest pose used."""
 
     T_parent_child: FloatArray
-    parent_frame: str
-    child_frame: str
     stamp_ns: int
 
 
@@ -96,16 +94,14 @@ class Player:
         asked = [self._solve.call_async(Trigger.Request())]
 
         def is_covered() -> bool:
-            if self._heard and from_transform(self._heard[-1]).stamp_ns >= stamp_ns:
-                return True
             if asked[-1].done():
                 asked.append(self._solve.call_async(Trigger.Request()))
-            return False
+            return bool(self._heard) and from_transform(self._heard[-1]).stamp_ns >= stamp_ns
 
         self._wait(is_covered, "give a result with all poses")
         found = from_transform(self._heard[-1])
         T = se3.from_quat_xyzw(found.position, found.quat_xyzw)
-        return LiveExtrinsic(T, found.world_frame, found.sensor_frame or "", found.stamp_ns)
+        return LiveExtrinsic(T, found.stamp_ns)
 
     def _wait(self, condition: Callable[[], object], purpose: str) -> None:
         end_s = time.monotonic() + _PATIENCE_S

@@ -3,7 +3,6 @@ extrinsic is broadcast on ``/tf_static``, only once the goal is reached, never a
 """
 
 import contextlib
-import math
 import time
 from collections import deque
 from dataclasses import replace
@@ -23,9 +22,8 @@ from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
+from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.status import AXES, ROTATIONS
-from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.ros.conversions import (
     LATCHED,
     LISTENING,
@@ -245,8 +243,10 @@ class TfBroadcaster:
             return Broadcast.OFF, ""
         if result is None or self._why_not:
             return Broadcast.WAITING, self._why_not
-        if unknown := what_is_unknown(result):
-            return Broadcast.REFUSED, unknown
+        if result.verdict is Verdict.DO_NOT_USE:
+            return Broadcast.REFUSED, result.headline
+        if hidden := result.unobservable():
+            return Broadcast.REFUSED, f"{axes_in_words(hidden)} not determined"
         if time.monotonic() - self._began_s < LOOK_S:
             return Broadcast.WAITING, "the transform tree is looked at first"
         if forbidden := self._tree.what_forbids(result.mounting[0], result.child_frame):
@@ -263,21 +263,8 @@ class TfBroadcaster:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
             self._sent: TransformStamped | None = None
             self._log.info("the result is broadcast on /tf_static from now on")
-        transform = to_transform(result, *result.mounting)
+        transform = to_transform(result, is_mounting=True)
         if transform != self._sent:
             self._sent = transform
             self._tree.own.append(transform)
             self._publisher.publish(message_type()(transforms=[transform]))
-
-
-def what_is_unknown(calibration: Calibration) -> str:
-    """What a result lacks to be a whole transform that may be used; empty if nothing."""
-    if calibration.verdict is Verdict.DO_NOT_USE:
-        return calibration.headline
-    rough = [
-        dof.name
-        for dof in calibration.observability
-        if not math.isfinite(dof.sigma)
-        or (dof.verdict is not DofVerdict.PRIOR and dof.sigma > target_of(dof.name, calibration))
-    ]
-    return f"{axes_in_words(rough)} not known to the target" if rough else ""

@@ -24,10 +24,8 @@ from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.text import counted
 from hand_eye_calib.watch.board import Board
 
-# New nodes are looked for so often (s), and so many are listened to.
-_LOOK_S, _MOST_NODES = 1.0, 50
-# Most topics that are told of.
-_MOST_TOPICS = 12
+# New nodes are looked for so often (s), so many are listened to, and so many topics are told of.
+_LOOK_S, _MOST_NODES, _MOST_TOPICS = 1.0, 50, 12
 
 # A service that has not answered for so long will not (s): a solve takes seconds.
 _PATIENCE_S = 60.0
@@ -75,13 +73,12 @@ class Watcher:
             name, is_parameter, value = request.partition(":=")
             kind, message = Trigger, Trigger.Request()
             if is_parameter:
-                given = {"true": True, "false": False}.get(value, value)
-                parameter = Parameter(name, value=given).to_parameter_msg()
-                kind, message = SetParameters, SetParameters.Request(parameters=[parameter])
-                name = "set_parameters"
+                parameter = Parameter(name, value=False if value == "false" else value)
+                message = SetParameters.Request(parameters=[parameter.to_parameter_msg()])
+                kind, name = SetParameters, "set_parameters"
             client = self._node.create_client(kind, f"{self._board.node}/{name}")
             self._asked[request] = client, message, None, time.monotonic()
-            self._answer(request, None, "asked ...")
+            self._board.answer(request, None, "asked ...", time.monotonic())
 
     def _look(self) -> None:
         """Listen to nodes that are new: anybody may have a topic of that name. And note the topics
@@ -117,19 +114,17 @@ class Watcher:
             self._asked[request] = client, message, client.call_async(message), asked_s
         elif future is not None and future.done():
             response: Any = future.result()
-            if client.srv_type is Trigger:
-                self._end(request, response.success, response.message)
+            if client.srv_type is SetParameters:
+                (result,) = response.results
+                self._end(request, result.successful, result.reason)
             else:
-                self._end(request, response.results[0].successful, response.results[0].reason)
+                self._end(request, response.success, response.message)
         elif time.monotonic() - asked_s > _PATIENCE_S:
             self._end(request, False, f"no answer within {_PATIENCE_S:.0f} s")
 
     def _end(self, request: str, good: bool, text: str) -> None:
         self._node.destroy_client(self._asked.pop(request)[0])
-        self._answer(request, good, printable(text) or "done")
-
-    def _answer(self, request: str, good: bool | None, text: str) -> None:
-        self._board.answer(request, good, text, time.monotonic())
+        self._board.answer(request, good, printable(text) or "done", time.monotonic())
 
 
 def state_of(text: str) -> NodeState | None:

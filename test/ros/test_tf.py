@@ -53,32 +53,6 @@ def calibration():
     return calibrator.estimate()
 
 
-class TestWhatIsUnknown:
-    @staticmethod
-    def with_z(calibration, verdict, sigma):
-        dofs = [*calibration.observability]
-        dofs[2] = dataclasses.replace(dofs[2], verdict=verdict, sigma=sigma)
-        return dataclasses.replace(calibration, observability=tuple(dofs))
-
-    @pytest.mark.parametrize(
-        ("verdict", "sigma", "expected"),
-        [
-            (DofVerdict.OBSERVED, 0.01, ""),
-            (DofVerdict.WEAK, 0.06, "z not known to the target"),
-            (DofVerdict.PRIOR, 0.06, ""),
-            (DofVerdict.UNOBSERVABLE, np.inf, "z not known to the target"),
-        ],
-    )
-    def test_each_axis_is_known_to_its_target_or_by_hand(
-        self, calibration, verdict, sigma, expected
-    ):
-        assert tf.what_is_unknown(self.with_z(calibration, verdict, sigma)) == expected
-
-    def test_a_result_that_may_not_be_used_is_not_broadcast(self, calibration):
-        failed = dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED)
-        assert tf.what_is_unknown(failed).startswith("DO NOT USE: the solver did not converge")
-
-
 class TestNode:
     """On the real topics, wherever tf2_msgs is installed."""
 
@@ -207,9 +181,13 @@ class TestNode:
         faulty = "the streams are faulty"
         broadcaster.add(calibration, why_not=faulty)
         assert broadcaster.state == (Broadcast.WAITING, faulty)
-        hidden = TestWhatIsUnknown.with_z(calibration, DofVerdict.WEAK, 0.06)
-        self.settle(broadcaster, hidden)
-        assert broadcaster.state == (Broadcast.REFUSED, "z not known to the target")
+        dofs = [*calibration.observability]
+        dofs[2] = dataclasses.replace(dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf)
+        self.settle(broadcaster, dataclasses.replace(calibration, observability=tuple(dofs)))
+        assert broadcaster.state == (Broadcast.REFUSED, "z not determined")
+        self.settle(broadcaster, dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED))
+        assert broadcaster.state[0] is Broadcast.REFUSED
+        assert broadcaster.state[1].startswith("DO NOT USE: the solver did not converge")
 
     @staticmethod
     def frames_of_new_listener(peer, listen, until):
