@@ -11,7 +11,7 @@ from hand_eye_calib.text import amount, told_apart
 
 if TYPE_CHECKING:
     from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.session.compare import Comparison
+    from hand_eye_calib.results.records import Comparison
 
 _EPILOG = """\
 examples:
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare; returns the exit code."""
     from hand_eye_calib.io.results import load_result
     from hand_eye_calib.plain import json_text
-    from hand_eye_calib.session.compare import Change, compare
+    from hand_eye_calib.session.compare import compare
 
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):
@@ -58,10 +58,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"expected different results; got {', '.join(names)}")
     found = compare(results, installed, names)
     if arguments.json:
-        print(json_text(found.to_dict()))
+        print(json_text(found))
     else:
         print("\n".join(printable(line) for line in _lines(found, results[0])))
-    return {Change.SAME: 0, Change.MOVED: 4}.get(found.verdict, 3)
+    return {"same": 0, "moved": 4}.get(found.verdict, 3)
 
 
 def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
@@ -70,7 +70,6 @@ def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
         sentence = "" if len(found.differences) == 1 else each.sentence
         yield f"{each.second} minus {each.first}: {sentence}".rstrip(": ")
         yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
-        for axis, row in each.to_dict()["axes"].items():
-            numbers = (row["difference"], row["sigma"], row["visible"])
-            cells = ["unknown" if value is None else amount(axis, value) for value in numbers]
-            yield f"  {axis:<6}{cells[0]:>12}{cells[1]:>10}{cells[2]:>12}  {row['verdict']}"
+        for axis, row in each.axes.items():
+            sizes = [amount(axis, size) for size in (row.difference, row.sigma, row.visible)]
+            yield f"  {axis:<6}{sizes[0]:>12}{sizes[1]:>10}{sizes[2]:>12}  {row.verdict}"

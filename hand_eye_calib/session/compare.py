@@ -1,86 +1,32 @@
 """Has the mount moved? A result against what is installed, or the results of several recordings."""
 
-from __future__ import annotations
-
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.assessment.moved import UNKNOWN, Change, Moved, moved, scatter_of_recordings
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_recordings
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
-from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
-from hand_eye_calib.results.records import Comparison as Installed
+from hand_eye_calib.results.records import AxisDifference, Comparison, Difference
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.session.agreement import Kind
 from hand_eye_calib.session.together import agreement_of_results, require_same_frames
 from hand_eye_calib.text import listing
 
+_Named = tuple[str, Calibration | Extrinsic]
+
 # An axis is the same if changes of so many targets would have been seen.
 _TARGETS = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Difference(Moved):
-    """How an extrinsic differs from another: second minus first; see Moved.
-
-    Attributes
-    ----------
-    first, second : str
-        What is compared.
-    """
-
-    first: str
-    second: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
-        names = ("difference", "sigma", "visible", "verdict")
-        verdicts = [each.value for each in self.verdicts]
-        rows = zip(self.values, self.sigmas, self.visible, verdicts, strict=True)
-        axes = {
-            axis: plain(dict(zip(names, row, strict=True)))
-            for axis, row in zip(AXES, rows, strict=True)
-        }
-        taken = {name: getattr(self, name) for name in ("first", "second", "sentence", "chi2")}
-        return taken | {"verdict": self.verdict.value, "axes": axes}
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The differences of results from what is installed, or of each from each.
-
-    Attributes
-    ----------
-    differences : tuple of Difference
-    moved : tuple of str
-        Results after whose removal the others agree; those that differ from what is installed.
-    verdict : Change
-    sentence : str
-    """
-
-    differences: tuple[Difference, ...]
-    moved: tuple[str, ...]
-    verdict: Change
-    sentence: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
-        differences = [each.to_dict() for each in self.differences]
-        told = {"verdict": self.verdict.value, "sentence": self.sentence}
-        return told | {"moved": list(self.moved), "differences": differences}
-
-
 def compare(
-    results: Sequence[Calibration | Extrinsic],
+    results: Sequence[Calibration],
     installed: Calibration | Extrinsic | None = None,
     names: Sequence[str] | None = None,
 ) -> Comparison:
@@ -94,6 +40,13 @@ def compare(
     names : sequence of str, optional
         What to call the results; numbered by default.
 
+    Returns
+    -------
+    Comparison
+        The differences from what is installed, or of each result from each; ``verdict`` is "same",
+        "moved" or "cannot tell". ``moved`` names the results that differ from what is installed, or
+        without which the others agree.
+
     Raises
     ------
     InputError
@@ -101,98 +54,92 @@ def compare(
 
     Examples
     --------
-    >>> hec.compare([result], installed=result).verdict.value
+    >>> hec.compare([result], installed=result).verdict
     'same'
     """
     called = list(names) if names else [f"result {i}" for i in range(1, len(results) + 1)]
     if len(called) != len(results) or len(set(called)) != len(called):
         raise InputError(f"expected {len(results)} different names, found {len(called)}")
-    calibrations = [each for each in results if isinstance(each, Calibration)]
     require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
-    targets = [target_of(axis, each) for each in calibrations[:1] for axis in AXES]
-    limits = _TARGETS * np.array(targets or CalibratorConfig().targets)
-    stated = [_stated(result, name) for result, name in zip(results, called, strict=True)]
-    couples = list(itertools.combinations(stated, 2))
+    named = list(zip(called, results, strict=True))
+    couples: list[tuple[_Named, _Named]] = [*combinations(named, 2)]
     if installed is not None:
-        couples = [(_stated(installed, "installed"), each) for each in stated]
+        couples = [(("installed", installed), each) for each in named]
     if not couples:
         raise InputError("expected two results or more, or one and what is installed")
+    limits = _TARGETS * np.array([target_of(axis, results[0]) for axis in AXES])
     differences = tuple(_difference(*couple, limits) for couple in couples)
-    verdict = Change.of_all([each.verdict for each in differences])
-    moved_names = tuple(each.second for each in differences if each.verdict is Change.MOVED)
-    sentence = f"moved: {listing(moved_names)} of {len(stated)}"
+    verdict = Change.of_all([Change(each.verdict) for each in differences]).value
+    apart = [each for each in differences if each.verdict == Change.MOVED]
+    of_all, who = f"{len(results)}", tuple(each.second for each in apart)
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
-    elif not moved_names:
+    elif not apart:
         beside = "another" if installed is None else "what is installed"
-        sentence = f"{verdict.value}: none of {len(stated)} differs from {beside}"
-    elif installed is None:
-        moved_names, sentence = _who_moved(called, calibrations, differences)
-    return Comparison(differences, moved_names, verdict, sentence)
-
-
-def _who_moved(
-    names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
-) -> tuple[tuple[str, ...], str]:
-    """The one without which the others agree; or those from some recording on. Nobody, if neither
-    explains the differences.
-    """
-    if len(results) == len(names) > 2:
+        sentence = f"{verdict}: none of {of_all} differs from {beside}"
+    elif installed is not None:
+        sentence = f"moved: {listing(who)} of {of_all}"
+    else:
         # Two differ, so that less evidence says which.
         found = agreement_of_results(results, level=0.05)
-        moved_names = tuple(names[index] for index in found.apart)
-        if found.kind is Kind.ONE_OFF:
-            return moved_names, f"moved: {moved_names[0]} differs, the others agree"
-        if found.kind is Kind.MOVED:
-            between = f"{names[found.apart[0] - 1]} and {moved_names[0]}"
-            return moved_names, f"moved between {between}: {listing(moved_names)}"
-    apart = [each for each in differences if each.verdict is Change.MOVED]
-    pairs = listing([f"{each.first} and {each.second}" for each in apart])
-    return (), f"moved: {pairs} differ; which of them has moved, they do not tell"
+        pairs = listing([f"{each.first} and {each.second}" for each in apart])
+        who, told = (), f"{pairs} differ; which of them has moved, they do not tell"
+        if found.kind in (Kind.ONE_OFF, Kind.MOVED):
+            who, told = tuple(called[index] for index in found.apart), found.sentence(called)
+        sentence = f"moved: {told}"
+    return Comparison(sentence=sentence, verdict=verdict, moved=who, differences=differences)
 
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
     """The result with its comparison with what is installed."""
-    document: dict[str, Any] = compare([result], installed, ["result"]).to_dict()
-    document["installed"] = installed.origin if isinstance(installed, Extrinsic) else "a result"
-    stated = installed if isinstance(installed, Extrinsic) else _stated(installed, "").extrinsic
-    document["values"] = dict(zip(AXES, stated.values.tolist(), strict=True))
-    return replace(result, comparison=from_plain(Installed, document))
+    stated = installed
+    if isinstance(stated, Calibration):
+        stated = Extrinsic(stated.T_parent_child, "a result")
+    values = dict(zip(AXES, stated.values.tolist(), strict=True))
+    found = compare([result], installed, ["result"])
+    return replace(result, comparison=replace(found, installed=stated.origin, values=values))
 
 
-class _Stated(NamedTuple):
-    """An extrinsic; along and about the parent's axes its covariance, how recordings of its rig
-    scatter, and its floor.
-    """
-
-    name: str
-    extrinsic: Extrinsic
-    covariance: FloatArray
-    scatter: FloatArray
-    floor: FloatArray
-
-
-def _stated(given: Calibration | Extrinsic, name: str) -> _Stated:
-    X, floor, hidden = given.T_parent_child, np.zeros((6, 6)), np.zeros(6, dtype=bool)
-    to_parent = np.kron(np.eye(2), X[:3, :3])
-    if isinstance(given, Calibration):
-        if given.floor is not None:
-            floor = to_parent @ given.floor @ to_parent.T
-        hidden = np.array([dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability])
-        given = Extrinsic(X, name, given.covariance, is_calibration=True)
-    unknown = np.diag(UNKNOWN**2)
-    is_known = bool(np.isfinite(given.covariance).all())
-    covariance = to_parent @ given.covariance @ to_parent.T if is_known else unknown
-    covariance = covariance + np.where(hidden, unknown, 0.0)
-    scatter = scatter_of_recordings(covariance) if given.is_calibration else np.zeros((6, 6))
-    return _Stated(name, given, covariance, scatter, floor)
-
-
-def _difference(first: _Stated, second: _Stated, limits: FloatArray) -> Difference:
-    values = deviation(second.extrinsic.T_parent_child, first.extrinsic.T_parent_child)
-    scatter, floor = first.scatter + second.scatter, first.floor + second.floor
-    if not (first.extrinsic.is_calibration and second.extrinsic.is_calibration):
+def _difference(first: _Named, second: _Named, limits: FloatArray) -> Difference:
+    (first_name, one), (second_name, two) = first, second
+    covariance, scatter, floor = _spread(one) + _spread(two)
+    if not (_is_found(one) and _is_found(two)):
         # What is the same in all recordings is in one of both only: the larger of both, by axis.
         scatter = floor + np.diag(np.maximum(np.diag(scatter - floor), 0.0))
-    found = moved(values, first.covariance + second.covariance + scatter, limits)
-    return Difference(**vars(found), first=first.name, second=second.name)
+    values = deviation(two.T_parent_child, one.T_parent_child)
+    found = moved(values, covariance + scatter, limits)
+    columns = (found.values.tolist(), found.sigmas.tolist(), found.visible.tolist())
+    rows = zip(*columns, (each.value for each in found.verdicts), strict=True)
+    return Difference(
+        first=first_name,
+        second=second_name,
+        verdict=found.verdict.value,
+        sentence=found.sentence,
+        chi2=found.chi2,
+        axes={
+            axis: AxisDifference(difference=value, sigma=sigma, visible=visible, verdict=verdict)
+            for axis, (value, sigma, visible, verdict) in zip(AXES, rows, strict=True)
+        },
+    )
+
+
+def _is_found(given: Calibration | Extrinsic) -> bool:
+    """Whether it was found from motion, with the same sensors."""
+    return isinstance(given, Calibration) or given.is_calibration
+
+
+def _spread(given: Calibration | Extrinsic) -> FloatArray:
+    """Covariance (6, 6) along and about the parent's axes, how recordings of its rig scatter, and
+    its floor, stacked.
+    """
+    to_parent = np.kron(np.eye(2), given.T_parent_child[:3, :3])
+    covariance, floor = np.diag(UNKNOWN**2), np.zeros((6, 6))
+    if np.isfinite(given.covariance).all():
+        covariance = to_parent @ given.covariance @ to_parent.T
+    if isinstance(given, Calibration):
+        hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
+        covariance = covariance + np.diag(np.where(hidden, UNKNOWN**2, 0.0))
+        if given.floor is not None:
+            floor = to_parent @ given.floor @ to_parent.T
+    scatter = scatter_of_recordings(covariance) if _is_found(given) else np.zeros((6, 6))
+    return np.array([covariance, scatter, floor])

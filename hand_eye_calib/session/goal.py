@@ -6,9 +6,7 @@ not shown yet in a short recording. The rule was measured on recordings with kno
 docs/session.md.
 """
 
-from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +15,7 @@ from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.records import AxisProgress, Progress
 from hand_eye_calib.results.status import AXES
-from hand_eye_calib.text import amount, angle, axes_in_words, duration, length
+from hand_eye_calib.text import angle, axes_in_words, duration, length
 
 # An axis is known if its standard deviation is below this share of its target ...
 _SHARE = 0.7
@@ -35,19 +33,8 @@ _STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, 
 # own are larger by more than this factor.
 _AS_GOOD = 1.25
 
-# The motion will not get there if it would take longer than this (s), ...
+# The motion will not get there if it would take longer than this (s).
 _TOO_LONG_S = 1200.0
-# ... or if, over so many seconds of motion, the information on the worst axis has grown by less
-# than this share of what the motion before would have brought.
-_STALL_S, _STALL_GROWTH = 60.0, 0.25
-
-
-class _Point(NamedTuple):
-    """One result: seconds of motion, and the information on the worst axis (1 suffices)."""
-
-    motion_s: float
-    information: float
-    is_known: bool
 
 
 class Goal:
@@ -74,7 +61,7 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        self._points: deque[_Point] = deque(maxlen=10_000)
+        self._motion_s, self._n_known = -1.0, 0
         self.best: Calibration | None = None
         self._best_information = 0.0
         self._steps = np.full(6, len(_STEPS_S) - 1)
@@ -82,7 +69,7 @@ class Goal:
 
     def wait(self, sentence: str) -> None:
         """Take note that there is no result yet, and why."""
-        if not self._points:
+        if self._motion_s < 0:
             self.progress = self._nothing_yet(sentence)
 
     def add(
@@ -98,15 +85,8 @@ class Goal:
         faults : sequence of str
             What the stream checks found; the goal is not reached while there is something.
         """
-        wanted = _SHARE * self._targets
-        # What somebody measured by hand, no motion would tell better; some streams never show all.
-        exempt = np.isin(AXES, calibration.out_of_reach)
-        exempt |= [dof.verdict is DofVerdict.PRIOR for dof in calibration.observability]
-        # What the common-mode floor leaves of the target; a floor above it cannot be driven away.
-        room = np.maximum(wanted**2 - calibration.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
-        ratios = np.where(exempt, 0.0, calibration.sigmas**2 / room)
-        worst = int(np.argmax(ratios))
-        motion_s = seen.motion_s
+        ratios = self._ratios(calibration)
+        worst, motion_s = int(np.argmax(ratios)), seen.motion_s
         if not faults:  # errors that the result has of its own, as one of positions or rates
             found = [each for each in calibration.reasons if each.is_finding]
             faults = [one.sentence for one in found if one.verdict is Verdict.DO_NOT_USE]
@@ -114,51 +94,43 @@ class Goal:
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
         least_s = _least_motion_s(calibration)
         is_known = bool(is_within) and motion_s >= least_s
-        point = _Point(motion_s, 1.0 / max(ratios[worst], 1e-12), is_known)
         # Every result of a robot that stands still is the same result.
-        if not self._points or motion_s > self._points[-1].motion_s:
-            self._points.append(point)
-        if is_within:
-            self._keep_best(calibration, point)
+        if motion_s > self._motion_s:
+            self._motion_s, self._n_known = motion_s, self._n_known + 1 if is_known else 0
+        information = 1.0 / max(ratios[worst], 1e-12)
+        may_end = self.best is not None or (is_known and self._n_known >= _RESULTS)
+        if is_within and may_end and information * _AS_GOOD**2 >= self._best_information:
+            self.best = calibration
+            self._best_information = max(information, self._best_information)
         # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(least_s - motion_s, 0.0))
         is_done = self.best is not None
-        stuck = not is_done and self._is_stuck(float(left_s[worst]))
+        stuck = not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _TOO_LONG_S
         left_s = self._told(left_s)
-        sentence = self._sentence(calibration, seen, faults, AXES[worst], left_s[worst], stuck)
+        sentence = self._sentence(
+            calibration, seen, faults, AXES[worst], left_s[worst], bool(stuck)
+        )
         self.progress = Progress(
             sentence=sentence,
             done=is_done and not faults,
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
-            will_not_get_there=stuck,
+            will_not_get_there=bool(stuck),
             axes=self._by_axis(calibration.sigmas_with_floor, np.zeros(6) if is_done else left_s),
         )
         return self.progress
 
-    def _keep_best(self, calibration: Calibration, point: _Point) -> None:
-        recent = list(self._points)[-_RESULTS:]
-        is_first = self.best is None
-        are_known = len(recent) == _RESULTS and all(each.is_known for each in (*recent, point))
-        if is_first and not are_known:
-            return
-        if point.information * _AS_GOOD**2 >= self._best_information:
-            self.best = calibration
-            self._best_information = max(point.information, self._best_information)
-
-    def _is_stuck(self, left_s: float) -> bool:
-        newest = self._points[-1]
-        if newest.motion_s < _MIN_MOTION_S:
-            return False
-        if left_s > _TOO_LONG_S:
-            return True
-        earlier = [p for p in self._points if p.motion_s <= newest.motion_s - _STALL_S]
-        if not earlier or earlier[-1].motion_s < _MIN_MOTION_S:
-            return False
-        before = earlier[-1]
-        expected = newest.motion_s / before.motion_s - 1.0
-        return newest.information < before.information * (1.0 + _STALL_GROWTH * expected)
+    def _ratios(self, calibration: Calibration) -> FloatArray:
+        """Variances (6,) over what the common-mode floor leaves of the targets: a floor above them
+        cannot be driven away.
+        """
+        wanted = _SHARE * self._targets
+        room = np.maximum(wanted**2 - calibration.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
+        # What somebody measured by hand, no motion would tell better; some streams never show all.
+        exempt = np.isin(AXES, calibration.out_of_reach)
+        exempt |= [dof.verdict is DofVerdict.PRIOR for dof in calibration.observability]
+        return np.asarray(np.where(exempt, 0.0, calibration.sigmas**2 / room))
 
     def _told(self, left_s: FloatArray) -> FloatArray:
         """The steps (6,) that are told of these times: estimates jump, and a person who is told 4
@@ -195,8 +167,7 @@ class Goal:
         if calibration.status.failure:
             return f"No usable result: {calibration.status.failure}."
         if self.best is not None:
-            floor = _beyond_target(self.best, self._targets)
-            return f"Done: {_precision(self.best)}. Stop and save.{floor}"
+            return f"Done: {_precision(self.best)}. Stop and save."
         motion, called = helpful_motion([axis], seen), axes_in_words([axis])
         if stuck:
             return f"This motion will not determine {called} well enough: {motion}."
@@ -210,7 +181,7 @@ def _least_motion_s(calibration: Calibration) -> float:
     """Seconds of motion below which a standard deviation is not believed."""
     lasting = calibration.noise.lasting if calibration.noise else ()
     slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
-    return max(_MIN_MOTION_S, _CORRELATION_TIMES * float(slowest_s))
+    return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
 
 
 def _precision(calibration: Calibration) -> str:
@@ -220,16 +191,3 @@ def _precision(calibration: Calibration) -> str:
         if not {*AXES[of_kind]} & {*calibration.out_of_reach}:
             told.append(f"{kind} known to {say(sigmas[of_kind].max())}")
     return f"{', '.join(told)} (one sigma)"
-
-
-def _beyond_target(calibration: Calibration, targets: FloatArray) -> str:
-    """A note on errors that more motion does not average out, if they exceed the target."""
-    floor = calibration.sigmas_of_floor
-    told = [
-        f"{axis} {amount(axis, sigma)}"
-        for axis, sigma, target in zip(AXES, floor, targets, strict=True)
-        if sigma > target
-    ]
-    if not told:
-        return ""
-    return f" Constant odometry errors, which no motion shows, add {', '.join(told)}."

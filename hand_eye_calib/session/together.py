@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # Values of a result that are in its row as they are.
-TAKEN = (
+_TAKEN = (
     *("verdict", "headline", "status", "parent_frame", "child_frame"),
     *("method", "reference", "n_poses", "n_pairs", "n_inliers"),
     *("time_offset_s", "time_offset_sigma_s", "scale", "scale_sigma"),
@@ -127,7 +127,7 @@ def _named(names: Sequence[str] | None) -> Iterator[str]:
 def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
     """The row of a result, from what its ``to_dict`` gave; what is not known is None."""
     transform = calibration["T_parent_child"]
-    row: dict[str, Any] = {name: calibration[name] for name in TAKEN[:5]}
+    row: dict[str, Any] = {name: calibration[name] for name in _TAKEN}
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
     columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
     values = [*transform["translation"], *transform["rpy_deg"]]
@@ -135,8 +135,7 @@ def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
     for column, value, sigma in zip(columns, values, sigmas, strict=True):
         is_known = sigma is not None and math.isfinite(sigma)
         row |= {column: value, f"sigma_{column}": sigma if is_known else None}
-    row |= {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
-    return row | {name: calibration[name] for name in TAKEN[5:]}
+    return row | {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
 
 
 def together(results: Mapping[str, Calibration]) -> Calibration:

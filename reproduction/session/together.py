@@ -15,7 +15,7 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.session.compare import Change, compare
+from hand_eye_calib.session.compare import compare
 from hand_eye_calib.session.together import together
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.recordings import Rig, Truth
@@ -101,7 +101,7 @@ def tables(rigs: Sequence[Recorded], seed: int) -> str:
             cases, named = cases + 1, named + (out == {foreign})
             wrong += bool(out - {foreign})
         for couple in combinations(each.results.values(), 2):
-            pairs, moved = pairs + 1, moved + (compare(couple).verdict is Change.MOVED)
+            pairs, moved = pairs + 1, moved + (compare(couple).verdict == "moved")
     return (
         f"{markdown_table(rows)}\n\nOf {cases} sets of three or six recordings, one of them with "
         f"the mount knocked by {100 * _KNOCK_M:g} cm and {np.degrees(_KNOCK_RAD):g} deg, that one "

@@ -49,7 +49,7 @@ def saved(tmp_path, monkeypatch):
         (["third", "--with", "robot.urdf"], 4, "moved: y by "),
         (["flat", "--with", "first"], 3, "cannot tell about x, y and z; roll, pitch"),
         (["first", "second"], 0, "same: none of 2 differs"),
-        (["first", "second", "third"], 4, "moved: third differs, the others agree"),
+        (["first", "second", "third"], 4, "moved: third differs from the others: y by "),
         (["first", "third", "--with", "second"], 4, "moved: third of 2"),
     ],
 )

@@ -16,58 +16,61 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.status import AXES
-from hand_eye_calib.session.compare import (
-    Change,
-    compare,
-    with_comparison,
-)
+from hand_eye_calib.session.compare import compare, with_comparison
+
+
+def values(difference):
+    return np.array([each.difference for each in difference.axes.values()])
+
+
+def axes(difference, verdict):
+    return [axis for axis, each in difference.axes.items() if each.verdict == verdict]
 
 
 def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told():
     found = compare([result(seed=1), result(seed=2), result(seed=3)])
-    assert (found.verdict, found.moved) == (Change.SAME, ())
+    assert (found.verdict, found.moved) == ("same", ())
     one = found.differences[0]
     assert one.sentence == "same: a change of 5.4 cm or 0.8 deg would have been seen"
     np.testing.assert_allclose(
-        one.values, deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child)
+        values(one), deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child)
     )
 
 
 def test_chance_makes_a_change_less_than_once_in_a_hundred():
     moved = [
-        compare([result(seed=2 * i), result(seed=2 * i + 1)]).verdict is Change.MOVED
-        for i in range(150)
+        compare([result(seed=2 * i), result(seed=2 * i + 1)]).verdict == "moved" for i in range(150)
     ]
     assert sum(moved) <= 2
 
 
 @pytest.mark.parametrize("axis", AXES)
 def test_a_change_of_the_size_that_is_said_to_be_seen_is_seen(axis):
-    seen = compare([result(), result()]).differences[0].visible[AXES.index(axis)]
+    seen = compare([result(), result()]).differences[0].axes[axis].visible
     found = [
         compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[0]
         for i in range(20)
     ]
-    named = [axis in each.axes(Change.MOVED) for each in found]
+    named = [each.axes[axis].verdict == "moved" for each in found]
     assert np.mean(named) >= 0.9  # sigmas are taken larger than stated
 
 
 def test_an_unknown_axis_is_neither_the_same_nor_moved():
     flat = result(shift("z", 0.5), hidden="z", status=SolveStatus.UNOBSERVABLE)
     found = compare([flat], Extrinsic(X, "drawing")).differences[0]
-    assert found.verdict is Change.CANNOT_TELL
-    assert found.axes(Change.CANNOT_TELL) == ["z"]
-    assert np.isinf(found.sigmas[2])
+    assert found.verdict == "cannot tell"
+    assert axes(found, "cannot tell") == ["z"]
+    assert np.isinf(found.axes["z"].sigma)
     assert found.sentence.startswith("cannot tell about z; x, y, roll, pitch and yaw the same: ")
 
 
 def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
     floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.2) ** 2)])
     first, second = result(floor=floor), result(shift("yaw", np.radians(0.6)), floor=floor)
-    assert compare([second], Extrinsic(X, "drawing")).verdict is Change.SAME
-    assert compare([first, second]).verdict is Change.MOVED
+    assert compare([second], Extrinsic(X, "drawing")).verdict == "same"
+    assert compare([first, second]).verdict == "moved"
     known = Extrinsic(X, "earlier result", first.covariance, is_calibration=True)
-    assert compare([second], known).differences[0].axes(Change.MOVED) == ["yaw"]
+    assert axes(compare([second], known).differences[0], "moved") == ["yaw"]
 
 
 def test_what_a_flight_alone_is_off_by_is_no_move():
@@ -75,8 +78,8 @@ def test_what_a_flight_alone_is_off_by_is_no_move():
     flight = real_data.euroc("vio_stereo", "v2_01")
     published = Extrinsic(real_data.EUROC_TRUTH, "published")
     found = compare([hec.calibrate(flight.parent, flight.child)], published).differences[0]
-    assert found.values[1] == pytest.approx(0.015, abs=0.002)
-    assert found.verdict is Change.SAME
+    assert found.axes["y"].difference == pytest.approx(0.015, abs=0.002)
+    assert found.verdict == "same"
 
 
 @pytest.mark.parametrize("sigma_z", [0.002, 0.05], ids=["in hand", "vehicle"])
@@ -90,24 +93,24 @@ def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
             result(sigmas=sigmas, seed=seed, floor=floor),
             result(moved, sigmas=sigmas, seed=100 + seed, floor=floor),
         )
-        assert AXES[axis + 3] in compare([first, second]).differences[0].axes(Change.MOVED)
+        assert AXES[axis + 3] in axes(compare([first, second]).differences[0], "moved")
         against = compare([second], Extrinsic(X, "drawing")).differences[0]
-        assert AXES[axis + 3] in against.axes(Change.MOVED)
+        assert AXES[axis + 3] in axes(against, "moved")
 
 
 def test_an_axis_is_the_same_by_its_own_target():
     rough, drawing = result(), Extrinsic(X, "drawing")
-    assert compare([rough], drawing).verdict is Change.SAME
+    assert compare([rough], drawing).verdict == "same"
     strict = dataclasses.replace(rough, target_axes={"y": 0.001})
-    assert compare([strict], drawing).differences[0].axes(Change.CANNOT_TELL) == ["y"]
+    assert axes(compare([strict], drawing).differences[0], "cannot tell") == ["y"]
 
 
 @pytest.mark.parametrize(
     ("have_moved", "named", "sentence"),
     [
-        ("010", ("drive 2",), "moved: drive 2 differs, the others agree"),
-        ("0011", ("drive 3", "drive 4"), "between drive 2 and drive 3: drive 3 and drive 4"),
-        ("01", (), "drive 1 and drive 2 differ; which of them has moved, they do not tell"),
+        ("010", ("drive 2",), "moved: drive 2 differs from the others: the rotation about y by "),
+        ("0011", ("drive 3", "drive 4"), "moved: The mount has moved before drive 3: "),
+        ("01", (), "moved: drive 1 and drive 2 differ; which of them has moved, they do not tell"),
     ],
 )
 def test_which_one_moved(have_moved, named, sentence):
@@ -117,7 +120,7 @@ def test_which_one_moved(have_moved, named, sentence):
         names=[f"drive {i + 1}" for i in range(len(have_moved))],
     )
     assert found.moved == named
-    assert found.sentence.endswith(sentence)
+    assert found.sentence.startswith(sentence)
 
 
 def test_files_and_python_speak_of_the_same(tmp_path):
@@ -127,7 +130,7 @@ def test_files_and_python_speak_of_the_same(tmp_path):
     assert again.comparison == changed.comparison
     assert again.comparison.verdict == "moved"
     assert again.comparison.installed == "drawing"
-    assert hec.compare([again], Extrinsic(X, "drawing")).to_dict()["moved"] == ["result 1"]
+    assert hec.compare([again], Extrinsic(X, "drawing")).moved == ("result 1",)
     json.dumps(again.to_dict()["comparison"], allow_nan=False)
 
 

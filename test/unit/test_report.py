@@ -353,7 +353,8 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     shown = page.text[page.text.index("axis of lidar difference") : page.text.rindex("Evidence")]
     (difference,) = hec.compare([calibration], installed).differences
     assert compared.comparison.sentence in page.text
-    sigma, visible = (amount("x", size[0]) for size in (difference.sigmas, difference.visible))
+    along_x = difference.axes["x"]
+    sigma, visible = amount("x", along_x.sigma), amount("x", along_x.visible)
     assert f"along x -50 cm ± {sigma} {visible} moved along y" in shown
     assert "along z 0 mm ± unknown unknown cannot tell about x" in shown
     assert shown.count("deg same") == 3
