@@ -62,6 +62,8 @@ def rendered(
 
 def write_report(directory: Path, render: Callable[[], str]) -> None:
     """Write the report that a function gives, such as :func:`rendered`."""
+    from hand_eye_calib.io.results import save_text
+
     with waiting_for(f"writing {REPORT}"):
         save_text(directory / REPORT, render())
     note(f"wrote {directory / REPORT}")
@@ -72,14 +74,6 @@ def rendered_rig(rig: "RigCalibration", names: Any) -> str:
     from hand_eye_calib.report.rig_page import render_rig
 
     return render_rig(rig, names)
-
-
-def save_text(path: Path, text: str) -> None:
-    """Write a file in one step, into a directory that is made if it is missing."""
-    from hand_eye_calib.io.files import write_atomically
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically({path: text})
 
 
 # ----------------------------------------------------------- a session's pages

@@ -96,6 +96,13 @@ def save_rig(
     return _written(Path(directory), texts)
 
 
+def save_text(path: Path, text: str) -> Path:
+    """Write a file in one step, into a directory that is made if it is missing; returns its path.
+    Raises InputError if it cannot be written.
+    """
+    return _written(path.parent, {path.name: text})
+
+
 def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     """Write the texts into a directory by their names, all or none, and remove what has none;
     returns the last file.

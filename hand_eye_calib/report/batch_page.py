@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.errors import printable
 from hand_eye_calib.report.figures import Drawn
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.style import (
@@ -37,8 +38,8 @@ _TO_SHOWN = np.repeat([1000.0, np.degrees(1.0)], 3)
 # A band of the common value in its own standard deviations.
 _BAND = 2.0
 _GRAVITY = ("bad", "warn", "good")
-# More would make the page too large for a browser; rows.csv has all.
-_MOST_ROWS, _MOST_VEHICLES, _MOST_FIGURES = 1000, 40, 12
+# More would make the page too large for a browser.
+_MOST_VEHICLES, _MOST_FIGURES = 40, 12
 
 
 def render_batch(
@@ -65,21 +66,22 @@ def render_batch(
     str
         The gravest recordings and vehicles first.
     """
-    cells = [_cells(row, row["name"] in with_report) for row in rows]
-    counts = Counter(cell["verdict"] for cell in cells)
-    cells.sort(key=lambda cell: _GRAVITY.index(cell["tone"]))
+    cells = sorted(
+        (_cells(row, row["name"] in with_report) for row in rows),
+        key=lambda cell: _GRAVITY.index(TONES.get(cell[2], "bad")),
+    )
+    counts = Counter(cell[2] for cell in cells)
     ordered = sorted(vehicles.items(), key=lambda one: _GRAVITY.index(TONES[one[1].verdict.value]))
     return page(
         "batch.html",
-        cells[0]["tone"],
+        TONES.get(cells[0][2], "bad"),
         counted(len(rows), "recording"),
         listing([f"{count} {verdict}" for verdict, count in counts.most_common()]),
         batch=title.rpartition("/")[2],
-        left_out=max(0, len(rows) - _MOST_ROWS),
         vehicles_left_out=max(0, len(ordered) - _MOST_VEHICLES),
         vehicles=[_vehicle(*one, n) for n, one in enumerate(ordered[:_MOST_VEHICLES], start=1)],
-        rows=cells[:_MOST_ROWS],
-        with_vehicles=len({row["vehicle"] for row in rows}) > 1,
+        rows=cells,
+        tones=TONES,
         headings=[f"{name} {unit}" for name, unit in _AXES.items()],
     )
 
@@ -122,19 +124,15 @@ def _values(row: Plain) -> list[str]:
     ]
 
 
-def _cells(row: Plain, is_linked: bool) -> dict[str, Any]:
-    """A recording's row of the table."""
+def _cells(row: Plain, is_linked: bool) -> list[Any]:
+    """What the table shows of a recording: name, vehicle, verdict, start, whether it has a report,
+    and the values, each with its standard deviation after a space, or why there are none.
+    """
+    known = row["verdict"] is not None and not row["error"]
+    values = [text.replace(" +/- ", " ") for text in _values(row)] if known else row["error"]
+    start = (row["start"] or "").removesuffix("+00:00").replace("T", " ")
     verdict = "failed" if row["error"] else row["verdict"]
-    return {
-        "name": row["name"],
-        "vehicle": row["vehicle"],
-        "start": (row["start"] or "").removesuffix("+00:00").replace("T", " "),
-        "link": f"{row['name']}/report.html" if is_linked else "",
-        "verdict": verdict,
-        "tone": TONES.get(verdict, "bad"),
-        "why": row["error"] or row["headline"] or "",
-        "values": _values(row) if row["verdict"] is not None else [],
-    }
+    return [printable(row["name"]), row["vehicle"], verdict, start, int(is_linked), values]
 
 
 def draw_trend(result: Calibration, number: int) -> str:
@@ -142,11 +140,8 @@ def draw_trend(result: Calibration, number: int) -> str:
     time; ``number`` is that of the vehicle on the page.
     """
     recordings = result.together.recordings if result.together else ()
-    stamps_s = [each.stamp_ns * 1e-9 for each in recordings]
-    is_date = len(set(stamps_s)) > 1
-    at = np.arange(1.0, len(stamps_s) + 1)
-    if is_date:
-        at = np.array(date2num([datetime.fromtimestamp(each, UTC) for each in stamps_s]))
+    dates = [datetime.fromtimestamp(each.stamp_ns * 1e-9, UTC) for each in recordings]
+    at = np.array(date2num(dates))
     apart = np.array([bool(each.left_out) for each in recordings])
     with page_style():
         figure = new_figure(WIDTH, 3.9)
@@ -157,10 +152,9 @@ def draw_trend(result: Calibration, number: int) -> str:
             points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
             values = np.where(np.isfinite(points), points, np.nan).T
             _draw_axis(panel, at, values, band, factor, apart)
-            if is_date:
-                locator = AutoDateLocator(minticks=2, maxticks=4)
-                panel.xaxis.set_major_locator(locator)
-                panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+            locator = AutoDateLocator(minticks=2, maxticks=4)
+            panel.xaxis.set_major_locator(locator)
+            panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         return as_svg(figure, f"trend{number}")
 
 

@@ -16,7 +16,7 @@ from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.engine.evidence import Evidence, gather
 from hand_eye_calib.engine.snapshot import Snapshot
-from hand_eye_calib.errors import InputError, printable
+from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
@@ -88,26 +88,6 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
     )
 
 
-def write_report(calibration: Calibration, path: Path) -> Path:
-    """Write the report of a result that was calibrated in this process; returns the file.
-
-    Raises
-    ------
-    InputError
-        If the result has no poses, or the file cannot be written.
-    """
-    snapshot = calibration.recording if isinstance(calibration.recording, Snapshot) else None
-    if calibration.motion_residuals is None:
-        raise InputError("a result that was read from a file has no poses; calibrate again")
-    path = path / "report.html" if path.is_dir() else path
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(render(calibration, snapshot), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-    return path
-
-
 def render(
     calibration: Calibration,
     snapshot: Snapshot | None,
@@ -167,21 +147,17 @@ def _named(frame: str, known: Plain) -> str:
 
 
 def _at_distance(calibration: Calibration) -> str:
-    """What the standard deviations do to an object at a distance; empty if angles are unknown."""
-    covariance = calibration.covariance_with_floor
-    if not np.isfinite(calibration.sigmas[3:]).all():
+    """What the standard deviations do to an object at a distance; empty if one is unknown."""
+    if not np.isfinite(calibration.sigmas).all():
         return ""
-    errors = {}
-    for axis, point in zip("xyz", _DISTANCE_M * np.eye(3), strict=True):
+    errors = []
+    for point in _DISTANCE_M * np.eye(3):
         J = np.hstack([np.eye(3), -se3.skew(point)])
-        if not np.isfinite(calibration.sigmas[:3]).all():
-            J[:, :3] = 0.0  # the rotation alone
-        errors[axis] = float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
-    because = ", constant odometry errors included"
-    because += "" if J[:, :3].any() else ", by the rotation alone"
+        errors.append(np.linalg.eigvalsh(J @ calibration.covariance_with_floor @ J.T)[-1])
     return (
         f"An object {_DISTANCE_M:.0f} m from {printable(calibration.child_frame)} is misplaced by "
-        f"up to {length(max(errors.values()))} (one standard deviation{because})."
+        f"up to {length(float(np.sqrt(max(errors))))} (one standard deviation, constant odometry "
+        "errors included)."
     )
 
 

@@ -5,14 +5,12 @@ two sensors at a time close.
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from hand_eye_calib.report.figures import figure_of_views
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.status import AXES, TRANSLATIONS
 from hand_eye_calib.rig.result import RigCalibration
-from hand_eye_calib.text import counted, with_sigma
+from hand_eye_calib.text import counted, printed_angle, with_sigma
 
 
 def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
@@ -42,13 +40,13 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
 
 
 def _sensor(calibration: Calibration) -> dict[str, Any]:
-    values = {}
-    for name, row in calibration.rows().items():
-        factor, decimals = (1.0, 3) if row["unit"] == "m" else (float(np.degrees(1.0)), 2)
-        values[name] = with_sigma(factor * row["value"], factor * row["sigma"], decimals)
+    pose = calibration.to_dict()["T_parent_child"]
+    metres = zip(pose["translation"], pose["sigma_total_translation"], strict=True)
+    degrees = zip(pose["rpy_deg"], pose["sigma_total_rpy_deg"], strict=True)
+    values = [with_sigma(*one, 3) for one in metres] + [printed_angle(*one) for one in degrees]
     return {
         "name": calibration.child_frame,
         "headline": calibration.headline,
         "reasons": [f"{each.sentence}: {each.what_to_do}" for each in calibration.reasons],
-        "values": values,
+        "values": dict(zip(AXES, values, strict=True)),
     }

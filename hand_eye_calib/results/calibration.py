@@ -190,9 +190,13 @@ class Calibration(Result):
         Raises
         ------
         InputError
-            If the result was read from a file, which has no poses.
+            If the result was read from a file, which has no poses, or the report cannot be written.
         """
-        return cast(Path, upstairs("report.report", "write_report")(self, Path(path)))
+        if self.motion_residuals is None:
+            raise InputError("a result that was read from a file has no poses; calibrate again")
+        path = Path(path, "report.html") if Path(path).is_dir() else Path(path)
+        page = upstairs("report.report", "render")(self, self.recording)
+        return cast(Path, upstairs("io.results", "save_text")(path, page))
 
     def child_as_parent(self, child: Trajectory) -> Trajectory:
         """The trajectory that the parent sensor has according to the child's: with the time offset

@@ -17,8 +17,9 @@ from hand_eye_calib.cli.batch.work import Outcome, Row, Task, matching, outcomes
 from hand_eye_calib.cli.console import note, waiting_for, with_progress
 from hand_eye_calib.cli.options import options_from, sources_from
 from hand_eye_calib.cli.present import deliver, wrapped
-from hand_eye_calib.cli.reporting import REPORT, save_text
+from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.io.results import save_result, save_text
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.session.together import together
@@ -39,8 +40,6 @@ def run_batch(arguments: argparse.Namespace) -> int:
     done = _all_done(groups, arguments.vehicle or "", arguments)
     vehicles = _vehicles(done)
     if arguments.out:
-        from hand_eye_calib.io.results import save_result
-
         for name, each in vehicles.items():
             save_result(each, arguments.out / work.VEHICLES / name)
         _write_rows_and_page(arguments.out, title, done, vehicles, work.INDEX)
@@ -129,8 +128,6 @@ def stored(task: Task, directory: Path) -> Outcome | None:
 
 def _store(task: Task, outcome: Outcome, directory: Path) -> None:
     """Write the results of a task into its folder."""
-    from hand_eye_calib.io.results import save_result
-
     folder = directory / task.name
     if outcome.row["verdict"]:
         save_result(outcome.calibration, folder, outcome.inputs)
