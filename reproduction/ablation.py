@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.alignment.scale import child_scaled, settle_scale
+from hand_eye_calib.alignment.scale import settle_scale
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
@@ -81,7 +81,7 @@ def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
     options = {name: value for name, value in rig.options.items() if name != "prior"}
     snapshot = whole_snapshot(offline_config(parent, child, options), parent, child).resolved()
     pairs = snapshot.pose_pairs()
-    pairs = child_scaled(pairs, settle_scale(pairs, snapshot.config.scale).value)
+    pairs = pairs.child_scaled(settle_scale(pairs, snapshot.config.scale)[0])
     family = next((each for each in _FAMILIES if each in rig.name), rig.name)
     is_clock_free = snapshot.time_offset is not None
     return Case(family, pairs, is_clock_free, rig.truth.T_parent_child, rig.truth.sigmas)

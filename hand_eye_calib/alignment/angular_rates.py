@@ -16,12 +16,10 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.stats import quantile
 
-# Angles are taken over windows of this many sampling steps, so that the noise of single poses does
-# not hide the motion.
-_WINDOW_STEPS = 3
-_MIN_WINDOW_S = 0.2
-_MIN_STEP_S, _MAX_STEP_S = 0.02, 1.0
-_MAX_SAMPLES = 200_000
+# Angles are taken over windows of this many sampling steps, and at least so long, so that the noise
+# of single poses does not hide the motion. Sampling steps are within bounds, and at most so many.
+_WINDOW_STEPS, _MIN_WINDOW_S = 3, 0.2
+_MIN_STEP_S, _MAX_STEP_S, _MAX_SAMPLES = 0.02, 1.0, 200_000
 
 # Angular rates above those of all but this share of the windows are clipped: jumps of a stream are
 # not motion.
@@ -34,23 +32,18 @@ _MIN_OVERLAP_SHARE, _MIN_OVERLAP_S = 0.25, 5.0
 # anyway.
 _PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS = 2.0, 5.0
 
-# So many offsets are named.
-_MOST_PEAKS = 4
-
 # Streams of one body are 5 to 12 times better correlated at their offset than at any other,
 # unrelated streams at most 1.3 times (measured on sixteen real recordings).
-DISTINCT = 2.0
-CORRELATED = 0.5
+_DISTINCT, _CORRELATED = 2.0, 0.5
 
 # Smallest standard deviation of the angular rate (rad/s) that can be correlated.
 MIN_VARIATION = 0.01
 
-_ALMOST_ONE = 1 - 1e-9
-
 
 @dataclass(frozen=True)
 class Correlation:
-    """Best correlation of the angular rates of two streams, over all clock offsets.
+    """Best correlation of the angular rates of two streams, over all clock offsets; by default no
+    evidence of any.
 
     Attributes
     ----------
@@ -64,46 +57,34 @@ class Correlation:
         Time that both streams have in common at that offset.
     variation : float
         Standard deviation of the angular rate, of the stream that varies less, rad/s.
-    others_s : tuple of float
-        The next best offsets.
     """
 
-    offset_s: float
-    correlation: float
-    distinctness: float
-    overlap_s: float
-    variation: float
-    others_s: tuple[float, ...] = ()
+    offset_s: float = 0.0
+    correlation: float = 0.0
+    distinctness: float = 0.0
+    overlap_s: float = 0.0
+    variation: float = 0.0
 
     @property
     def is_clear(self) -> bool:
         """Whether the evidence suffices to trust the offset."""
         return not self.doubt()
 
-    @property
-    def is_ambiguous(self) -> bool:
-        """Whether the streams agree, but at other offsets almost as well."""
-        is_same = self.correlation >= CORRELATED and self.variation >= MIN_VARIATION
-        return is_same and self.distinctness < DISTINCT
-
     def doubt(self) -> str:
         """What is wrong with the evidence, in words; empty if nothing is."""
         if self.variation < MIN_VARIATION:
             return "the streams hardly rotate, or rotate at a constant rate"
-        if self.correlation < CORRELATED:
+        if self.correlation < _CORRELATED:
             return (
                 f"their angular rates are correlated by {self.correlation:.2f} at best "
-                f"({CORRELATED} is needed)"
+                f"({_CORRELATED} is needed)"
             )
-        if self.distinctness < DISTINCT:
+        if self.distinctness < _DISTINCT:
             return (
                 f"the best offset is only {self.distinctness:.1f} times better than the next "
-                f"({DISTINCT:g} is needed)"
+                f"({_DISTINCT:g} is needed)"
             )
         return ""
-
-
-NO_CORRELATION = Correlation(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def correlate_rates(
@@ -129,7 +110,7 @@ def correlate_rates(
         Without any evidence if a stream is too short; see :attr:`Correlation.is_clear`.
     """
     if min(len(parent), len(child)) < 4:
-        return NO_CORRELATION
+        return Correlation()
     step_s = float(np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S))
     step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
@@ -137,38 +118,29 @@ def correlate_rates(
         angular_rates(each, window_s, step_s, max_gap_s, of_speed) for each in (parent, child)
     )
     if min(np.isfinite(each).sum() for each in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
-        return NO_CORRELATION
+        return Correlation()
     lags, coefficients, overlaps = _masked_correlation(of_parent, of_child)
     durations = overlaps * step_s
     shorter_s = min(len(of_parent), len(of_child)) * step_s
     enough = durations >= max(_MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S)
     # About one independent sample a second; three degrees of freedom go into the coefficient.
-    fisher_z = np.arctanh(np.clip(coefficients, -_ALMOST_ONE, _ALMOST_ONE))
+    fisher_z = np.arctanh(np.clip(coefficients, -1 + 1e-9, 1 - 1e-9))
     significance = np.where(enough, fisher_z * np.sqrt(np.maximum(durations - 3, 0)), -np.inf)
-    peaks, rival = _peaks(significance, np.multiply(lags, step_s, dtype=float), window_s)
-    start_s = (parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
-    offsets_s = [float(start_s + (lags[k] + _vertex(coefficients, k)) * step_s) for k in peaks]
-    return Correlation(
-        offset_s=offsets_s[0],
-        correlation=float(coefficients[peaks[0]]),
-        distinctness=float(significance[peaks[0]] / max(rival, 1.0)),
-        overlap_s=float(durations[peaks[0]]),
-        variation=min(float(np.nanstd(rates)) for rates in (of_parent, of_child)),
-        others_s=tuple(offsets_s[1:]),
-    )
-
-
-def _peaks(
-    significance: FloatArray, lags_s: FloatArray, window_s: float
-) -> tuple[list[int], float]:
-    """Indices of the most significant lags that are apart, and the significance of the second."""
+    best, lags_s = int(np.argmax(significance)), np.multiply(lags, step_s, dtype=float)
     apart_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
-    left, peaks, heights = significance.copy(), [], []
-    for _ in range(_MOST_PEAKS):
-        peaks.append(int(np.argmax(left)))
-        heights.append(float(left[peaks[-1]]))
-        left[np.abs(lags_s - lags_s[peaks[-1]]) <= apart_s] = -np.inf
-    return peaks, heights[1]
+    rivals = significance[np.abs(lags_s - lags_s[best]) > apart_s]
+    # The vertex of the parabola through the best lag and its neighbours.
+    below, top, above = coefficients[np.arange(best - 1, best + 2) % len(coefficients)]
+    curvature = below - 2 * top + above
+    beside = 0.0 if curvature >= 0 else np.clip(0.5 * (below - above) / curvature, -0.5, 0.5)
+    start_s = (parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
+    return Correlation(
+        offset_s=float(start_s + (lags[best] + beside) * step_s),
+        correlation=float(top),
+        distinctness=float(significance[best] / max(rivals.max(initial=-np.inf), 1.0)),
+        overlap_s=float(durations[best]),
+        variation=min(float(np.nanstd(rates)) for rates in (of_parent, of_child)),
+    )
 
 
 def angular_rates(
@@ -227,12 +199,3 @@ def _masked_correlation(
     lags = np.arange(size)
     lags = np.where(lags < len(first), lags, lags - size)
     return lags, np.where(varied, covariance / scale, 0.0), count
-
-
-def _vertex(coefficients: FloatArray, best: int) -> float:
-    """Distance, in lags, from the best lag to the vertex of the parabola through it and its
-    neighbours.
-    """
-    below, top, above = coefficients[np.arange(best - 1, best + 2) % len(coefficients)]
-    curvature = below - 2 * top + above
-    return 0.0 if curvature >= 0 else float(np.clip(0.5 * (below - above) / curvature, -0.5, 0.5))

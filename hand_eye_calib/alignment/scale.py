@@ -1,7 +1,5 @@
 """The scale: factor from the child's unit of length to the parent's."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hand_eye_calib.alignment.similarity import (
@@ -20,9 +18,8 @@ from hand_eye_calib.stats import median
 _LAGS_S = (3.0, 1.0, 8.0)
 _MIN_PAIRS = 20
 
-# A scale differs from 1 if it is off by more than _MIN_DIFFERENCE and by _MIN_SIGMAS standard
-# deviations, and if the fit leaves less than _MAX_UNEXPLAINED_TO_DIFFER of the motion unexplained:
-# jumps in most of the motions could imitate a scale.
+# A scale differs from 1 if it is off by more than this and by so many standard deviations, and if
+# the fit leaves less than this of the motion unexplained: many jumps could imitate a scale.
 _MIN_DIFFERENCE, _MIN_SIGMAS, _MAX_UNEXPLAINED_TO_DIFFER = 0.01, 5.0, 0.1
 
 # Distances are compared between positions that are so many parts of the recording apart: far more
@@ -33,38 +30,7 @@ _PARTS = (4, 8, 16, 32)
 _SHORT, _ROUNDS = 0.3, 5
 
 
-@dataclass(frozen=True)
-class Scale:
-    """An estimated scale.
-
-    Attributes
-    ----------
-    value : float
-        Factor from the child's lengths to the parent's.
-    sigma : float
-        Standard deviation.
-    fit : SimilarityFit
-        The fit it comes from.
-    """
-
-    value: float
-    sigma: float
-    fit: SimilarityFit
-
-    @property
-    def differs(self) -> bool:
-        """Whether the lengths of the two streams differ significantly, and by enough to matter."""
-        significant = abs(self.value - 1.0) > max(_MIN_DIFFERENCE, _MIN_SIGMAS * self.sigma)
-        return significant and self.fit.unexplained_translation < _MAX_UNEXPLAINED_TO_DIFFER
-
-    @property
-    def relative_error(self) -> float:
-        """Relative standard deviation, plus the unexplained share if the fit does not hold."""
-        penalty = 0.0 if self.fit.explains_translation else self.fit.unexplained_translation
-        return self.sigma / self.value + penalty
-
-
-def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) -> Scale:
+def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
     Parameters
@@ -73,80 +39,66 @@ def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) ->
     start : SimilarityFit, optional
         Fit of the same streams to start at; a start is searched for without one.
 
-    Returns
-    -------
-    Scale
-
     Raises
     ------
     NotEnoughDataError
         If there are too few poses.
     """
-    scales: list[Scale] = []
-    fit = start
+    fits: list[SimilarityFit] = []
     for lag_s in _LAGS_S:
         pairs = pairs_over(pose_pairs, lag_s)
-        if len(pairs) < _MIN_PAIRS:
-            continue
-        fit = fit_similarity(pairs, start=fit)
-        scales.append(Scale(fit.scale, fit.scale_sigma, fit))
-    if not scales:
+        if len(pairs) >= _MIN_PAIRS:
+            fits.append(fit_similarity(pairs, start=fits[-1] if fits else start))
+    if not fits:
         raise NotEnoughDataError(
             f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "
             f"{_MIN_PAIRS} of them are {min(_LAGS_S):g} s apart; record longer, or give scale"
         )
-    return min(scales, key=lambda scale: scale.relative_error)
+    # By the relative standard deviation, plus the unexplained share if the fit does not hold.
+    return min(
+        fits,
+        key=lambda fit: (
+            fit.scale_sigma / fit.scale
+            + (0.0 if fit.explains_translation else fit.unexplained_translation)
+        ),
+    )
 
 
-def child_scaled(pose_pairs: PosePairs, factor: float) -> PosePairs:
-    """The same poses with the child's translations times ``factor``."""
-    Ts_cw_c = pose_pairs.Ts_cw_c.copy()
-    Ts_cw_c[:, :3, 3] *= factor
-    return PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, Ts_cw_c)
+def scale_differs(fit: SimilarityFit) -> bool:
+    """Whether the lengths of two streams differ significantly, and by enough to matter."""
+    significant = abs(fit.scale - 1.0) > max(_MIN_DIFFERENCE, _MIN_SIGMAS * fit.scale_sigma)
+    return significant and fit.unexplained_translation < _MAX_UNEXPLAINED_TO_DIFFER
 
 
-@dataclass(frozen=True)
-class ScaleInUse:
-    """Factor of the child's lengths, and the estimate it comes from if it was estimated."""
-
-    value: float = 1.0
-    estimate: Scale | None = None
-    warnings: tuple[str, ...] = ()
-
-
-def settle_scale(pose_pairs: PosePairs, option: str | float) -> ScaleInUse:
-    """The scale to use: given, or estimated if the option ``scale`` asks for it.
+def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, SimilarityFit | None]:
+    """The scale to use, given or estimated as the option ``scale`` asks for, and the fit that it
+    comes from if it was estimated.
 
     Raises
     ------
     NotEnoughDataError
         If it is to be estimated and cannot be.
     """
-    if option == "none":
-        return ScaleInUse()
     if not isinstance(option, str):
-        return ScaleInUse(option)
-    if option == "estimate":
-        scale = estimate_scale(pose_pairs)
-        if not scale.fit.explains_translation:
-            raise NotEnoughDataError(
-                "the scale cannot be estimated: even with a scale, "
-                f"{scale.fit.unexplained_translation:.0%} of the motion stays unexplained "
-                f"(at most {MAX_UNEXPLAINED_TRANSLATION:.0%} is allowed); "
-                "check the streams, or give scale"
-            )
-        return ScaleInUse(scale.value, scale)
+        return option, None
+    if option == "none":
+        return 1.0, None
     try:
-        scale = estimate_scale(pose_pairs)
+        fit = estimate_scale(pose_pairs)
     except NotEnoughDataError:
-        return ScaleInUse()
-    if not scale.differs:
-        return ScaleInUse()
-    warning = (
-        f"the child's lengths are multiplied by {scale.value:.4f} +/- {scale.sigma:.4f}, "
-        "as estimated from the motion"
-    )
-    return ScaleInUse(scale.value, scale, (warning,))
+        if option == "estimate":
+            raise
+        return 1.0, None
+    if option == "auto" and not scale_differs(fit):
+        return 1.0, None
+    if not fit.explains_translation:
+        raise NotEnoughDataError(
+            "the scale cannot be estimated: even with a scale, "
+            f"{fit.unexplained_translation:.0%} of the motion stays unexplained "
+            f"(at most {MAX_UNEXPLAINED_TRANSLATION:.0%} is allowed); "
+            "check the streams, or give scale"
+        )
+    return fit.scale, fit
 
 
 def horizontal_factors(path: FloatArray, positions: FloatArray) -> tuple[float, float]:

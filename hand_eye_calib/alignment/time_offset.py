@@ -2,7 +2,6 @@
 that changes from second to second.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,10 +41,6 @@ _RATE_PRIOR, PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
 # stream if those are longer.
 _FINE_RANGE_S, _FINE_RANGE_INTERVALS = 0.25, 2.0
 
-# Where the angular rates match at many offsets, largest share of the motion that the right one
-# leaves unexplained, and largest share of that of any other which is not near zero.
-_EXPLAINED_NEAR, _FAR_BETTER = 0.12, 0.5
-
 
 @dataclass(frozen=True)
 class TimeOffset:
@@ -71,14 +66,9 @@ class TimeOffset:
     seconds: float
     sigma_s: float
     correlation: Correlation
-    fit: SimilarityFit | None
+    fit: SimilarityFit | None = None
     spread_s: float = np.inf
     rate: ClockRate | None = None
-
-    @property
-    def unexplained(self) -> float:
-        """Share of the motion that the fit leaves unexplained; infinite without one."""
-        return self.fit.unexplained if self.fit else np.inf
 
     def steadied(self, child: Trajectory) -> Trajectory:
         """The child's poses at a constant offset: with stamps freed of a rate that is used."""
@@ -96,8 +86,8 @@ def estimate_time_offset(
     max_gap_s: float = CalibratorConfig.max_gap,
     of_speed: bool = False,
 ) -> TimeOffset:
-    """Estimate the offset of the child's clock: coarse from the angular rates or, if they leave it
-    open, where the paths agree best; then fine together with X and the scale.
+    """Estimate the offset of the child's clock: coarse from the angular rates, then fine together
+    with X and the scale.
 
     Parameters
     ----------
@@ -121,34 +111,14 @@ def estimate_time_offset(
     correlation = correlate_rates(parent, child, max_gap_s, of_speed)
     if correlation.is_clear and of_speed:
         sigma_s = max(parent.interval_s, child.interval_s) / 5
-        return TimeOffset(correlation.offset_s, sigma_s, correlation, None)
+        return TimeOffset(correlation.offset_s, sigma_s, correlation)
     if correlation.is_clear:
         return refine_time_offset(parent, child, correlation, max_gap_s)
-    if correlation.is_ambiguous and not of_speed:
-        # Rhythmic motion matches at many offsets; clocks of one machine are hardly apart.
-        near_s = correlation.offset_s if abs(correlation.offset_s) < _FINE_RANGE_S else 0.0
-        tried = [
-            refine_time_offset(parent, child, replace(correlation, offset_s=at_s), max_gap_s)
-            for at_s in {near_s, correlation.offset_s, *correlation.others_s}
-        ]
-        best = min(tried, key=lambda each: each.unexplained)
-        if best.unexplained < _limit(best, tried):
-            return best
     doubt = correlation.doubt().replace("angular rates", "speeds" if of_speed else "angular rates")
     raise NotEnoughDataError(
         f"the time offset cannot be estimated: {doubt}; drive with more turns and "
         "changes of speed, or give time_offset in seconds"
     )
-
-
-def _limit(best: TimeOffset, tried: Sequence[TimeOffset]) -> float:
-    """What the best of some offsets must leave unexplained less than: a share of what any other
-    leaves, unless it is near zero.
-    """
-    if abs(best.seconds) <= 2 * _FINE_RANGE_S:
-        return _EXPLAINED_NEAR
-    rivals = [each for each in tried if abs(each.seconds - best.seconds) > _FINE_RANGE_S]
-    return min([_EXPLAINED_NEAR, *(_FAR_BETTER * each.unexplained for each in rivals)])
 
 
 def refine_time_offset(
@@ -178,7 +148,7 @@ def refine_time_offset(
         The coarse offset with a wide sigma if no fit explains the motion.
     """
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
-    best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation, None), start
+    best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation), start
     held: list[float] = []
     for lag_s in _LAGS_S:
         found, fit = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit)
@@ -211,7 +181,7 @@ def _fine_offset(
         pose_pairs = synchronise(parent, shifted, max_gap_s)
         pairs = pairs_over(pose_pairs, lag_s, most_pairs)
         if len(pairs) < _MIN_PAIRS:
-            return TimeOffset(offset_s, np.inf, correlation, None), None
+            return TimeOffset(offset_s, np.inf, correlation), None
         used, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
         twists = _twists(shifted, pose_pairs.stamps_ns[used], span_s)[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]

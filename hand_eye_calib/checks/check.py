@@ -17,11 +17,10 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import (
     MIN_VARIATION,
-    NO_CORRELATION,
     Correlation,
     correlate_rates,
 )
-from hand_eye_calib.alignment.scale import Scale, estimate_scale
+from hand_eye_calib.alignment.scale import estimate_scale, scale_differs
 from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
@@ -93,7 +92,7 @@ class CheckResult:
     """
 
     findings: tuple[Finding, ...]
-    correlation: Correlation = NO_CORRELATION
+    correlation: Correlation = Correlation()
     fit: SimilarityFit | None = None
 
 
@@ -192,7 +191,7 @@ def _explained(streams: StreamPair, is_clear: bool) -> tuple[Explanation | None,
 def _offset(streams: StreamPair, explanation: Explanation, correlation: Correlation) -> TimeOffset:
     """The time offset of streams that agree under a hypothesis."""
     if streams.are_slow:  # too slow to refine it
-        return TimeOffset(correlation.offset_s, streams.interval_s, correlation, None)
+        return TimeOffset(correlation.offset_s, streams.interval_s, correlation)
     right = explanation.hypothesis.undo(streams)
     parts = right.parent, right.child, correlation, streams.max_gap_s, explanation.fit
     return refine_time_offset(*parts, least_s=_OFFSET_NOTE_S)
@@ -211,7 +210,7 @@ def _check_sizes(
         return [finding("unit_unseen"), *findings], fit
     with suppress(NotEnoughDataError):
         found = estimate_scale(pose_pairs, start=fit)
-        return [*_check_scale(found, scale), *findings], found.fit
+        return [*_check_scale(found, scale), *findings], found
     return findings, fit
 
 
@@ -323,17 +322,16 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     ]
 
 
-def _check_scale(scale: Scale, known: float) -> list[Finding]:
-    if not scale.differs:
+def _check_scale(fit: SimilarityFit, known: float) -> list[Finding]:
+    if not scale_differs(fit):
         return []
-    if found := unit_of(scale.value):
+    scale, sigma = fit.scale, fit.scale_sigma
+    if found := unit_of(scale):
         factor, unit = found
-        return [in_other_units(scale.value, scale.sigma, unit, round(known * factor, 9))]
-    severity = Severity.ERROR if abs(scale.value - 1.0) > _SCALE_ERROR else Severity.WARNING
-    options = {"scale": round(known * scale.value, 4)}
-    return [
-        finding("scale", "child", severity, options=options, scale=scale.value, sigma=scale.sigma)
-    ]
+        return [in_other_units(scale, sigma, unit, round(known * factor, 9))]
+    severity = Severity.ERROR if abs(scale - 1.0) > _SCALE_ERROR else Severity.WARNING
+    options = {"scale": round(known * scale, 4)}
+    return [finding("scale", "child", severity, options=options, scale=scale, sigma=sigma)]
 
 
 def in_other_units(scale: float, sigma: float, unit: str, factor: float) -> Finding:

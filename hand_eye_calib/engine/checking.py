@@ -70,7 +70,7 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
         correlation = _correlated(snapshot, known_s)
         if correlation.is_clear and abs(correlation.offset_s) >= _FOUND_BY_SOLVE_S:
             sigma_s = max(stream.interval_s for stream in snapshot.streams) / 5
-            offset = TimeOffset(correlation.offset_s, sigma_s, correlation, None)
+            offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
             found += check_offset(offset, known_s)
     return [each for index, each in enumerate(found) if each not in found[:index]]
 
@@ -128,7 +128,7 @@ def _of_result(result: Calibration, correlation: Correlation, known_s: float) ->
     if hidden == within_reach:
         return [finding("no_turning")]
     offset_s, sigma_s = result.time_offset_s - known_s, result.time_offset_sigma_s
-    found = check_offset(TimeOffset(offset_s, sigma_s, correlation, None), known_s)
+    found = check_offset(TimeOffset(offset_s, sigma_s, correlation), known_s)
     if abs(offset_s) < _FOUND_BY_SOLVE_S:
         found = [replace(each, severity=Severity.NOTE) for each in found]
     if hidden:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.scale import Scale, ScaleInUse, child_scaled, settle_scale
+from hand_eye_calib.alignment.scale import settle_scale
+from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes
@@ -68,7 +69,8 @@ class Solved:
     warnings: tuple[str, ...] = ()
     shift: PossibleShift | None = None
     model: AdaptiveSolution | None = None
-    scale: ScaleInUse = ScaleInUse()
+    scale: float = 1.0
+    scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
     speed_m_s: float = 0.0
     is_beside: bool = False
@@ -85,7 +87,7 @@ class Solved:
         T_method, config, found = self.solution.T_parent_child, self.config, self.adaptive
         fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), config.prior())
         residuals = residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns)
-        scale, offset = self.scale, self.time_offset
+        offset, of_scale = self.time_offset, self.scale_fit
         odometries = [config.parent_kind, config.child_kind].count("odometry")
         result = calibration_of(
             fused,
@@ -107,9 +109,9 @@ class Solved:
             time_offset_s=offset.seconds if offset else fixed_time_offset(config),
             time_offset_sigma_s=offset.sigma_s if offset else 0.0,
             clock_rate=offset.rate if offset else None,
-            scale=scale.value,
-            scale_sigma=scale.estimate.sigma if scale.estimate else 0.0,
-            warnings=(*scale.warnings, *fused.warnings, *self.warnings)
+            scale=self.scale,
+            scale_sigma=of_scale.scale_sigma if of_scale else 0.0,
+            warnings=(*fused.warnings, *self.warnings)
             + (self.shift.warnings if self.shift else ()),
             model=self.model,
         )
@@ -119,8 +121,8 @@ class Solved:
             result,
             time_offset_s=result.time_offset_s + found.time_offset_s,
             time_offset_sigma_s=found.time_offset_sigma_s or result.time_offset_sigma_s,
-            scale=scale.value * found.scale,
-            scale_sigma=scale.value * found.scale_sigma or result.scale_sigma,
+            scale=self.scale * found.scale,
+            scale_sigma=self.scale * found.scale_sigma or result.scale_sigma,
         )
 
     def _floor(self) -> FloatArray:
@@ -190,26 +192,32 @@ def solve_poses(
     NotEnoughDataError
         If there are too few poses for the reference or for the scale.
     """
-    scale = settle_scale(pose_pairs, config.scale)
+    scale, scale_fit = settle_scale(pose_pairs, config.scale)
     METHODS[config.method].require_backend(config.backend)
-    scaled = child_scaled(pose_pairs, scale.value)
+    scaled = pose_pairs.child_scaled(scale)
     if config.method in ("auto", "adaptive"):
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config, is_beside=is_beside)
     found = solved.adaptive
     # A model with a time offset knows how uncertain that is.
-    spread = _spread_by_alignment(
-        scale.estimate, None if found and found.time_offset_s else time_offset
-    )
+    spread = _spread_by_alignment(scale_fit, None if found and found.time_offset_s else time_offset)
     if solved.shift is not None:
         spread += solved.shift.spread
     rotation = solved.solution.T_parent_child[:3, :3]
+    said = []
+    if scale_fit and config.scale == "auto":
+        said = [
+            f"the child's lengths are multiplied by {scale:.4f} +/- {scale_fit.scale_sigma:.4f}, "
+            "as estimated from the motion"
+        ]
     return replace(
         solved,
         assessment=widened(solved.assessment, rotation, spread),
         config=config,
         scale=scale,
+        scale_fit=scale_fit,
+        warnings=(*said, *solved.warnings),
         time_offset=time_offset,
         speed_m_s=usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3]),
         is_beside=is_beside,
@@ -332,12 +340,16 @@ def _solve_pairs(
     )
 
 
-def _spread_by_alignment(scale: Scale | None, time_offset: TimeOffset | None) -> FloatArray:
+def _spread_by_alignment(
+    of_scale: SimilarityFit | None, time_offset: TimeOffset | None
+) -> FloatArray:
     """Covariance (6, 6) that an estimated scale and time offset add to the extrinsic's."""
     spread = np.zeros((6, 6))
-    if scale:
-        by_log_scale = scale.fit.sensitivity[:, 0]
-        spread += np.outer(by_log_scale, by_log_scale) * (scale.sigma / scale.value) ** 2
+    if of_scale:
+        by_log_scale = of_scale.sensitivity[:, 0]
+        spread += (
+            np.outer(by_log_scale, by_log_scale) * (of_scale.scale_sigma / of_scale.scale) ** 2
+        )
     if time_offset and time_offset.fit:
         by_offset = time_offset.fit.sensitivity[:, 1]
         spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import angular_rates
-from hand_eye_calib.alignment.scale import child_scaled
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.streams import are_gaps
@@ -79,7 +78,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     # The time offset is settled; estimating it again would cost time.
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = replace(snapshot, config=settled).pose_pairs()
-    scaled = child_scaled(pose_pairs, calibration.scale)
+    scaled = pose_pairs.child_scaled(calibration.scale)
     rotating = scaled
     of_parent = config.parent_measures == "positions"
     if of_parent:

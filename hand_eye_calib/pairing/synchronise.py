@@ -1,6 +1,6 @@
 """Synchronisation: poses of two streams at common instants, by interpolation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -43,6 +43,12 @@ class PosePairs:
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
         return type(self)(self.stamps_ns[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
+
+    def child_scaled(self, factor: float) -> Self:
+        """The same poses with the child's translations times ``factor``."""
+        Ts_cw_c = self.Ts_cw_c.copy()
+        Ts_cw_c[:, :3, 3] *= factor
+        return replace(self, Ts_cw_c=Ts_cw_c)
 
     @classmethod
     def empty(cls) -> Self:

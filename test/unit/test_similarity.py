@@ -39,8 +39,8 @@ def pose_pairs(parent, child):
 @pytest.mark.parametrize("poses", [wandering_poses, planar_poses])
 def test_noise_free_scale_is_exact(scale, poses):
     found = estimate_scale(pose_pairs(*streams(scale=scale, poses=poses)))
-    assert found.value == pytest.approx(scale, rel=1e-5)
-    assert found.fit.explains_translation
+    assert found.scale == pytest.approx(scale, rel=1e-5)
+    assert found.explains_translation
 
 
 def test_most_pairs_decide_whatever_the_others_say():
@@ -50,7 +50,7 @@ def test_most_pairs_decide_whatever_the_others_say():
     poses = child.poses.copy()
     poses[wrong] = poses[wrong] @ se3.exp(random.normal(size=(int(wrong.sum()), 6)))
     found = estimate_scale(pose_pairs(parent, dataclasses.replace(child, poses=poses)))
-    assert found.value == pytest.approx(2.5, rel=0.01)
+    assert found.scale == pytest.approx(2.5, rel=0.01)
 
 
 def test_standard_deviation_is_of_the_size_of_the_errors():
@@ -58,7 +58,7 @@ def test_standard_deviation_is_of_the_size_of_the_errors():
         estimate_scale(pose_pairs(*streams(seed=seed, scale=1.7, noise=0.01)))
         for seed in range(0, 60, 5)
     ]
-    ratios = [(scale.value - 1.7) / scale.sigma for scale in found]
+    ratios = [(fit.scale - 1.7) / fit.scale_sigma for fit in found]
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 3.0
 
 

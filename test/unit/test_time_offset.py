@@ -68,27 +68,6 @@ def test_a_body_that_rotates_about_one_of_its_sensors():
     assert found.sigma_s < 0.002
 
 
-def test_rhythmic_motion_shows_an_offset_if_the_path_does():
-    """Like a boat in steady waves: the angular rates match at many offsets."""
-
-    def rocking(n_poses, seed, drifts=True):
-        phases = 2 * np.pi * 0.25 * np.arange(n_poses) / 10.0
-        drift = drifts * np.arange(n_poses) / n_poses
-        angles = np.stack([0.2 * np.sin(phases), 0.1 * np.sin(2 * phases + 1), drift], axis=1)
-        steps = np.stack([3 * drift, drift**2, 0.3 * np.cos(phases)], axis=1)
-        return se3.exp(np.concatenate([steps, angles], axis=1))
-
-    parent, child = drive(shift_s=0.1234, noise=0.0002, wander=rocking)
-    found = estimate_time_offset(parent, child)
-    assert not found.correlation.is_clear
-    assert found.seconds == pytest.approx(0.1234, abs=0.002)
-    far = estimate_time_offset(parent, child.shifted(-30.0))
-    assert far.seconds == pytest.approx(30.1234, abs=0.002)
-    parent, child = drive(noise=0.0002, wander=lambda *what: rocking(*what, drifts=False))
-    with pytest.raises(NotEnoughDataError, match="drive with more turns"):
-        estimate_time_offset(parent, child.shifted(-30.0))
-
-
 def test_standard_deviation_is_of_the_size_of_the_errors():
     found = [estimate_time_offset(*drive(seed, shift_s=1.5, noise=0.003)) for seed in range(12)]
     ratios = [(offset.seconds - 1.5) / offset.sigma_s for offset in found]
