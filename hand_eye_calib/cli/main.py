@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from hand_eye_calib.cli.console import as_typed, fail
 from hand_eye_calib.config import did_you_mean
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
-from hand_eye_calib.io.limits import ReadingMemory
+from hand_eye_calib.io.limits import limit_memory
 from hand_eye_calib.text import shown_value
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
@@ -80,7 +80,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
     # The matrices are small. Several threads would wait for each other, and take three times as
     # long if other programs run.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    ReadingMemory.switch_on()
+    limit_memory()
     try:
         code = run()
         sys.stdout.flush()

@@ -3,62 +3,57 @@
 import os
 import stat
 from collections.abc import Mapping
+from io import BufferedReader
 from pathlib import Path
 
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.io.limits import LARGEST_TEXT
 
 
-def open_regular(path: str | Path) -> int:
-    """Open a file for reading and return its descriptor.
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
 
-    A pipe or a device is refused, as reading it may wait for ever.
+
+def open_regular(path: str | Path) -> BufferedReader:
+    """Open a file for reading.
 
     Raises
     ------
-    OSError
     InputError
-        If it is not a regular file.
+        If it cannot be opened, or is a pipe or a device, for which reading may wait for ever.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    mode = os.fstat(descriptor).st_mode
-    if stat.S_ISREG(mode):
-        return descriptor
-    os.close(descriptor)
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(21, "Is a directory", str(path))
+    try:
+        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        return file
+    file.close()
     raise InputError(f"cannot read {path}: it is not a regular file; save its content to one first")
 
 
-def read_bytes(path: str | Path, largest: int) -> bytes:
+def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
     """Read a whole file.
 
     Raises
     ------
-    OSError
     InputError
-        If it is not a regular file, or larger than ``largest`` bytes.
+        If it cannot be read, or is larger than ``largest`` bytes; one line that names the file.
     """
-    with open(open_regular(path), "rb") as file:
+    with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > largest:
             raise InputError(f"cannot read {path}: it is larger than {largest} bytes")
         return file.read()
 
 
-def read_text(path: str | Path, expected: str, largest: int) -> str:
-    """Read a whole text file in UTF-8, with or without a byte order mark.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is larger than ``largest`` bytes; one line that names the file, and
-        what was expected.
+def read_text(path: str | Path, expected: str, largest: int = LARGEST_TEXT) -> str:
+    """Read a whole text file in UTF-8, with or without a byte order mark; ``expected`` is what an
+    error says that it should be. Raises as :func:`read_bytes`.
     """
     try:
         return read_bytes(path, largest).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected {expected}") from None
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:

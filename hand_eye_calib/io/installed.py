@@ -15,11 +15,9 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import FrameTree, numbers_of, pose_of
-from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import LARGEST_YAML
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.urdf import read_urdf
-from hand_eye_calib.io.yaml_files import parse_foreign_yaml
+from hand_eye_calib.io.yaml_files import read_yaml
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.exports import FORMATS, arranged
 from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
@@ -124,13 +122,13 @@ def _document(path: Path) -> Any:
             return np.load(path, allow_pickle=False, mmap_mode="r").tolist()
         except (OSError, ValueError, EOFError) as error:
             raise InputError(f"cannot read {path}: {error}") from None
-    text = read_text(path, _EXPECTED, LARGEST_YAML)
-    if "EKF2_EV_POS_X" in text or "EKF2_GPS_POS_X" in text:
+    document = read_yaml(path, _EXPECTED)
+    if isinstance(document, str) and "EKF2_" in document:
         raise InputError(
             f"{path}: parameters of PX4 have a position and no rotation; give six numbers instead, "
             '"X Y Z ROLL PITCH YAW"'
         )
-    return parse_foreign_yaml(text, str(path))
+    return document
 
 
 def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:

@@ -15,6 +15,7 @@ import os
 import shutil
 from array import array
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,13 +25,15 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import other_names
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.files import open_regular, write_atomically
+from hand_eye_calib.io.files import open_regular
 from hand_eye_calib.io.limits import LONGEST_LINE
 from hand_eye_calib.io.trajectory_files.writing import tum_line
 
 _FORMAT, _VERSION = "hand_eye_calib/journal", 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
+# What a line may raise that is none of a journal.
+_UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
 #: What is known of each stream: plain values, such as topic, frame, origin and options.
 About = Mapping[str, Mapping[str, Any]]
@@ -56,31 +59,23 @@ class JournalWriter:
     """
 
     def __init__(
-        self,
-        directory: str | Path,
-        about: About,
-        resumed: "Journal | None" = None,
+        self, directory: str | Path, about: About, resumed: "Journal | None" = None
     ) -> None:
         self._directory = Path(directory)
         self._directory.mkdir(parents=True, exist_ok=True)
-        known, whole_bytes, self._parent_poses = dict(about), {}, 0
+        before, whole_bytes, self._parent_poses = dict[str, Any](), dict[str, int](), 0
         if resumed is not None:
-            known, whole_bytes = known | resumed.about, resumed.whole_bytes
+            before, whole_bytes = resumed.about, resumed.whole_bytes
             self._parent_poses = int((resumed.streams == "parent").sum())
-        texts = {}
-        for stream in about.keys() - whole_bytes.keys():
-            head = {"format": _FORMAT, "version": _VERSION, "stream": stream, **about[stream]}
-            texts[self._path(stream)] = f"{_comment(head)}\n"
-        write_atomically(texts)
-        self._about: dict[str, Mapping[str, Any]] = known
-        self._pending: dict[str, list[str]] = {stream: [] for stream in known}
+        self._about: dict[str, Mapping[str, Any]] = {**before}
+        self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before}}
         self._files: dict[str, BinaryIO] = {}
-        for stream in known:
+        for stream in self._pending:
             # Unbuffered: what is flushed is with the operating system and survives this process.
             self._files[stream] = open(self._path(stream), "ab", buffering=0)  # noqa: SIM115
-            if stream in whole_bytes:
-                self._files[stream].truncate(whole_bytes[stream])
-        self.describe(about)
+            self._files[stream].truncate(whole_bytes.get(stream, 0))
+        head = {"format": _FORMAT, "version": _VERSION}
+        self.describe({stream: head | {"stream": stream} | {**about[stream]} for stream in about})
 
     def _path(self, stream: str) -> Path:
         return self._directory / f"{stream}.tum"
@@ -97,26 +92,24 @@ class JournalWriter:
         for stream, known in about.items():
             before = self._about.get(stream, {})
             if changed := {key: each for key, each in known.items() if before.get(key) != each}:
-                self._write(stream, [_comment(changed)])
+                self._write(stream, [f"# {json.dumps(changed)}"])
             self._about[stream] = {**before, **known}
 
     def flush(self) -> None:
         """Hand everything noted to the operating system, where it survives this process."""
         for stream, lines in self._pending.items():  # the parent is first
             if lines:
-                batch = [] if stream == "parent" else [_comment({_BATCH: self._parent_poses})]
+                batch = [] if stream == "parent" else [f'# {{"{_BATCH}": {self._parent_poses}}}']
                 self._write(stream, [*batch, *lines])
                 self._parent_poses += len(lines) * (stream == "parent")
                 lines.clear()
 
     def _write(self, stream: str, lines: Sequence[str]) -> None:
-        file, text = self._files[stream], "\n".join([*lines, ""]).encode()
+        file = self._files[stream]
         # A file that is no longer where it was would take what is written, and lose it.
         if not os.path.samestat(os.stat(self._path(stream)), os.fstat(file.fileno())):
             raise OSError("another program has replaced its file")
-        taken = file.write(text)
-        if taken != len(text):
-            raise OSError(f"only {taken} of {len(text)} bytes were written")
+        file.write("\n".join([*lines, ""]).encode())
 
     def close(self) -> None:
         """Flush and close."""
@@ -125,10 +118,6 @@ class JournalWriter:
         finally:
             for file in self._files.values():
                 file.close()
-
-
-def _comment(values: Mapping[str, Any]) -> str:
-    return f"# {json.dumps(values)}"
 
 
 @dataclass(frozen=True)
@@ -164,14 +153,14 @@ def read_journal(directory: str | Path) -> Journal:
     if not has_session(directory):
         raise InputError(f"no session journal in {directory}")
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
-    found = {stream: _read_file(path) for stream, path in paths.items() if os.path.lexists(path)}
-    order = np.argsort(np.concatenate([each.arrived for each in found.values()]), kind="stable")
-    counts = [len(each.arrived) for each in found.values()]
+    found = {stream: _File(path) for stream, path in paths.items() if os.path.lexists(path)}
+    files = found.values()
+    order = np.argsort(np.concatenate([each.arrived for each in files]), kind="stable")
     return Journal(
         about={stream: each.about for stream, each in found.items()},
-        streams=np.repeat([*found], counts)[order],
-        stamps_ns=np.concatenate([each.stamps_ns for each in found.values()])[order],
-        poses=np.concatenate([np.reshape(each.poses, (-1, 7)) for each in found.values()])[order],
+        streams=np.repeat([*found], [len(each.arrived) for each in files])[order],
+        stamps_ns=np.concatenate([each.stamps_ns for each in files])[order],
+        poses=np.concatenate([np.reshape(each.poses, (-1, 7)) for each in files])[order],
         whole_bytes={stream: each.whole_bytes for stream, each in found.items()},
     )
 
@@ -179,14 +168,28 @@ def read_journal(directory: str | Path) -> Journal:
 class _File:
     """One stream: about, poses, and of each the time of its arrival in poses of the parent."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path) -> None:
         self.about: dict[str, Any] = {}
         # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
         self.stamps_ns, self.poses, self.arrived = array("q"), array("d"), array("d")
         self.whole_bytes = 0
+        with open_regular(path) as file, suppress(*_UNREADABLE):
+            while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
+                self._add(line)
+                self.whole_bytes += len(line)
+        found = [self.about.get(key) for key in ("format", "version")]
+        if found[0] != _FORMAT:
+            raise InputError(
+                f"the session journal {path} is damaged from its first byte; move it away to start "
+                "anew"
+            )
+        if found[1] != _VERSION:
+            raise InputError(
+                f"the session journal {path} is of format version {found[1]}, this program reads "
+                f"{_VERSION}: use the version that wrote it, or move it away to start anew"
+            )
 
-    def add(self, line: bytes) -> None:
-        """Read a line. Raises ValueError, TypeError, OverflowError or RecursionError."""
+    def _add(self, line: bytes) -> None:
         if line.startswith(b"# {"):
             self.about |= json.loads(line[2:])
         elif not line.startswith(b"#"):
@@ -200,31 +203,6 @@ class _File:
             self.stamps_ns.append(int(seconds + decimals))
             self.poses.extend(pose)
             self.arrived.append(arrived)
-
-
-def _read_file(path: Path) -> _File:
-    found = _File()
-    try:
-        with open(open_regular(path), "rb") as file:
-            while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
-                try:
-                    found.add(line)
-                except (ValueError, TypeError, OverflowError, RecursionError):
-                    break
-                found.whole_bytes += len(line)
-    except OSError as error:
-        raise InputError(f"cannot read the session journal {path}: {error.strerror}") from None
-    if found.about.get("format") != _FORMAT:
-        raise InputError(
-            f"the session journal {path} is damaged from its first byte; move it away to start anew"
-        )
-    if found.about.get("version") != _VERSION:
-        raise InputError(
-            f"the session journal {path} is of format version {found.about.get('version')}, this "
-            f"program reads {_VERSION}: use the version that wrote it, or move it away to start "
-            "anew"
-        )
-    return found
 
 
 def has_session(directory: str | Path) -> bool:

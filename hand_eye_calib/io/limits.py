@@ -5,8 +5,9 @@ for them. Bags are read by libraries: while they do so, a command gives the proc
 than :data:`LARGEST_GROWTH`; the poses that are kept come on top.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
 
 _MIB = 1 << 20
 
@@ -38,49 +39,36 @@ LARGEST_TEXT = 512 * _MIB
 LONGEST_LINE = 65_536
 
 
-class ReadingMemory:
-    """Lets the process grow by :data:`LARGEST_GROWTH` in all while a bag is read, and no more; a
-    context manager, entered as often as the bag is read from. What asks for more gets a
-    MemoryError.
-
-    It does nothing until :meth:`switch_on` was called, as the limit is one of the whole process:
-    commands call it, a program that reads bags in one of its threads may not want it.
-    """
-
-    _is_on = False
-
-    def __init__(self) -> None:
-        self._left = LARGEST_GROWTH
-
-    @classmethod
-    def switch_on(cls) -> None:
-        """Limit the memory from now on, where the system can (Linux)."""
-        cls._is_on = _STATM.exists()
-
-    def __enter__(self) -> Self:
-        if self._is_on:
-            import resource
-
-            self._before = _address_space()
-            self._limits = resource.getrlimit(resource.RLIMIT_AS)
-            allowed = [limit for limit in self._limits if limit != resource.RLIM_INFINITY]
-            soft = min([self._before + self._left, *allowed])
-            resource.setrlimit(resource.RLIMIT_AS, (soft, self._limits[1]))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._is_on:
-            import resource
-
-            resource.setrlimit(resource.RLIMIT_AS, self._limits)
-            self._left -= _address_space() - self._before
-
-
 _STATM = Path("/proc/self/statm")
+_is_limited = False
 
 
-def _address_space() -> int:
-    """Bytes of virtual memory of this process, which is what the limit counts."""
+def limit_memory() -> None:
+    """Limit the memory of reading from now on, where the system can (Linux).
+
+    The limit is one of the whole process: commands call this, a program that reads bags in one of
+    its threads may not want it.
+    """
+    global _is_limited
+    _is_limited = _STATM.exists()
+
+
+@contextmanager
+def reading_memory() -> Iterator[None]:
+    """Lets the process grow by :data:`LARGEST_GROWTH` and no more, after :func:`limit_memory`; what
+    asks for more gets a MemoryError.
+    """
+    if not _is_limited:
+        yield
+        return
     import resource
 
-    return int(_STATM.read_text().split()[0]) * resource.getpagesize()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    # Virtual memory, which is what the limit counts.
+    most = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST_GROWTH
+    allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_AS, (min([most, *allowed]), limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)

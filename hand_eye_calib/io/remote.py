@@ -61,21 +61,20 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
     MissingDependencyError
         If fsspec, or what it needs for the store, is not installed.
     """
+    if not any(map(is_url, paths)):
+        yield [*paths], lambda value: value
+        return
     with tempfile.TemporaryDirectory(prefix="hand_eye_calib_") as folder:
-        names: dict[str, str] = {}
-        local = []
-        for number, path in enumerate(paths):
-            if is_url(path):
-                path, url = _copied(str(path), Path(folder, str(number))), path
-                names[str(path)] = public(str(url)).rstrip("/")
-            local.append(path)
+        local = [
+            _copied(str(path), Path(folder, str(number))) if is_url(path) else path
+            for number, path in enumerate(paths)
+        ]
 
         def as_given(value: Any) -> Any:
-            if not names:
-                return value
             text = json.dumps(value)
-            for copy, url in names.items():
-                text = text.replace(json.dumps(copy)[1:-1], json.dumps(url)[1:-1])
+            for copy, path in zip(local, paths, strict=True):
+                url = public(str(path)).rstrip("/")
+                text = text.replace(json.dumps(str(copy))[1:-1], json.dumps(url)[1:-1])
             return json.loads(text)
 
         try:
@@ -89,7 +88,11 @@ def _copied(url: str, folder: Path) -> Path:
     """Copy the files of a bag into a new folder; returns where it is."""
     folder.mkdir()
     with _reached(url) as (system, path):
-        files = _files(system, path)
+        is_file = _name(path).endswith(_SUFFIXES)
+        found = [system.info(path) | {"name": path}] if is_file else system.ls(path, detail=True)
+        files = [about for about in found if _name(about["name"]).endswith(_SUFFIXES)]
+        if not files:
+            raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
         # Half of the free space is left to the copies of other processes.
         largest = shutil.disk_usage(folder).free // 2
         if sum(about.get("size") or 0 for about in files) > largest:
@@ -100,18 +103,7 @@ def _copied(url: str, folder: Path) -> Path:
         for about in files:
             # The name's last part only: a store does not choose where things go.
             system.get_file(about["name"], str(folder / _name(about["name"])))
-        is_file = [about["name"] for about in files] == [path]
         return folder / _name(path) if is_file else folder
-
-
-def _files(system: Any, path: str) -> list[dict[str, Any]]:
-    """What the store says of each file of a bag."""
-    if _name(path).endswith(_SUFFIXES):
-        return [system.info(path) | {"name": path}]
-    files = [about for about in system.ls(path, detail=True) if about["name"].endswith(_SUFFIXES)]
-    if not files:
-        raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
-    return sorted(files, key=lambda about: str(about["name"]))
 
 
 def _name(path: str) -> str:

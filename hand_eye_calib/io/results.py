@@ -5,7 +5,7 @@ transforms alone as xacro and as launch file.
 import hashlib
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -14,7 +14,6 @@ from xml.sax.saxutils import quoteattr
 
 from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
-from hand_eye_calib.io.limits import LARGEST_TEXT
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
@@ -149,7 +148,7 @@ def keep_earlier_results(directory: str | Path) -> None:
     try:
         if found:
             previous.mkdir(exist_ok=True)
-        write_atomically({previous / path.name: read_bytes(path, LARGEST_TEXT) for path in found})
+        write_atomically({previous / path.name: read_bytes(path) for path in found})
     except OSError as error:
         raise InputError(f"cannot keep {error.filename} in {previous}: {error.strerror}") from None
 
@@ -162,12 +161,9 @@ def fingerprint(path: str | Path) -> dict[str, Any]:
     InputError
         If it cannot be read.
     """
-    try:
-        with open(open_regular(path), "rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-            return {"file": str(path), "bytes": file.tell(), "sha256": digest}
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    with open_regular(path) as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return {"file": str(path), "bytes": file.tell(), "sha256": digest}
 
 
 def load_result(path: str | Path) -> Calibration:
@@ -208,9 +204,12 @@ def load_result(path: str | Path) -> Calibration:
 
 def _xacro_text(calibration: Calibration) -> str:
     """A fixed joint from the parent's to the child's link, for a robot description with both."""
-    mounted_on = calibration.mounting[0]
-    parent, child = (_xacro_attribute(frame) for frame in (mounted_on, calibration.child_frame))
-    joint = _xacro_attribute(f"{mounted_on}_to_{calibration.child_frame}")
+    parent, child = calibration.mounting[0], calibration.child_frame
+    # Quoted for XML, and kept from being evaluated by xacro.
+    joint, parent, child = (
+        quoteattr(printable(text).replace("$", "$$"))
+        for text in (f"{parent}_to_{child}", parent, child)
+    )
     numbers = calibration.usable_numbers() | calibration.usable_angles()
     xyz, rpy = (
         " ".join(str(numbers[name]) for name in names) for names in (TRANSLATIONS, ROTATIONS)
@@ -234,7 +233,10 @@ def _xacro_text(calibration: Calibration) -> str:
 def _launch_text(calibrations: Sequence[Calibration]) -> str:
     """A launch file that publishes extrinsics as static transforms."""
     comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
-    nodes = "\n".join(_node_text(each) for each in calibrations)
+    nodes = "".join(
+        _NODE.format("\n".join(f"{' ' * 20}{name!r}, {text!r}," for name, text in _arguments(each)))
+        for each in calibrations
+    )
     return f"""\
 # Publishes the extrinsic on /tf_static. Only if no robot description has this edge: a frame has one
 # parent and one publisher.
@@ -246,31 +248,29 @@ from launch_ros.actions import Node
 def generate_launch_description():
     return LaunchDescription(
         [
-{nodes}
-        ]
+{nodes}        ]
     )
 """
 
 
-def _node_text(calibration: Calibration) -> str:
-    """The node that publishes an extrinsic."""
-    arguments = {
-        f"--{name}": value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
-        for name, value in calibration.usable_numbers().items()
-    }
-    arguments["--frame-id"] = printable(calibration.mounting[0])
-    arguments["--child-frame-id"] = printable(calibration.child_frame)
-    lines = "\n".join(
-        f"                    {name!r}, {text!r}," for name, text in arguments.items()
-    )
-    return f"""\
+_NODE = """\
             Node(
                 package='tf2_ros',
                 executable='static_transform_publisher',
                 arguments=[
-{lines}
+{}
                 ],
-            ),"""
+            ),
+"""
+
+
+def _arguments(calibration: Calibration) -> Iterator[tuple[str, str]]:
+    """The arguments of the node that publishes an extrinsic, and their values."""
+    for name, value in calibration.usable_numbers().items():
+        text = value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
+        yield f"--{name}", text
+    yield "--frame-id", printable(calibration.mounting[0])
+    yield "--child-frame-id", printable(calibration.child_frame)
 
 
 def _remarks(calibration: Calibration) -> list[str]:
@@ -284,11 +284,6 @@ def _remarks(calibration: Calibration) -> list[str]:
         "covariance and where it came from.",
     ]
     return [printable(" ".join(remark.split())) for remark in remarks]
-
-
-def _xacro_attribute(text: str) -> str:
-    """Quoted for XML, and kept from being evaluated by xacro."""
-    return quoteattr(printable(text).replace("$", "$$"))
 
 
 # Their names in the package's public interface.

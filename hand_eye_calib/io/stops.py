@@ -17,8 +17,6 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of
-from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import LARGEST_YAML
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
@@ -74,14 +72,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     >>> hec.read_arm_samples("samples.yaml").robot.shape
     (40, 4, 4)
     """
-    path = Path(path)
-    document: Any
-    if path.suffix == ".npz":
-        document = _stacks(path)
-    else:
-        from hand_eye_calib.io.yaml_files import parse_foreign_yaml
-
-        document = parse_foreign_yaml(read_text(path, _EXPECTED, LARGEST_YAML), str(path))
+    document: Any = _document(path)
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
@@ -95,24 +86,25 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
         document = [pair for pair in pairs if None not in pair]
     if not isinstance(document, list) or not document:
         raise InputError(f"{path}: expected {_EXPECTED}")
-    robot: list[FloatArray] = []
-    tracking: list[FloatArray] = []
+    poses = []
     for number, sample in enumerate(document, 1):
         try:
-            for Ts, value in zip((robot, tracking), _pair(sample), strict=True):
-                Ts.append(pose_of(value))
+            poses.append([pose_of(value) for value in _pair(sample)])
         except InputError as error:
             raise InputError(f"{path}, sample {number}: {error}") from None
-    Ts_base_hand = se3.inverse(robot) if is_inverse else np.stack(robot)
-    return ArmSamples(Ts_base_hand, np.stack(tracking), frames)
+    robot, tracking = np.swapaxes(poses, 0, 1)
+    return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
 
 
-def _stacks(path: Path) -> list[Any]:
-    """Pairs of rows of two stacks of poses."""
+def _document(path: str | Path) -> Any:
+    """What a file has, of an ``.npz`` the pairs of rows of its two stacks."""
+    if Path(path).suffix != ".npz":
+        from hand_eye_calib.io.yaml_files import read_yaml
+
+        return read_yaml(path, _EXPECTED)
     try:
         with np.load(path, allow_pickle=False) as stacks:
-            arrays = {name: stacks[name] for name in stacks.files}
-        return [*zip(*_pair(arrays), strict=True)]
+            return [*zip(*_pair({name: stacks[name] for name in stacks.files}), strict=True)]
     except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"cannot read {path}: {error}") from None
 

@@ -11,9 +11,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import LARGEST_YAML
-from hand_eye_calib.io.yaml_files import parse_foreign_yaml
+from hand_eye_calib.io.yaml_files import read_yaml
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 
@@ -95,8 +93,7 @@ def read_camera(path: str | Path) -> Camera:
     InputError
         If the file cannot be read, or has none.
     """
-    text = read_text(Path(path), _EXPECTED_CAMERA, LARGEST_YAML)
-    document: Any = parse_foreign_yaml(text, str(path))
+    document: Any = read_yaml(path, _EXPECTED_CAMERA)
     try:
         document = document.get("cam0", document)
         if "intrinsics" in document:

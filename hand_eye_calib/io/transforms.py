@@ -73,7 +73,8 @@ class TfStream:
     """Composes the poses of a sensor from the edges of a transform tree as they arrive.
 
     There is one pose for each transform of the moving edge with the lowest rate. The other moving
-    edges are interpolated there, never extrapolated and never across more than ``max_gap_s``.
+    edges are interpolated there, never extrapolated and never across more than ``max_gap_s``. Of
+    repeated transforms of an edge the first counts, and those that are late are left out.
 
     Parameters
     ----------
@@ -88,15 +89,15 @@ class TfStream:
         self.source, self.max_gap_s = source, max_gap_s
         self._tree = tree or FrameTree("/tf and /tf_static")
         self._moving: dict[str, _MovingEdge] = {}
+        self._last_ns: dict[str, int] = {}
         self._find_chain()
 
     def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
         """Take a transform; yields the poses that are known with it. Raises as :meth:`edges_at`."""
         for stamp_ns, rows in self.edges_at(transform, is_static):
             T_world_sensor = self.composed({name: np.array(row) for name, row in rows.items()})
-            x, y, z = T_world_sensor[:3, 3].tolist()
-            qx, qy, qz, qw = se3.to_quat_xyzw(T_world_sensor).tolist()
-            yield PoseFields(stamp_ns, *self.source, (x, y, z), (qx, qy, qz, qw))
+            x, y, z, *quat_xyzw = _row(T_world_sensor)
+            yield PoseFields(stamp_ns, *self.source, (x, y, z), quat_xyzw)
 
     def edges_at(
         self, transform: PoseFields, is_static: bool
@@ -109,14 +110,20 @@ class TfStream:
         InputError
             If it is no pose, or its frame has another parent already.
         """
-        frame, edges = transform.sensor_frame or "", self._tree.edges
+        parent, frame, edges = transform.world_frame, transform.sensor_frame or "", self._tree.edges
         before = edges[frame].is_static if frame in edges else None
-        pose = _matrices(_checked(transform)) if is_static else None
-        is_fixed = self._tree.add(transform.world_frame, frame, pose, is_static).is_static
+        row = (*transform.position, *transform.quat_xyzw)
+        if is_static or frame in self._moving:
+            try:
+                check_pose(*row)
+            except InputError as error:
+                raise InputError(f"transform {parent}:{frame}: {error}") from None
+        pose = _matrices(row) if is_static else None
+        is_fixed = self._tree.add(parent, frame, pose, is_static).is_static
         if before != is_fixed:
             self._find_chain()
         if frame in self._moving and not is_static:
-            yield from self._move(frame, transform.stamp_ns, _checked(transform))
+            yield from self._move(frame, transform.stamp_ns, row)
 
     def composed(self, moving: Mapping[str, FloatArray]) -> FloatArray:
         """Poses of the sensor (..., 4, 4) from those of the moving edges (..., 7)."""
@@ -141,20 +148,19 @@ class TfStream:
         self._moving = {each: self._moving.get(each, deque(maxlen=_MOST_KEPT)) for each in frames}
 
     def _move(self, frame: str, stamp_ns: int, row: _Row) -> Iterator[tuple[int, dict[str, _Row]]]:
-        edge = self._moving[frame]
-        if len(self._moving) == 1:  # the usual case, for which nothing has to wait
-            if not edge or edge[-1][0] != stamp_ns:
-                edge.append((stamp_ns, row))
-                yield stamp_ns, {frame: row}
+        last_ns = self._last_ns.get(frame, stamp_ns - 1)
+        if last_ns - _JUMP_BACK_NS <= stamp_ns <= last_ns:
             return
-        if edge and stamp_ns < edge[-1][0] - _JUMP_BACK_NS:
+        if stamp_ns < last_ns:
             self._slowest = ""
+            self._last_ns.clear()
             for each in self._moving.values():  # their stamps begin anew
                 each.clear()
-        # Of repeated ones the first counts, and late ones are left out.
-        if not edge or stamp_ns > edge[-1][0]:
-            edge.append((stamp_ns, row))
-        if not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
+        self._last_ns[frame] = stamp_ns
+        self._moving[frame].append((stamp_ns, row))
+        if len(self._moving) == 1:  # the usual case, for which nothing has to wait
+            self._slowest = frame
+        elif not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
             self._slowest = max(self._moving, key=self._interval_ns)
         if not self._slowest:
             return
@@ -181,24 +187,17 @@ def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
     start_ns, row = edge[0]
     if start_ns == stamp_ns:
         return row
-    if start_ns > stamp_ns:
+    if start_ns > stamp_ns or edge[1][0] - start_ns > max_gap_s * 1e9:
         return None
     end_ns, end = edge[1]
-    if end_ns - start_ns > max_gap_s * 1e9:
-        return None
     fraction = np.array([float(stamp_ns - start_ns) / float(end_ns - start_ns)])
     (T,) = se3.interpolate(_matrices([row]), _matrices([end]), fraction)
+    return _row(T)
+
+
+def _row(T: FloatArray) -> _Row:
+    """x y z qx qy qz qw of a pose (4, 4)."""
     return *T[:3, 3].tolist(), *se3.to_quat_xyzw(T).tolist()
-
-
-def _checked(transform: PoseFields) -> _Row:
-    row = (*transform.position, *transform.quat_xyzw)
-    try:
-        check_pose(*row)
-    except InputError as error:
-        edge = f"{transform.world_frame}:{transform.sensor_frame}"
-        raise InputError(f"transform {edge}: {error}") from None
-    return row
 
 
 def _matrices(rows: ArrayLike) -> FloatArray:

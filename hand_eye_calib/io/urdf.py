@@ -13,7 +13,6 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.files import read_bytes
-from hand_eye_calib.io.limits import LARGEST_TEXT
 
 
 def read_urdf(path: str | Path) -> FrameTree:
@@ -24,10 +23,9 @@ def read_urdf(path: str | Path) -> FrameTree:
     InputError
         If it cannot be read, is no URDF, or has xacro in it; one line that says why.
     """
+    data = read_bytes(path)
     try:
-        return _frames(read_bytes(Path(path), LARGEST_TEXT))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
+        return _frames(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -44,23 +42,17 @@ def _frames(data: bytes) -> FrameTree:
     if root.tag != "robot":
         raise InputError(f"expected a URDF file, found <{root.tag}>")
     joints = root.findall("joint")
-    links = [[_link(joint, name) for name in ("parent", "child")] for joint in joints]
     values = np.array([_origin(joint) for joint in joints]).reshape(-1, 6)
-    rotations = se3.rotation_from_rpy(values[:, 3:])
+    poses = se3.from_rotation_translation(se3.rotation_from_rpy(values[:, 3:]), values[:, :3])
     found = FrameTree("the robot description")
-    for joint, (parent, child), T_parent_child in zip(
-        joints, links, se3.from_rotation_translation(rotations, values[:, :3]), strict=True
-    ):
-        found.add(parent, child, T_parent_child, joint.get("type") == "fixed")
+    for joint, T_parent_child in zip(joints, poses, strict=True):
+        links = [
+            part.get("link", "") for each in ("parent", "child") for part in joint.findall(each)
+        ]
+        if len(links) != 2 or not all(links):
+            raise InputError(f"joint {joint.get('name', '')!r} has no parent or no child")
+        found.add(links[0], links[1], T_parent_child, joint.get("type") == "fixed")
     return found
-
-
-def _link(joint: ElementTree.Element, name: str) -> str:
-    part = joint.find(name)
-    link = part.get("link", "") if part is not None else ""
-    if not link:
-        raise InputError(f"joint {joint.get('name', '')!r} has no {name}")
-    return link
 
 
 def _origin(joint: ElementTree.Element) -> list[float]:

@@ -1,8 +1,8 @@
 """YAML of unknown origin, read within limits.
 
-Every YAML file of the package is read here. Values are those of JSON: dates are read as text, other
-tags of YAML are refused, and so are keys that appear twice, aliases, and documents that are too
-large or too deep; all in one line.
+Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. Values are
+those of JSON: dates are read as text, other tags of YAML are refused, and so are keys that appear
+twice, aliases, and documents that are too large or too deep; all in one line.
 """
 
 import re
@@ -47,19 +47,19 @@ class _Loader(_Base):
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
 
-
-def _integer(loader: Any, node: Any) -> int:
-    value = int(loader.construct_yaml_int(node))
-    if not -(2**63) <= value < 2**63:
-        raise ValueError(f"an integer does not fit into 64 bits, line {node.start_mark.line + 1}")
-    return value
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+    def construct_yaml_int(self, node: Any) -> int:
+        value = int(super().construct_yaml_int(node))
+        if not -(2**63) <= value < 2**63:
+            line = node.start_mark.line + 1
+            raise ValueError(f"an integer does not fit into 64 bits, line {line}")
+        return value
 
 
-def read_yaml(path: str | Path) -> Any:
-    """Read a YAML file.
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
+
+def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
+    """Read a YAML file; ``expected`` is what an error says that it should be.
 
     Returns
     -------
@@ -70,20 +70,16 @@ def read_yaml(path: str | Path) -> Any:
     InputError
         If it cannot be read, is not YAML or exceeds a limit; one line that names the file.
     """
-    return _parsed(read_text(path, "YAML", LARGEST_YAML), str(path))
-
-
-def parse_foreign_yaml(text: str, name: str) -> Any:
-    """Read a text of another program: YAML, JSON with comments, or YAML of OpenCV, whose header and
-    tag are not of YAML. ``name`` is that of the file in messages.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_yaml`.
-    """
+    text = read_text(path, expected, LARGEST_YAML)
+    # Comments of JSON, header and tag of OpenCV.
     text = re.sub(r"^%YAML.*|^\s*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
-    return _parsed(text, name)
+    try:
+        _check_events(text)
+        return yaml.load(text, Loader=_Loader)
+    # A loader raises nearly anything at values that are not what their tags say.
+    except Exception as error:
+        reason = " ".join(str(error).split())[:_MOST_SHOWN] or type(error).__name__
+        raise InputError(f"{path} is not YAML that can be read: {reason}") from None
 
 
 def yaml_text(document: Any) -> str:
@@ -91,16 +87,6 @@ def yaml_text(document: Any) -> str:
     return yaml.safe_dump(
         plain(document), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
     )
-
-
-def _parsed(text: str, name: str) -> Any:
-    try:
-        _check_events(text)
-        return yaml.load(text, Loader=_Loader)
-    # A loader raises nearly anything at values that are not what their tags say.
-    except Exception as error:
-        reason = " ".join(str(error).split())[:_MOST_SHOWN] or type(error).__name__
-        raise InputError(f"{name} is not YAML that can be read: {reason}") from None
 
 
 def _check_events(text: str) -> None:

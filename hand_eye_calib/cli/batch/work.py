@@ -28,7 +28,7 @@ from hand_eye_calib.cli.reading import read_recording
 from hand_eye_calib.cli.reporting import rendered
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io import remote
-from hand_eye_calib.io.limits import ReadingMemory
+from hand_eye_calib.io.limits import limit_memory
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import told_apart
@@ -210,7 +210,7 @@ Work = Callable[[Task], Outcome]
 
 def work(task: Task) -> Outcome:
     """Do a task; what goes wrong becomes part of the outcome, so that the others go on."""
-    ReadingMemory.switch_on()  # this may be a process of its own
+    limit_memory()  # this may be a process of its own
     try:
         with remote.local_copies(task.bags) as (paths, as_given):
             recording = read_recording([*map(Path, paths)], task.sources, task.options)

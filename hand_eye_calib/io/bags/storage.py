@@ -25,7 +25,7 @@ from hand_eye_calib.io.limits import (
     BLOCK_BYTES,
     LARGEST_RATIO,
     SMALLEST_UNPACKED,
-    ReadingMemory,
+    reading_memory,
 )
 
 # Messages that are unpacked at once.
@@ -42,7 +42,7 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 class Storage:
     """A storage file opened for reading: ``path`` is its name for a person, ``file`` where it is,
-    unpacked, ``memory`` that of all that are read together.
+    unpacked.
 
     Attributes
     ----------
@@ -59,8 +59,8 @@ class Storage:
         If nothing in it can be read.
     """
 
-    def __init__(self, path: Path, file: Path, memory: ReadingMemory) -> None:
-        self.path, self._file, self._memory = path, file, memory
+    def __init__(self, path: Path, file: Path) -> None:
+        self.path, self._file = path, file
         self.counts = Counter[MessageKind]()
         self.start_ns: int | None = None
         self.end_ns: int | None = None
@@ -145,7 +145,7 @@ class Storage:
         inside, so no defect of the rest is hidden.
         """
         try:
-            with self._memory:
+            with reading_memory():
                 yield
         except MissingDependencyError:
             raise
@@ -223,14 +223,14 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
     InputError
         If there is no bag or it cannot be read; one line that names the path.
     """
-    memory, found = ReadingMemory(), list[Storage]()
+    found = list[Storage]()
     for file in [file for path in paths for file in _files_of(path)]:
         readable, lost = file, ""
         if file.suffix == ".zstd":
             folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
             readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
             lost = _unpack(file, readable)
-        storage = Storage(file, readable, memory)
+        storage = Storage(file, readable)
         opened.callback(storage.close)
         storage.losses[:0] = filter(None, [lost])
         found.append(storage)
