@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -97,7 +98,7 @@ def lines_of(path: _Path, expected: str = "a trajectory") -> Iterator[Line]:
     be read. They are read anew each time: a list would take many times the memory of the text.
     """
     try:
-        with open(open_regular(path), encoding="utf-8-sig") as file:
+        with TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
             if os.fstat(file.fileno()).st_size > LARGEST_TEXT:
                 raise InputError(f"cannot read {path}: it is larger than {LARGEST_TEXT} bytes")
             for number, text in enumerate(file, 1):
