@@ -38,57 +38,51 @@ POSE_TYPES = (
 )
 
 
-def _tf_source(stream: str) -> Any:
-    return option(
-        "",
-        f"Take the poses of the {stream} sensor from /tf and /tf_static instead of {stream}_odom: "
-        "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
-        read_only=True,
-        parse=split_frames,
-    )
+def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
+    """An option of each stream, whose name takes the place of {} in its meaning."""
+    return {
+        stream: option(default, doc.format(stream), **settings) for stream in ("parent", "child")
+    }
 
 
-def _type(stream: str) -> Any:
-    text = f"Message type of {stream}_odom; auto takes it from the publisher."
-    return option("auto", text, choices=POSE_TYPES, read_only=True)
-
-
-def _measures(stream: str) -> Any:
-    return option(
-        "auto",
-        f"What the {stream} sensor measures: poses; positions (a GNSS antenna, a prism); rotations "
-        "without positions; or angular rates. auto takes it from the message type or the columns.",
-        choices=("auto", *MEASURES),
-        read_only=True,
-    )
-
-
-def _invert(stream: str) -> Any:
-    return option(
-        "none",
-        f"Invert the {stream}'s poses, if they are those of the world in the sensor, or its "
-        "orientations alone.",
-        choices=("none", "poses", "orientations"),
-    )
-
-
-def _quaternion(stream: str) -> Any:
-    return option(
-        "xyzw",
-        f"Order in which the {stream}'s quaternions were written: wxyz puts right what was read "
-        "as x y z w.",
-        choices=("xyzw", "wxyz"),
-    )
-
-
-def _kind(stream: str) -> Any:
-    return option(
-        "odometry",
-        f"How the poses of the {stream} sensor were made. odometry (lidar, camera, wheels) has "
-        "constant errors that no recording shows: they are part of every standard deviation. exact "
-        "(motion capture, surveyed, an INS with RTK, simulated) has none.",
-        choices=("odometry", "exact"),
-    )
+_TF_SOURCE = _both(
+    "",
+    "Take the poses of the {0} sensor from /tf and /tf_static instead of {0}_odom: "
+    "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
+    read_only=True,
+    parse=split_frames,
+)
+_TYPE = _both(
+    "auto",
+    "Message type of {}_odom; auto takes it from the publisher.",
+    choices=POSE_TYPES,
+    read_only=True,
+)
+_MEASURES = _both(
+    "auto",
+    "What the {} sensor measures: poses; positions (a GNSS antenna, a prism); rotations "
+    "without positions; or angular rates. auto takes it from the message type or the columns.",
+    choices=("auto", *MEASURES),
+    read_only=True,
+)
+_INVERT = _both(
+    "none",
+    "Invert the {}'s poses, if they are those of the world in the sensor, or its "
+    "orientations alone.",
+    choices=("none", "poses", "orientations"),
+)
+_QUATERNION = _both(
+    "xyzw",
+    "Order in which the {}'s quaternions were written: wxyz puts right what was read as x y z w.",
+    choices=("xyzw", "wxyz"),
+)
+_KIND = _both(
+    "odometry",
+    "How the poses of the {} sensor were made. odometry (lidar, camera, wheels) has "
+    "constant errors that no recording shows: they are part of every standard deviation. exact "
+    "(motion capture, surveyed, an INS with RTK, simulated) has none.",
+    choices=("odometry", "exact"),
+)
 
 
 def _prior(axis: str) -> Any:
@@ -221,14 +215,14 @@ class CalibratorConfig(OptionSet):
         "Factor from the parent's lengths to metres, such as 0.001 for millimetres.",
         within=(1e-6, 1e6),
     )
-    parent_measures: str = _measures("parent")
-    child_measures: str = _measures("child")
-    parent_invert: str = _invert("parent")
-    child_invert: str = _invert("child")
-    parent_quaternion: str = _quaternion("parent")
-    child_quaternion: str = _quaternion("child")
-    parent_kind: str = _kind("parent")
-    child_kind: str = _kind("child")
+    parent_measures: str = _MEASURES["parent"]
+    child_measures: str = _MEASURES["child"]
+    parent_invert: str = _INVERT["parent"]
+    child_invert: str = _INVERT["child"]
+    parent_quaternion: str = _QUATERNION["parent"]
+    child_quaternion: str = _QUATERNION["child"]
+    parent_kind: str = _KIND["parent"]
+    child_kind: str = _KIND["child"]
     prior_x: str = _prior("x")
     prior_y: str = _prior("y")
     prior_z: str = _prior("z")
@@ -349,8 +343,8 @@ class NodeConfig(OptionSet):
     """Options that only the node has."""
 
     solve_period: float = option(2.0, "Time between solves.", unit="s", within=(0.05, 3600.0))
-    parent_type: str = _type("parent")
-    child_type: str = _type("child")
+    parent_type: str = _TYPE["parent"]
+    child_type: str = _TYPE["child"]
     other_children: int = option(
         0,
         "Number of further child sensors, with poses on child2_odom, child3_odom and so on. "
@@ -359,8 +353,8 @@ class NodeConfig(OptionSet):
         within=(0, MOST_OTHERS),
         read_only=True,
     )
-    parent_tf: str = _tf_source("parent")
-    child_tf: str = _tf_source("child")
+    parent_tf: str = _TF_SOURCE["parent"]
+    child_tf: str = _TF_SOURCE["child"]
     output_directory: str = option(
         "",
         "Directory of the journal and of the result files, which ~/save and the end of the node "

@@ -62,7 +62,8 @@ def with_sigma(value: float | None, sigma: float | None, least_decimals: int = 2
     """
     if value is None or sigma is None or not math.isfinite(sigma):
         return "unknown"
-    decimals = max(decimals_of(sigma), least_decimals)
+    of_sigma = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0 else _MOST_DECIMALS
+    decimals = max(min(of_sigma, _MOST_DECIMALS), least_decimals)
     return f"{fixed(value, decimals)} +/- {fixed(sigma, decimals)}"
 
 
@@ -73,13 +74,6 @@ def printed_angle(degrees: float | None, sigma: float | None) -> str:
     return (
         fixed(degrees, 2) if degrees is not None and sigma is None else with_sigma(degrees, sigma)
     )
-
-
-def decimals_of(sigma: float) -> int:
-    """Decimals that show two digits of a standard deviation."""
-    if not sigma > 0:
-        return _MOST_DECIMALS
-    return min(max(1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS)
 
 
 def fixed(value: float, decimals: int = 4) -> str:
@@ -185,21 +179,15 @@ def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
     if not text:
         return {}
     before, _, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
-    values, sigmas = before.split(), after.split()
-    axes, expected = [name.removeprefix("prior.")], "VALUE+/-SIGMA"
+    sigmas = after.split()
+    axes, form = [name.removeprefix("prior.")], "VALUE+/-SIGMA, with its standard deviation"
     if axes == ["transform"]:
-        axes, expected = [*AXIS_UNITS], "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
+        axes, form = [*AXIS_UNITS], "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
         sigmas = sigmas[:1] * 3 + sigmas[1:] * 3 if len(sigmas) == 2 else sigmas
-    if len(values) != len(axes) or len(sigmas) != len(axes):
-        raise ConfigError(f"{name} must be {expected}, with its standard deviation; got {text!r}")
-    prior = {}
-    for axis, value, sigma in zip(axes, values, sigmas, strict=True):
-        prior[axis] = _quantity(name, value, AXIS_UNITS[axis]), _above_0(name, sigma, axis)
-        if AXIS_UNITS[axis] == "rad" and abs(prior[axis][0]) > 2 * math.pi:
-            raise ConfigError(
-                f"{name} is in radians unless it says deg; got {value[:20]}: write {value[:20]}deg"
-            )
-    return prior
+    known = _quantities(name, axes, before.split(), form)
+    return dict(
+        zip(axes, zip(known, _quantities(name, axes, sigmas, form, 0.0), strict=True), strict=True)
+    )
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:
@@ -211,11 +199,7 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
     ConfigError
         If the text has another form.
     """
-    words = text.split()
-    if len(words) != len(AXIS_UNITS):
-        raise ConfigError(f"{name} must be X Y Z ROLL PITCH YAW; got {shown_value(text)}")
-    values = zip(words, AXIS_UNITS.values(), strict=True)
-    return tuple(_quantity(name, word, unit) for word, unit in values)
+    return tuple(_quantities(name, [*AXIS_UNITS], text.split(), "X Y Z ROLL PITCH YAW"))
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
@@ -235,28 +219,38 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
                 f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
                 f"yaw=0.5deg; got {shown_value(word)}"
             )
-        targets[axis] = _above_0(f"{name}: {axis}", value, axis)
+        (targets[axis],) = _quantities(f"{name}: {axis}", [axis], [value], "TARGET", 0.0)
         if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
             raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
     return targets
 
 
-def _quantity(name: str, text: str, unit: str) -> float:
-    match = _QUANTITY.fullmatch(text)
-    if not match or (match[2] or unit) not in _IN_SI[unit]:
-        units = " or ".join(_IN_SI[unit])
-        raise ConfigError(f"{name} must be numbers in {units}; got {shown_value(text)}")
-    value = float(match[1]) * _IN_SI[unit][match[2] or unit]
-    if abs(value) > _LARGEST_QUANTITY:
-        raise ConfigError(f"{name} must be at most {_LARGEST_QUANTITY:g} {unit}; got {text[:20]!r}")
-    return value
-
-
-def _above_0(name: str, text: str, axis: str) -> float:
-    value = _quantity(name, text, AXIS_UNITS[axis])
-    if not value > 0:
-        raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(text)}")
-    return value
+def _quantities(
+    name: str, axes: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
+) -> list[float]:
+    """Numbers of axes, in m or rad, from words with or without units; ``form`` is how the option
+    ``name`` is written.
+    """
+    if len(words) != len(axes):
+        raise ConfigError(f"{name} must be {form}; got {shown_value(' '.join(words))}")
+    found = []
+    for axis, word in zip(axes, words, strict=True):
+        unit, match = AXIS_UNITS[axis], _QUANTITY.fullmatch(word)
+        if not match or (match[2] or unit) not in _IN_SI[unit]:
+            units = " or ".join(_IN_SI[unit])
+            raise ConfigError(f"{name} must be numbers in {units}; got {shown_value(word)}")
+        value = float(match[1]) * _IN_SI[unit][match[2] or unit]
+        if abs(value) > _LARGEST_QUANTITY:
+            largest = f"{_LARGEST_QUANTITY:g} {unit}"
+            raise ConfigError(f"{name} must be at most {largest}; got {word[:20]!r}")
+        if not value > above:
+            raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(word)}")
+        if unit == "rad" and not match[2] and abs(value) > 2 * math.pi:
+            raise ConfigError(
+                f"{name} is in radians unless it says deg; got {word[:20]}: write {word[:20]}deg"
+            )
+        found.append(value)
+    return found
 
 
 def split_frames(name: str, text: str) -> tuple[str, str]:

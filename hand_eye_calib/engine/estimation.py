@@ -24,7 +24,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC
-from hand_eye_calib.methods import METHODS
+from hand_eye_calib.methods import require_backend
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, Residuals
@@ -193,7 +193,7 @@ def solve_poses(
         If there are too few poses for the reference or for the scale.
     """
     scale, scale_fit = settle_scale(pose_pairs, config.scale)
-    METHODS[config.method].require_backend(config.backend)
+    require_backend(config.method, config.backend)
     scaled = pose_pairs.child_scaled(scale)
     if config.method in ("auto", "adaptive"):
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)

@@ -8,7 +8,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
-from hand_eye_calib.methods import METHODS
+from hand_eye_calib.methods import METHODS, require_backend
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, quadratic_form, zhuang
 from hand_eye_calib.solvers.solution import Solution
@@ -55,7 +55,7 @@ class Method:
     def __post_init__(self) -> None:
         if self.name not in _SOLVERS:
             raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}")
-        METHODS[self.name].require_backend(self.backend)
+        require_backend(self.name, self.backend)
 
     @property
     def rejection(self) -> tuple[float, ...]:

@@ -267,7 +267,7 @@ def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
         (b"MATLAB 5.0 MAT-file, Platform: GLNXA64\x00\x01IM" + bytes(99), "save the poses as text"),
         (b"PK\x03\x04" + bytes(40), "save the sheet as csv"),
         (b"\x89HDF\r\n\x1a\n" + bytes(40), "HDF5"),
-        (b"\x89MCAP0\r\n" + bytes(40), "name it .mcap"),
+        (b"\x89MCAP0\r\n" + bytes(40), "not a text file"),
         (b"\x93NUMPY\x01\x00" + bytes(10), "cannot read"),
         (b"<gpx><trkpt lat='1' lon='2'/></gpx>", "has no time"),
         (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),

@@ -31,9 +31,6 @@ _NOT_READ = {
     "save('poses.txt', 'poses', '-ascii', '-double')",
     b"PK\x03\x04": "a spreadsheet or another zip file; save the sheet as csv",
     b"\x89HDF": "an HDF5 file; save the poses as csv or .npy",
-    b"#ROSBAG": "a bag; name it .bag and give it as one",
-    b"\x89MCAP": "a bag; name it .mcap and give it as one",
-    b"SQLite format 3": "a database, perhaps a bag; name it .db3 and give it as one",
     b"\x80\x04": "a pickle of Python, which is not read as it could run anything; save .npy or csv",
 }
 # Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
