@@ -206,11 +206,10 @@ def _check_sizes(
     pose_pairs = explanation.hypothesis.undo(streams).shifted(offset_s).synchronised
     rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
     findings, fit = _check_axes(rotations, explanation.fit.sigma_rotation), explanation.fit
-    if explanation.same_unit:
-        return [finding("unit_unseen"), *findings], fit
-    with suppress(NotEnoughDataError):
-        found = estimate_scale(pose_pairs, start=fit)
-        return [*_check_scale(found, scale), *findings], found
+    if not explanation.same_unit:
+        with suppress(NotEnoughDataError):
+            found = estimate_scale(pose_pairs, start=fit)
+            return [*_check_scale(found, scale), *findings], found
     return findings, fit
 
 
@@ -270,17 +269,6 @@ def _with_lengths(findings: list[Finding], parent: Trajectory) -> list[Finding]:
     return findings + check_lengths(parent)
 
 
-def unit_of(scale: float) -> tuple[float, str] | None:
-    """Factor and name of the unit of length that a scale is about, of the child or, above 1, of
-    the parent; None if it is about none.
-    """
-    for factor, name in _UNITS.items():
-        for each in (factor, 1.0 / factor):
-            if abs(scale / each - 1.0) < _UNIT_TOLERANCE:
-                return each, name
-    return None
-
-
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
     """Whether two streams last so long, and rotate so far, that the checks mean something: to be
     asked during a session.
@@ -326,28 +314,35 @@ def _check_scale(fit: SimilarityFit, known: float) -> list[Finding]:
     if not scale_differs(fit):
         return []
     scale, sigma = fit.scale, fit.scale_sigma
-    if found := unit_of(scale):
-        factor, unit = found
-        return [in_other_units(scale, sigma, unit, round(known * factor, 9))]
+    if found := in_other_units(scale, sigma, known):
+        return [found]
     severity = Severity.ERROR if abs(scale - 1.0) > _SCALE_ERROR else Severity.WARNING
     options = {"scale": round(known * scale, 4)}
     return [finding("scale", "child", severity, options=options, scale=scale, sigma=sigma)]
 
 
-def in_other_units(scale: float, sigma: float, unit: str, factor: float) -> Finding:
-    """The finding that a stream's lengths are in another unit, by the scale that was found: the
-    child's if it is below 1, otherwise the parent's.
+def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:
+    """The finding that a stream's lengths are in another unit, by the scale that was found beside
+    the known one: the child's if it is below 1, otherwise the parent's; None if the scale is about
+    that of no unit.
     """
     is_child = scale < 1.0
-    return finding(
-        "units",
-        "child" if is_child else "parent",
-        options={"scale": factor} if is_child else {"parent_scale": round(1.0 / factor, 9)},
-        other="parent" if is_child else "child",
-        scale=scale,
-        sigma=sigma,
-        unit=unit,
-    )
+    for factor, unit in _UNITS.items():
+        if abs(scale / (factor if is_child else 1.0 / factor) - 1.0) < _UNIT_TOLERANCE:
+            return finding(
+                "units",
+                "child" if is_child else "parent",
+                options=(
+                    {"scale": round(known * factor, 9)}
+                    if is_child
+                    else {"parent_scale": round(factor / known, 9)}
+                ),
+                other="parent" if is_child else "child",
+                scale=scale,
+                sigma=sigma,
+                unit=unit,
+            )
+    return None
 
 
 def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:

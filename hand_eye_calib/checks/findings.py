@@ -243,14 +243,6 @@ _ROWS = {
         "that moves",
         severity=_WARNING,
     ),
-    "unit_unseen": _Row(
-        "the body rotates about one of the sensors, so that this motion cannot tell whether both "
-        "streams have one unit of length: the translation is as long as the other sensor's stream "
-        "has it",
-        "nothing, if both measure in metres; otherwise move the body as well",
-        "a pan-tilt unit, or a robot that rotates on the spot",
-        severity=_WARNING,
-    ),
     "mount_moved": _Row(
         "the extrinsic changes {at_s:.0f} s after the start by {size}",
         "tighten it and record again, or calibrate the parts before and after on their own",

@@ -22,7 +22,7 @@ import numpy as np
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks.findings import Finding, Severity, conventions, finding
-from hand_eye_calib.checks.streams import coarse_poses
+from hand_eye_calib.checks.streams import coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -48,15 +48,14 @@ _NOISY = 0.3
 _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 
 # Evidence (in logarithms of lengths) from which on streams are called inverted, and likely so.
+# Paths are over steps so coarse (s) that noise does not add to them. Frames this close (m, rad) may
+# be one: of one world for both streams, the lever arm between the worlds says nothing.
 _INVERTED, _LIKELY_INVERTED = 0.3, 1.0
-_PATH_STEP_S, _LEAST_LEVER_ARM_M = 0.3, 1e-3
+_PATH_STEP_S, _SAME_FRAME = 0.3, 0.01
 
 # An arm about its base, or a camera around its target, moves less than the base or target seen from
 # it. Sensors that stay within this distance (m), an arm's reach, may be such; stops too.
 _REACH_M = 3.0
-
-# Two frames are one if they are this close to each other (m, rad).
-_SAME_FRAME_M, _SAME_FRAME_RAD = 0.01, 0.01
 
 
 @dataclass(frozen=True)
@@ -217,7 +216,7 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     NotEnoughDataError
         If the streams have too few motions in common.
     """
-    failed: list[tuple[float, Explanation]] = []
+    failed: list[Explanation] = []
     for lag_s in LAGS_S:
         try:
             chosen = _plain_or_usual(streams, lag_s, _NOISY if thorough else HOLDS)
@@ -227,15 +226,15 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
         if not chosen.holds and thorough and not failed:
             chosen = _or_other_axes(chosen, streams, lag_s)
         if chosen.holds:
-            return _attributed(chosen, streams, lag_s)
+            return _attributed(chosen, streams)
         # Jumps spoil long motions more than short ones.
-        failed.append((lag_s, chosen))
+        failed.append(chosen)
     if not failed:
         raise too_few
-    lag_s, best = min(failed, key=lambda tried: tried[1].fit.unexplained)
+    best = min(failed, key=lambda tried: tried.fit.unexplained)
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
-        attributed = _attributed(best, streams, lag_s)
+        attributed = _attributed(best, streams)
         findings = (*attributed.findings, finding("noisy", share=unexplained))
         return replace(attributed, findings=findings, limit=_NOISY)
     return replace(best, findings=(finding("not_one_body", share=min(unexplained, 1.0)),))
@@ -299,7 +298,7 @@ def _is_decisive(plain: Explanation, rival: Explanation, limit: float) -> bool:
     return unexplained < limit and _DECISIVE * unexplained < plain.fit.unexplained
 
 
-def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
     """The explanation with its finding, after deciding by path lengths which stream is inverted, or
     both: the fits do not differ.
     """
@@ -308,7 +307,7 @@ def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> 
         detail, options = explanation.hypothesis.detail, conventions(code, stream)
         found = finding(code, stream, options=options, detail=detail)
         return replace(explanation, findings=(found,))
-    evidence, inverted = _evidence_for_inverse(streams, explanation, lag_s)
+    evidence, inverted = _evidence_for_inverse(streams, explanation)
     if code:
         fit = explanation.fit
         if evidence >= _INVERTED:
@@ -338,40 +337,27 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
 
 
 def _evidence_for_inverse(
-    streams: StreamPair, explanation: Explanation, lag_s: float
+    streams: StreamPair, explanation: Explanation
 ) -> tuple[float, SimilarityFit]:
     """Sum of logarithms by which paths and lever arm are shorter with both streams inverted, and
-    the fit then: the fit as they are if no other lever arm could make the sum matter.
+    the fit then: its X is the pose of the child's world in the parent's.
     """
     streams, fit = explanation.hypothesis.undo(streams), explanation.fit
-    by_paths = 0.0
+    evidence = 0.0
     for stream in (streams.parent, streams.child):
-        # Steps are so coarse that noise does not add to the path.
-        coarse = coarse_poses(stream, _PATH_STEP_S)
-        by_paths += float(np.log(_path_m(coarse) / _path_m(se3.inverse(coarse))))
-    most = by_paths + 0.5 * float(np.log(_lever_arm(fit) / _LEAST_LEVER_ARM_M))
-    if not explanation.hypothesis.code and most < _INVERTED:
-        return most, fit
-    inverted = _fitted(_BOTH_INVERTED, streams, lag_s, same_unit=explanation.same_unit).fit
-    if _is_identity(fit) or _is_identity(inverted):
-        # One world for both streams: the lever arm between the worlds says nothing.
-        return by_paths, inverted
-    return by_paths + 0.5 * float(np.log(_lever_arm(fit) / _lever_arm(inverted))), inverted
+        poses = coarse(stream, _PATH_STEP_S).poses
+        evidence += float(np.log(_path_m(poses) / _path_m(se3.inverse(poses))))
+    pairs, Ts_c_cw = streams.synchronised, se3.inverse(streams.synchronised.Ts_cw_c)
+    Ts_c_cw[:, :3, 3] *= fit.scale
+    worlds = pairs.Ts_pw_p @ fit.T_parent_child @ Ts_c_cw
+    off = np.linalg.norm(worlds[:, :3, 3] - np.median(worlds[:, :3, 3], axis=0), axis=1)
+    inverted = replace(fit, T_parent_child=worlds[np.argmin(off)])
+    Ts = np.array([fit.T_parent_child, inverted.T_parent_child])
+    arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)
+    if (np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])) > _SAME_FRAME).all():
+        evidence += 0.5 * float(np.log(arms_m[0] / arms_m[1]))
+    return evidence, inverted
 
 
 def _path_m(poses: FloatArray) -> float:
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()) + 1e-9
-
-
-def _lever_arm(fit: SimilarityFit) -> float:
-    """Length of the lever arm, m, or of what noise may make of it."""
-    length_m = float(np.linalg.norm(fit.T_parent_child[:3, 3]))
-    return max(length_m, 3 * fit.sigma_translation, _LEAST_LEVER_ARM_M)
-
-
-def _is_identity(fit: SimilarityFit) -> bool:
-    """Whether a fit's transform differs from the identity by no more than noise."""
-    T = fit.T_parent_child
-    is_near = np.linalg.norm(T[:3, 3]) <= max(_SAME_FRAME_M, 3 * fit.sigma_translation)
-    is_aligned = se3.rotation_angle(T[:3, :3]) < max(_SAME_FRAME_RAD, 3 * fit.sigma_rotation)
-    return bool(is_near and is_aligned)

@@ -23,28 +23,17 @@ _GAP_INTERVALS = 5.0
 _JUMP_SIGMAS, _JUMP_STEPS = 12.0, 3.0
 _MIN_JUMPS = 0.002
 
-# A stream is frozen if its pose is repeated to the last digits for this long (s) and at least this
-# many times, while the other stream moves.
-_FROZEN_S, _FROZEN_POSES = 1.0, 10
+# A stream is frozen if its pose is repeated to the last digits for this long (s) while the other
+# stream moves, and that for more than this share of the time.
+_FROZEN_S, _MAX_FROZEN = 1.0, 0.02
 _SAME_POSE = 1e-12
-
-# Largest share of the time in which a stream may be frozen.
-_MAX_FROZEN = 0.02
 
 # Two sensors take turns if a stream is this many times rougher from pose to pose than over some
 # longer lag (in poses), by at least so many metres. Repeated poses are another matter.
-_ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M = 2.0, 6, 0.01
+_ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M, _MAX_REPEATS = 2.0, 6, 0.01, 0.1
 # Their levels are steady over so many turns, in the world or in the sensor's axes, and make up this
 # share of the roughness: a body that shakes at about half the rate of the poses does not keep step.
 _TURNS, _STEADY_SHARE = 10, 0.5
-_MIN_POSES_OF_TURNS, _MAX_REPEATS = 60, 0.1
-
-# Two sensors in no order: how many times more a pose is off along one direction than along others,
-# its largest kurtosis there (3 for noise, 2 for two levels), and largest growth with the lag (1 for
-# noise and levels, 4 for curves). A body that shakes has half of the power in three neighbouring
-# frequencies of a spectrum over so many poses.
-_MIN_POSES_OF_MIX, _ONE_DIRECTION, _FEW_AMOUNTS, _STEADY = 300, 8.0, 2.4, 1.5
-_SPECTRUM_POSES, _SHAKES = 64, 0.5
 
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
 # of the smallest, to this share of a step. Steps (m) from which on that matters.
@@ -52,18 +41,13 @@ _MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
 _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
 _COARSE_NOTE_M, _COARSE_WARNING_M, _COARSE_ERROR_M = 0.002, 0.005, 0.02
 
-# A stream is flat if its vertical and its height (m) stay the same to rounding; that matters if the
-# other tilts by more than this (rad).
-_UPRIGHT, _LEVEL_M, _TILTS_RAD = 1e-6, 1e-6, 0.02
-
-# Motion (rad, m) from which on a stream moves.
-_MOVES_RAD, _MOVES_M = 0.02, 0.02
+# A stream is flat if its vertical and its height (m) stay the same to rounding. A stream moves, or
+# tilts, by more than this (rad, m).
+_FLAT, _MOVES = 1e-6, 0.02
 
 # Stamps of a date are around 1.7e18 ns. Read in another unit they are off by powers of a thousand.
-_STAMP_UNITS = {1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
-_SAME_TIME = 0.2
+_STAMP_UNITS = ("nanoseconds", "microseconds", "milliseconds", "seconds")
 _DATE_NS = 1e17
-
 
 # No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears ten times
 # gravity for a whole second (m/s^2), which is twice what a racing car does. Arms, which move least,
@@ -91,9 +75,9 @@ class StreamSummary:
 def summarise(trajectory: Trajectory) -> StreamSummary:
     """StreamSummary of a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    coarse = coarse_poses(trajectory, max(_PATH_STEP_S, median(intervals_s)))
-    steps = np.linalg.norm(np.diff(coarse[:, :3, 3], axis=0), axis=1)
-    angles = se3.rotation_angle(np.swapaxes(coarse[:-1, :3, :3], 1, 2) @ coarse[1:, :3, :3])
+    poses = coarse(trajectory, max(_PATH_STEP_S, median(intervals_s))).poses
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     return StreamSummary(
         poses=len(trajectory),
         duration_s=trajectory.duration_s,
@@ -104,10 +88,10 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
     )
 
 
-def coarse_poses(trajectory: Trajectory, step_s: float) -> FloatArray:
-    """Poses (M, 4, 4): the first in every step of ``step_s`` seconds that has one."""
+def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:
+    """The first pose in every step of ``step_s`` seconds that has one."""
     steps = (trajectory.stamps_ns - trajectory.stamps_ns[0]) // round(step_s * 1e9)
-    return trajectory.poses[np.unique(steps, return_index=True)[1]]
+    return trajectory[np.unique(steps, return_index=True)[1]]
 
 
 def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
@@ -125,8 +109,6 @@ def check_stream(
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(finding.code != "gaps" for finding in findings):
         return findings
-    if apart_m := _mixed(trajectory):
-        return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     share = float(_jumps(trajectory).mean())
     if share > _MIN_JUMPS:
         findings.append(finding("jumps", stream, options={"method": "dnlo"}, share=share))
@@ -171,67 +153,27 @@ def _interleaved(trajectory: Trajectory) -> float:
     rougher from one pose to the next than over several; otherwise 0.
     """
     positions, stamps_ns = trajectory.poses[:, :3, 3], trajectory.stamps_ns
-    if len(positions) < _MIN_POSES_OF_TURNS:
-        return 0.0
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME_POSE
-    off = [_off_line(positions, stamps_ns, lag) for lag in range(1, _MAX_PERIOD + 1)]
+    if len(positions) < (_TURNS + 2) * _MAX_PERIOD or repeats.mean() > _MAX_REPEATS:
+        return 0.0
+    off = []  # the line between the poses so many before and after
+    for lag in range(1, _MAX_PERIOD + 1):
+        before, after = positions[: -2 * lag], positions[2 * lag :]
+        elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
+        share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
+        off.append(positions[lag:-lag] - before - share[:, None] * (after - before))
     rough = [median(np.linalg.norm(vectors, axis=1)) for vectors in off]
     period = 2 + int(np.argmin(rough[1:]))
-    least_m = max(_ALTERNATES * rough[period - 1], _LEAST_LEVELS_M)
-    if repeats.mean() > _MAX_REPEATS or rough[0] < least_m:
+    if rough[0] < max(_ALTERNATES * rough[period - 1], _LEAST_LEVELS_M):
         return 0.0
-    # Share of the mean square that repeats after a period: the median over some turns each.
-    in_body = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])
-    n_turns = min(_TURNS, len(in_body) // period)
-    n_windows = len(in_body) // (n_turns * period)
-    shares = []
-    for vectors in (off[0], in_body):
-        windows = vectors[: n_windows * n_turns * period].reshape(n_windows, n_turns, period, 3)
+    for vectors in (off[0], np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])):
+        n_windows = len(vectors) // (_TURNS * period)
+        windows = vectors[: n_windows * _TURNS * period].reshape(n_windows, _TURNS, period, 3)
         levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
         total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
-        shares.append(median(levels / np.maximum(total, 1e-300)))
-    return rough[0] if max(shares) >= _STEADY_SHARE else 0.0
-
-
-def _mixed(trajectory: Trajectory) -> float:
-    """Like :func:`_interleaved`, for two sensors in no order: seen from the sensor, a pose is off
-    those around it along one direction, by one of few amounts.
-    """
-    positions, rotations = trajectory.poses[:, :3, 3], trajectory.poses[:, :3, :3]
-    if len(positions) < _MIN_POSES_OF_MIX:
-        return 0.0
-    near, far = (
-        np.einsum("kji,kj->ki", rotations[lag:-lag], _off_line(positions, None, lag))
-        for lag in (1, 2)
-    )
-    sizes, directions = np.linalg.eigh(near.T @ near / len(near))
-    along = near @ directions[:, -1]
-    peakedness = float(np.mean(along**4) / max(np.mean(along**2) ** 2, 1e-300))
-    growth = float(np.sqrt((far**2).sum(axis=1).mean() / max(sizes.sum(), 1e-300)))
-    # Sensors in no order have all frequencies, an oscillation few: of the positions themselves,
-    # without the slow motion.
-    windows = along[: len(along) // _SPECTRUM_POSES * _SPECTRUM_POSES].reshape(-1, _SPECTRUM_POSES)
-    power = (np.abs(np.fft.rfft(windows * np.hanning(_SPECTRUM_POSES), axis=1)) ** 2).mean(axis=0)
-    cycles = np.arange(_SPECTRUM_POSES // 8, len(power))
-    power = power[cycles] / (1.0 - np.cos(2 * np.pi * cycles / _SPECTRUM_POSES)) ** 2
-    shakes = np.convolve(power, np.ones(3), "valid").max() > _SHAKES * power.sum()
-    is_along_one = sizes[2] > max(_ONE_DIRECTION * sizes[1], _LEAST_LEVELS_M**2 / 4)
-    if not is_along_one or peakedness >= _FEW_AMOUNTS or growth >= _STEADY or shakes:
-        return 0.0
-    # A quarter of the poses are off by the distance of the levels, half by a half of it.
-    return float(np.sqrt(sizes[2] / 0.375))
-
-
-def _off_line(positions: FloatArray, stamps_ns: IntArray | None, lag: int) -> FloatArray:
-    """How far (M, 3) each position is off the line between those ``lag`` poses before and after, at
-    its stamp, or off the middle.
-    """
-    before, middle, after = positions[: -2 * lag], positions[lag:-lag], positions[2 * lag :]
-    if stamps_ns is None:
-        return middle - 0.5 * (before + after)
-    elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
-    share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
-    return middle - before - share[:, None] * (after - before)
+        if median(levels / np.maximum(total, 1e-300)) >= _STEADY_SHARE:
+            return rough[0]
+    return 0.0
 
 
 def _grid_step(values: FloatArray) -> float:
@@ -259,13 +201,13 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         ("child", child, "parent", parent),
     ):
         vertical, heights = flat.poses[:, 2, 2], flat.poses[:, 2, 3]
-        if np.abs(vertical - vertical[0]).max() >= _UPRIGHT or np.ptp(heights) > _LEVEL_M:
+        if np.abs(vertical - vertical[0]).max() >= _FLAT or np.ptp(heights) > _FLAT:
             continue
         # The direction in the other sensor whose image in the world scatters least: its axis of
         # rotation.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
-        if tilt_rad > _TILTS_RAD:
+        if tilt_rad > _MOVES:
             return [finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))]
     return []
 
@@ -310,14 +252,12 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
     frozen_ns = 0
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         from_ns, until_ns = (int(trajectory.stamps_ns[index]) for index in (start, end))
-        if end - start < _FROZEN_POSES or until_ns - from_ns < _FROZEN_S * 1e9:
-            continue
         during = other.poses[(other.stamps_ns >= from_ns) & (other.stamps_ns <= until_ns)]
-        if len(during) < 2:
+        if until_ns - from_ns < _FROZEN_S * 1e9 or len(during) < 2:
             continue
         distance = np.linalg.norm(during[:, :3, 3] - during[0, :3, 3], axis=1).max()
         angle = se3.rotation_angle(during[0, :3, :3].T @ during[:, :3, :3]).max()
-        if distance > _MOVES_M or angle > _MOVES_RAD:
+        if max(distance, angle) > _MOVES:
             frozen_ns += until_ns - from_ns
     return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
 
@@ -326,23 +266,24 @@ def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[
     """Finding about stamps (N,), as read, in another unit than the other stream's, or none."""
     stamps = {"parent": median(parent_stamps_ns), "child": median(child_stamps_ns)}
     early, late = sorted(stamps, key=lambda name: stamps[name])
-    if stamps[early] > 0 and stamps[late] > _DATE_NS:
-        for factor, unit in _STAMP_UNITS.items():
-            if abs(np.log10(stamps[late] / (stamps[early] * factor))) < _SAME_TIME:
-                return [finding("stamp_unit", early, other=late, unit=unit, factor=factor)]
-    return []
+    if stamps[early] <= 0 or stamps[late] < _DATE_NS:
+        return []
+    power = round(np.log10(stamps[late] / stamps[early]) / 3)
+    if not 0 < power < len(_STAMP_UNITS):
+        return []
+    unit = _STAMP_UNITS[power]
+    return [finding("stamp_unit", early, other=late, unit=unit, factor=1000.0**power)]
 
 
 def check_lengths(parent: Trajectory) -> list[Finding]:
     """Finding about motion that no vehicle has, or none: two streams in millimetres agree, and
     nothing else tells.
     """
-    steps = (parent.stamps_ns - parent.stamps_ns[0]) // round(_STEP_S * 1e9)
-    rows = np.unique(steps, return_index=True)[1]
-    if len(rows) < 4:
+    parent = coarse(parent, _STEP_S)
+    if len(parent) < 4:
         return []
-    intervals_s = np.diff(parent.stamps_ns[rows])[:, None] * 1e-9
-    velocities = np.diff(parent.poses[rows, :3, 3], axis=0) / intervals_s
+    intervals_s = np.diff(parent.stamps_ns)[:, None] * 1e-9
+    velocities = np.diff(parent.poses[:, :3, 3], axis=0) / intervals_s
     changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
     speed = quantile(np.linalg.norm(velocities, axis=1), _USUAL)
     change = quantile(np.linalg.norm(changes, axis=1), _USUAL)

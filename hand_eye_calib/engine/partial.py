@@ -16,7 +16,7 @@ from hand_eye_calib.alignment.time_offset import PLAIN_RATE
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_lever_arm, assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
-from hand_eye_calib.checks.check import in_other_units, unit_of
+from hand_eye_calib.checks.check import in_other_units
 from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import calibration_of, residuals_of
@@ -212,9 +212,9 @@ def _of_path(
         return []
     left, scaled = mended(positions, with_scale=True)
     scale = scaled.scale if is_child else 1.0 / scaled.scale
-    if left < _UNRELATED_PATH and (in_unit := unit_of(scale)):
-        factor, unit = in_unit
-        return [in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale), unit, factor)]
+    found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
+    if left < _UNRELATED_PATH and found:
+        return [found]
     what: dict[str, Any] = {
         "other": "odometry",
         "part": "motion of the positions",
