@@ -79,8 +79,8 @@ def real_cases(folder: Path | None) -> Iterator[Case]:
 def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
     assert rig.truth is not None
     options = {name: value for name, value in rig.options.items() if name != "prior"}
-    snapshot = whole_snapshot(offline_config(parent, child, options), parent, child).resolved()
-    pairs = snapshot.pose_pairs()
+    snapshot = whole_snapshot(offline_config(parent, child, options), parent, child).resolved
+    pairs = snapshot.pose_pairs
     pairs = pairs.child_scaled(settle_scale(pairs, snapshot.config.scale)[0])
     family = next((each for each in _FAMILIES if each in rig.name), rig.name)
     is_clock_free = snapshot.time_offset is not None

@@ -105,19 +105,10 @@ _ROWS = {
     "unrelated_parts": _Row(
         "{share:.0%} of the {part} is not that of the {other}", _ONE_BODY, code="unrelated"
     ),
-    "unsolved": _Row("{text}", _ONE_BODY, code="unrelated"),
     "not_independent": _Row(
         "The two streams are not independent: one seems to be computed from the other. This result "
         "only repeats the transform that was used for it.",
         "give the poses that each sensor measured by itself",
-    ),
-    "coordinates": _Row(
-        "the {stream}'s positions fit the other sensor's path only with x (east) multiplied by "
-        "{factor_x:.3g} and y (north) by {factor_y:.3g}{swapped}: then "
-        "{unexplained_share_mended:.1%} of the motion stays unexplained instead of "
-        "{unexplained_share:.0%}",
-        "write metres east, north and up: longitudes times the cosine of the latitude, and neither "
-        "latitude and longitude nor east and north swapped",
     ),
     "rate_unit": _Row(
         "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "

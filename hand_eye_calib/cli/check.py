@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import answered, finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.engine.checking import check_partial
+    from hand_eye_calib.engine.checking import check
     from hand_eye_calib.engine.offline import offline_config, whole_snapshot
     from hand_eye_calib.plain import json_text
 
@@ -58,21 +58,22 @@ def run(arguments: argparse.Namespace) -> int:
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking the streams"):
-        if {parent.measures, child.measures} == {"poses"}:
+        if config.measured == "poses":
             checked = check_streams(parent, child, offset_s, scale, config.max_gap)
         else:
-            checked = check_partial(snapshot)
+            checked = check(snapshot, snapshot.estimate())
     of_files = [finding("disorder", text=text) for text in repairs]
     findings = gravest_first(answered([*checked.findings, *of_files], config))
     both = zip(STREAMS, (parent, child), strict=True)
     streams = {name: summarise(one) for name, one in both if len(one) > 1}
     if arguments.json:
-        found = checked.correlation
-        turning = {
-            "time_offset_s": found.offset_s,
-            "correlation": found.correlation,
-            "distinctness": found.distinctness,
-        }
+        found, turning = checked.correlation, None
+        if config.measured == "poses":
+            turning = {
+                "time_offset_s": found.offset_s,
+                "correlation": found.correlation,
+                "distinctness": found.distinctness,
+            }
         summaries = {name: {"source": sources[name], **vars(streams[name])} for name in streams}
         print(json_text({"streams": summaries, "turning": turning, "findings": findings}))
     else:

@@ -181,7 +181,7 @@ def next_steps(
         if is_of_poses and snapshot:
             from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 
-            motion = what_is_missing(excitation(snapshot.pose_pairs()), calibration)
+            motion = what_is_missing(excitation(snapshot.pose_pairs), calibration)
             steps += [motion] if motion else []
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]

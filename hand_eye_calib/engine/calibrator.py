@@ -5,6 +5,7 @@ files.
 """
 
 import contextlib
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,12 +13,10 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import (
     STREAMS,
-    RawPoses,
     Snapshot,
     downsample,
     estimated_time_offset,
@@ -26,12 +25,9 @@ from hand_eye_calib.engine.snapshot import (
 )
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.frames import check_pose
-from hand_eye_calib.geometry.trajectory import REACH
+from hand_eye_calib.geometry.trajectory import REACH, Trajectory
 from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
 from hand_eye_calib.results.calibration import Calibration
-
-# Share of the poses that are paired if a buffer is full.
-_PAIRED_IF_FULL = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +38,7 @@ class BufferLimits:
     ----------
     capacity : int
         Most poses of a stream. A buffer fills up if the other stream lags behind, or if the time
-        offset is still to be estimated; then all but a tenth are paired.
+        offset is still to be estimated; then a batch is paired, or half of the buffer dropped.
     pairing_starts : int
         Number of poses from which on the oldest are made into pairs. Until then, messages may come
         in any order: 20 s at 100 Hz.
@@ -75,109 +71,57 @@ class StreamStatistics:
     first_stamp_ns: int | None = None
     last_stamp_ns: int | None = None
 
-    def note(self, stamp_ns: int) -> None:
-        """Count a pose that was taken."""
-        self.received += 1
-        if self.first_stamp_ns is None or self.last_stamp_ns is None:
-            self.first_stamp_ns = self.last_stamp_ns = stamp_ns
-        elif stamp_ns > self.last_stamp_ns:
-            self.last_stamp_ns = stamp_ns
-        else:
-            self.first_stamp_ns = min(self.first_stamp_ns, stamp_ns)
 
-    def to_dict(self) -> dict[str, int | None]:
-        """What a result says of its inputs."""
-        values = {name: each for name, each in vars(self).items() if name != "dropped_unpaired"}
-        return {"messages": values.pop("received"), **values}
-
-
-class PoseBuffer:
-    """Poses of one sensor, in order of their stamps.
-
-    Attributes
-    ----------
-    frame : str
-        Name of the sensor frame; empty until it is known.
-    statistics : StreamStatistics
+class _PoseBuffer:
+    """Poses of one sensor, in order of their stamps; the name of its frame, empty until it is
+    known; and its statistics.
     """
 
-    def __init__(self, limits: BufferLimits) -> None:
-        self._limits = limits
-        self._stamps_ns = np.empty(limits.capacity, dtype=np.int64)
-        self._poses = np.empty((limits.capacity, 7))  # x y z qx qy qz qw
-        self._count = 0
+    def __init__(self) -> None:
+        self.stamps_ns: list[int] = []
+        self._poses: list[tuple[float, ...]] = []  # x y z qx qy qz qw
         self._dropped_until_ns = -(2**63)
         self.frame = ""
         self.statistics = StreamStatistics()
 
     def __len__(self) -> int:
-        return self._count
+        return len(self.stamps_ns)
 
-    @property
-    def stamps_ns(self) -> IntArray:
-        """(N,) int64 array: the stamps, valid until the buffer changes."""
-        return self._stamps_ns[: self._count]
-
-    @property
-    def is_full(self) -> bool:
-        """Whether there is no room for another pose."""
-        return self._count == self._limits.capacity
-
-    @property
-    def pairing_is_due(self) -> bool:
-        """Whether it is time to make a batch of pairs."""
-        is_many = self._count > self._limits.pairing_starts
-        return is_many and self.statistics.received % self._limits.batch_every == 0
-
-    def add(self, stamp_ns: int, position: Any, quat_xyzw: Any) -> bool:
+    def add(self, stamp_ns: int, pose: tuple[float, ...]) -> bool:
         """Take a pose; False if the stamp is a duplicate or too late."""
+        counts, index = self.statistics, bisect_left(self.stamps_ns, stamp_ns)
         if stamp_ns <= self._dropped_until_ns:
-            self.statistics.refused_late += 1
+            counts.refused_late += 1
             return False
-        index, end = self._count, self._count
-        if index and stamp_ns <= self._stamps_ns[index - 1]:
-            index = int(np.searchsorted(self.stamps_ns, stamp_ns))
-            if self._stamps_ns[index] == stamp_ns:
-                self.statistics.refused_duplicate += 1
-                return False
-            self._stamps_ns[index + 1 : end + 1] = self._stamps_ns[index:end]
-            self._poses[index + 1 : end + 1] = self._poses[index:end]
-        self._stamps_ns[index] = stamp_ns
-        self._poses[index, :3], self._poses[index, 3:] = position, quat_xyzw
-        self._count += 1
-        self.statistics.note(stamp_ns)
+        if self.stamps_ns[index : index + 1] == [stamp_ns]:
+            counts.refused_duplicate += 1
+            return False
+        self.stamps_ns.insert(index, stamp_ns)
+        self._poses.insert(index, pose)
+        counts.received += 1
+        first_ns, last_ns = counts.first_stamp_ns, counts.last_stamp_ns
+        counts.first_stamp_ns = stamp_ns if first_ns is None else min(first_ns, stamp_ns)
+        counts.last_stamp_ns = stamp_ns if last_ns is None else max(last_ns, stamp_ns)
         return True
-
-    def stamp_at(self, share: float) -> int:
-        """Stamp below which this share of the poses lies."""
-        return self.stamp_of(int(share * (self._count - 1)))
 
     def stamp_of(self, index: int) -> int:
         """Stamp of a pose, or of the newest if there are not so many."""
-        return int(self._stamps_ns[min(index, self._count - 1)])
+        return self.stamps_ns[min(index, len(self) - 1)]
 
-    def poses(self, until_ns: int | None = None) -> RawPoses:
-        """The poses, copied: all, or those up to a stamp and the ones after it that interpolation
-        up to it looks at.
-        """
-        end = self._count
-        if until_ns is not None:
-            after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
-            end = min(after + REACH, self._count)
-        return RawPoses(self._stamps_ns[:end].copy(), self._poses[:end].copy())
+    def trajectory(self, until_ns: int = 2**63) -> Trajectory:
+        """The poses up to a stamp, and the ones after it that interpolation up to it looks at."""
+        end = bisect_right(self.stamps_ns, until_ns) + REACH
+        poses = np.array(self._poses[:end]).reshape(-1, 7)
+        stamps_ns = np.array(self.stamps_ns[:end], dtype=np.int64)
+        return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
 
-    def drop(self, until_ns: int, unpaired: bool = False) -> None:
+    def drop(self, until_ns: int, unpaired: bool) -> None:
         """Drop poses up to and including a stamp, except the last of them that interpolation up to
         the next pose looks at.
         """
-        after = int(np.searchsorted(self.stamps_ns, until_ns, side="right"))
-        split = max(after - REACH, 0)
-        if unpaired:
-            self.statistics.dropped_unpaired += split
-        rest = self._count - split
-        self._stamps_ns[:rest] = self._stamps_ns[split : self._count].copy()
-        self._poses[:rest] = self._poses[split : self._count].copy()
-        self._count = rest
+        split = max(bisect_right(self.stamps_ns, until_ns) - REACH, 0)
+        self.statistics.dropped_unpaired += split * unpaired
+        del self.stamps_ns[:split], self._poses[:split]
         self._dropped_until_ns = until_ns
 
 
@@ -215,7 +159,7 @@ class Calibrator:
 
     def reset(self) -> None:
         """Forget all poses, frames and statistics."""
-        self._buffers = {stream: PoseBuffer(self._limits) for stream in STREAMS}
+        self._buffers = {stream: _PoseBuffer() for stream in STREAMS}
         self._forget_pairs()
 
     def _forget_pairs(self) -> None:
@@ -232,10 +176,10 @@ class Calibrator:
 
     def inputs(self, topics: Mapping[str, object]) -> dict[str, Any]:
         """Where a result came from, in plain values: options, and streams by their topics."""
-        streams = {
-            stream: {"topic": str(topic), **self.statistics(stream).to_dict()}
-            for stream, topic in topics.items()
-        }
+        streams = {}
+        for stream, topic in topics.items():
+            counts = vars(self.statistics(stream))
+            streams[stream] = {"topic": str(topic), "messages": counts.pop("received"), **counts}
         return {"options": self.config.to_options(), **streams}
 
     def statistics(self, stream: str) -> StreamStatistics:
@@ -300,16 +244,15 @@ class Calibrator:
             If a value is not finite or the quaternion is not of unit length.
         """
         check_pose(*position, *quat_xyzw)
-        buffer = self._buffers[stream]
-        if buffer.is_full:
-            self._make_pairs(_PAIRED_IF_FULL)
-            for each in self._buffers.values():
-                if each.is_full:
-                    # The other stream has no poses at these times: they cannot be paired.
-                    each.drop(each.stamp_at(0.5), unpaired=True)
-        elif buffer.pairing_is_due:
-            self._make_pairs()
-        return buffer.add(stamp_ns, position, quat_xyzw)
+        buffer, limits = self._buffers[stream], self._limits
+        is_full = len(buffer) >= limits.capacity
+        is_due = buffer.statistics.received % limits.batch_every == 0
+        if is_full or (is_due and len(buffer) > limits.pairing_starts):
+            self._make_pairs(is_full)
+        if len(buffer) >= limits.capacity:
+            # The other stream has no poses at these times: they cannot be paired.
+            buffer.drop(buffer.stamp_of(len(buffer) // 2), unpaired=True)
+        return buffer.add(int(stamp_ns), (*position, *quat_xyzw))
 
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
@@ -320,8 +263,8 @@ class Calibrator:
         return Snapshot(
             config=self._config,
             kept=self._kept,
-            buffered_parent=parent.poses(),
-            buffered_child=child.poses(),
+            buffered_parent=parent.trajectory(),
+            buffered_child=child.trajectory(),
             paired_at=self._paired_at,
             parent_frame=parent_frame,
             child_frame=child_frame,
@@ -347,43 +290,44 @@ class Calibrator:
         """
         self._proposed_offset = found or self._proposed_offset
 
-    def _make_pairs(self, settled_share: float | None = None) -> None:
-        """Make the oldest poses into pairs, keep the pairs, and drop the poses.
-
-        Poses are settled if no late arrivals are expected among them: those older than the newest
-        by a while, or the given share of them; at most a batch.
+    def _make_pairs(self, is_full: bool) -> None:
+        """Make the oldest poses into pairs, keep the pairs, and drop the poses: at most a batch, of
+        poses so old that no late arrivals are expected among them. A time offset is estimated when
+        a buffer is full.
         """
-        parent, child = self._buffers["parent"], self._buffers["child"]
-        config = self._config_with_time_offset(estimate=settled_share is not None)
-        if config is None or not len(parent) or not len(child):
+        parent, child, limits = self._buffers["parent"], self._buffers["child"], self._limits
+        if not len(parent) or not len(child):
             return
-        offset_ns, limits = round(fixed_time_offset(config) * 1e9), self._limits
-
-        def settled_until_ns(buffer: PoseBuffer) -> int:
-            late_ns = limits.late_ns if settled_share is None else 0
-            newest_ns = buffer.stamp_at(1.0 if settled_share is None else settled_share)
-            return min(newest_ns - late_ns, buffer.stamp_of(limits.batch))
-
-        horizon_ns = min(settled_until_ns(parent), settled_until_ns(child) + offset_ns)
-        if settled_share is None:
-            # At least half a batch of the longer buffer is settled.
-            longer, ahead_ns = (parent, 0) if len(parent) >= len(child) else (child, offset_ns)
-            if horizon_ns < longer.stamp_of(limits.batch // 2) + ahead_ns:
+        config = self._config
+        if isinstance(config.time_offset, str):
+            if self._time_offset is None and is_full:
+                with contextlib.suppress(NotEnoughDataError):
+                    self._time_offset = self._proposed_offset or estimated_time_offset(
+                        config, parent.trajectory(), child.trajectory()
+                    )
+            if self._time_offset is None:
                 return
+            config = replace(config, time_offset=self._time_offset.seconds)
+        offset_ns = round(fixed_time_offset(config) * 1e9)
         if self._paired_at is None:
-            self._paired_at = slower_stream(parent.stamps_ns, child.stamps_ns)
-        of_parent = parent.poses(horizon_ns).trajectory
-        of_child = child.poses(horizon_ns - offset_ns).trajectory
+            self._paired_at = slower_stream(np.array(parent.stamps_ns), np.array(child.stamps_ns))
+        horizon_ns = min(
+            min(each.stamps_ns[-1] - limits.late_ns, each.stamp_of(limits.batch)) + ahead_ns
+            for each, ahead_ns in ((parent, 0), (child, offset_ns))
+        )
+        of_child = child.trajectory(horizon_ns - offset_ns)
         of_child = self._time_offset.steadied(of_child) if self._time_offset else of_child
-        made = pair_poses(config, of_parent, of_child, self._paired_at, self._kept_parts[-1])
+        made = pair_poses(
+            config, parent.trajectory(horizon_ns), of_child, self._paired_at, self._kept_parts[-1]
+        )
         made = made[made.stamps_ns <= horizon_ns]
         if len(made):
             self._kept_parts.append(made)
-            if sum(map(len, self._kept_parts)) > self._config.max_pairs:
-                self._kept_parts = [downsample(self._kept, self._config.max_pairs)]
-        unpaired = parent.stamp_of(0) > horizon_ns or child.stamp_of(0) + offset_ns > horizon_ns
-        parent.drop(horizon_ns, unpaired=unpaired)
-        child.drop(horizon_ns - offset_ns, unpaired=unpaired)
+            if sum(map(len, self._kept_parts)) > config.max_pairs:
+                self._kept_parts = [downsample(self._kept, config.max_pairs)]
+        is_alone = max(parent.stamps_ns[0], child.stamps_ns[0] + offset_ns) > horizon_ns
+        parent.drop(horizon_ns, unpaired=is_alone)
+        child.drop(horizon_ns - offset_ns, unpaired=is_alone)
 
     @property
     def _kept(self) -> PosePairs:
@@ -391,18 +335,3 @@ class Calibrator:
         if len(self._kept_parts) > 1:
             self._kept_parts = [PosePairs.concatenate(*self._kept_parts)]
         return self._kept_parts[0]
-
-    def _config_with_time_offset(self, estimate: bool) -> CalibratorConfig | None:
-        """The options with a time offset in seconds; None if it cannot be estimated, or need not be
-        yet.
-        """
-        if not isinstance(self._config.time_offset, str):
-            return self._config
-        if self._time_offset is None and estimate:
-            parent, child = self._buffers["parent"].poses(), self._buffers["child"].poses()
-            with contextlib.suppress(NotEnoughDataError):
-                self._time_offset = self._proposed_offset or estimated_time_offset(
-                    self._config, parent.trajectory, child.trajectory
-                )
-        found = self._time_offset
-        return replace(self._config, time_offset=found.seconds) if found else None

@@ -1,14 +1,14 @@
 """The stream checks of a snapshot, with a result or before any.
 
 Of streams that have only positions, rotations or angular rates, what they have in common shows in a
-solve, which is quick: whether they are of one body, in one unit of length, and on one clock.
+solve: whether they are of one body, in one unit of length, and on one clock.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import MIN_VARIATION, Correlation, correlate_rates
+from hand_eye_calib.alignment.angular_rates import correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.checks.check import (
     CheckResult,
@@ -17,11 +17,11 @@ from hand_eye_calib.checks.check import (
     check_streams,
     unseen,
 )
-from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
+from hand_eye_calib.checks.findings import Finding, answered, gravest_first
 from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import Snapshot
-from hand_eye_calib.errors import InputError, NotEnoughDataError
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.results.status import AXES
 
 # Smaller time offsets (s) of streams that are no poses are found by every solve.
 _FOUND_BY_SOLVE_S = 0.25
@@ -62,75 +62,20 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Finding]:
     """Findings about streams that are no poses; of the solve, those of its result."""
     found = [*calibration.findings] if calibration else []
-    known_s = fixed_time_offset(snapshot.resolved().config)
+    known_s = fixed_time_offset(snapshot.resolved.config)
+    parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
-        parent, child = snapshot.streams
         found += check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)
-    if any(each.code == "unrelated" for each in found):
-        correlation = _correlated(snapshot, known_s)
+    hidden = set()
+    if calibration:
+        hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
+    if len(hidden) == 3 or any(each.code == "unrelated" for each in found):
+        of_speed, max_gap_s = snapshot.config.measured == "positions", snapshot.config.max_gap
+        correlation = correlate_rates(parent, child.shifted(known_s), max_gap_s, of_speed)
         if correlation.is_clear and abs(correlation.offset_s) >= _FOUND_BY_SOLVE_S:
-            sigma_s = max(stream.interval_s for stream in snapshot.streams) / 5
+            sigma_s = max(parent.interval_s, child.interval_s) / 5
             offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
             found += check_offset(offset, known_s)
+    if hidden and not any(each.makes_unusable for each in found):
+        found.append(unseen([axis for axis in AXES if axis in hidden]))
     return [each for index, each in enumerate(found) if each not in found[:index]]
-
-
-def _correlated(snapshot: Snapshot, known_s: float) -> Correlation:
-    """Correlation of the angular rates of both streams or, if one has only positions, of their
-    speeds; the child's stamps are off by ``known_s``.
-    """
-    parent, child = snapshot.streams
-    of_speed = snapshot.config.measured == "positions"
-    return correlate_rates(parent, child.shifted(known_s), snapshot.config.max_gap, of_speed)
-
-
-def check_partial(snapshot: Snapshot) -> CheckResult:
-    """Check the streams of a snapshot of which one at least gives only a part of its poses.
-
-    A time offset in the options is known; otherwise the streams are solved at the offset at which
-    their angular rates, or the speeds beside positions, agree.
-    """
-    config = snapshot.config
-    known_s = 0.0 if isinstance(config.time_offset, str) else config.time_offset
-    before = check(_at_offset(snapshot, known_s))
-    if any(each.makes_unusable for each in before.findings):
-        return before
-    correlation = _correlated(snapshot, known_s)
-    is_behind = correlation.is_clear and abs(correlation.offset_s) > _FOUND_BY_SOLVE_S / 2
-    solved = _at_offset(snapshot, known_s + (correlation.offset_s if is_behind else 0.0))
-    try:
-        result = solved.estimate()
-    except NotEnoughDataError as error:
-        found = [*before.findings, finding("too_short", text=str(error))]
-    except InputError as error:
-        found = [*before.findings, finding("unsolved", text=str(error), units="the units")]
-    else:
-        found = [*check(solved, result).findings]
-        is_still = correlation.overlap_s > 0 and correlation.variation < MIN_VARIATION
-        if not any(each.makes_unusable for each in found):
-            found += _of_result(result, correlation, known_s)
-        elif is_still and all(each.code == "unrelated" for each in found):
-            found = [finding("no_turning")]
-    return CheckResult(gravest_first(found), correlation)
-
-
-def _at_offset(snapshot: Snapshot, offset_s: float) -> Snapshot:
-    return replace(snapshot, config=replace(snapshot.config, time_offset=offset_s))
-
-
-def _of_result(result: Calibration, correlation: Correlation, known_s: float) -> list[Finding]:
-    """Findings about motion and clock of streams that agree."""
-    within_reach = [dof.name for dof in result.observability if dof.name not in result.out_of_reach]
-    hidden = [axis for axis in within_reach if axis in result.unobservable()]
-    if result.status is SolveStatus.NOT_CONVERGED:
-        text = "the solve of these streams does not converge"
-        return [finding("unsolved", text=text, units="the units")]
-    if hidden == within_reach:
-        return [finding("no_turning")]
-    offset_s, sigma_s = result.time_offset_s - known_s, result.time_offset_sigma_s
-    found = check_offset(TimeOffset(offset_s, sigma_s, correlation), known_s)
-    if abs(offset_s) < _FOUND_BY_SOLVE_S:
-        found = [replace(each, severity=Severity.NOTE) for each in found]
-    if hidden:
-        found.append(unseen(hidden))
-    return found

@@ -45,8 +45,6 @@ class Solved:
     ----------
     shift : PossibleShift or None
         Of the mount within the recording.
-    model : AdaptiveSolution or None
-        The adaptive estimator's solution, if there is one: with method adaptive this one.
     stamps_ns, config, scale, time_offset
         What was solved; the time offset if it was estimated.
     speed_m_s : float
@@ -68,70 +66,59 @@ class Solved:
     proved_global: str = "not tried"
     warnings: tuple[str, ...] = ()
     shift: PossibleShift | None = None
-    model: AdaptiveSolution | None = None
     scale: float = 1.0
     scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
     speed_m_s: float = 0.0
     is_beside: bool = False
 
-    @property
-    def adaptive(self) -> AdaptiveSolution | None:
-        """The solution, if it is the adaptive estimator's."""
-        return self.model if self.method == "adaptive" else None
-
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
         """The result without frame names; ``unseen`` axes count as unobservable whatever the method
         says.
         """
-        T_method, config, found = self.solution.T_parent_child, self.config, self.adaptive
+        T_method, config = self.solution.T_parent_child, self.config
         fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), config.prior())
-        residuals = residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns)
-        offset, of_scale = self.time_offset, self.scale_fit
+        offset_s, offset_sigma_s = fixed_time_offset(config), 0.0
+        if offset := self.time_offset:
+            offset_s, offset_sigma_s = offset.seconds, offset.sigma_s
+        scale, scale_sigma = self.scale, self.scale_fit.scale_sigma if self.scale_fit else 0.0
+        found, noise = self.solution, None
+        if isinstance(found, AdaptiveSolution):
+            lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
+            floor = common_mode_floor(self.speed_m_s, math.hypot(*lasting))
+            noise = found.describe(self.stamps_ns)
+            offset_s += found.time_offset_s
+            offset_sigma_s = found.time_offset_sigma_s or offset_sigma_s
+            scale_sigma = scale * found.scale_sigma or scale_sigma
+            scale *= found.scale
+        elif not self.is_beside:
+            floor = floor_of_pairs(self.pairs, self.weights, T_method, self.speed_m_s)
         odometries = [config.parent_kind, config.child_kind].count("odometry")
-        result = calibration_of(
+        return calibration_of(
             fused,
-            residuals,
+            residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns),
             config,
-            status=fused.status(self.solution.converged),
+            status=fused.status(found.converged),
             T_method=T_method,
-            floor=None if self.is_beside else odometries / 2 * self._floor(),
-            objective=self.solution.objective,
+            floor=None if self.is_beside else odometries / 2 * floor,
+            objective=found.objective,
             proved_global=self.proved_global,
             method=self.method,
             method_reason=self.method_reason,
             reference=self.reference,
             reference_reason=self.reference_reason,
-            noise=found.describe(self.stamps_ns) if found else None,
+            noise=noise,
             backend=config.backend,
             n_poses=len(self.stamps_ns),
             stamp_ns=int(self.stamps_ns[-1]),
-            time_offset_s=offset.seconds if offset else fixed_time_offset(config),
-            time_offset_sigma_s=offset.sigma_s if offset else 0.0,
+            time_offset_s=offset_s,
+            time_offset_sigma_s=offset_sigma_s,
             clock_rate=offset.rate if offset else None,
-            scale=self.scale,
-            scale_sigma=of_scale.scale_sigma if of_scale else 0.0,
+            scale=scale,
+            scale_sigma=scale_sigma,
             warnings=(*fused.warnings, *self.warnings)
             + (self.shift.warnings if self.shift else ()),
-            model=self.model,
         )
-        if found is None:
-            return result
-        return replace(
-            result,
-            time_offset_s=result.time_offset_s + found.time_offset_s,
-            time_offset_sigma_s=found.time_offset_sigma_s or result.time_offset_sigma_s,
-            scale=self.scale * found.scale,
-            scale_sigma=self.scale * found.scale_sigma or result.scale_sigma,
-        )
-
-    def _floor(self) -> FloatArray:
-        """Common-mode floor (6, 6) of errors of two odometries."""
-        if (found := self.adaptive) is None:
-            T_parent_child = self.solution.T_parent_child
-            return floor_of_pairs(self.pairs, self.weights, T_parent_child, self.speed_m_s)
-        lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
-        return common_mode_floor(self.speed_m_s, math.hypot(*lasting))
 
 
 def calibration_of(
@@ -199,9 +186,10 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config, is_beside=is_beside)
-    found = solved.adaptive
+    found = solved.solution
     # A model with a time offset knows how uncertain that is.
-    spread = _spread_by_alignment(scale_fit, None if found and found.time_offset_s else time_offset)
+    is_known = isinstance(found, AdaptiveSolution) and found.time_offset_s
+    spread = _spread_by_alignment(scale_fit, None if is_known else time_offset)
     if solved.shift is not None:
         spread += solved.shift.spread
     rotation = solved.solution.T_parent_child[:3, :3]
@@ -246,7 +234,16 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         dnlo = _solve_pairs(pose_pairs, with_dnlo)
         reason = f"auto: dnlo, because the user set reference {config.reference}"
         return replace(dnlo, method_reason=reason)
-    solution = _adaptive_solution(pose_pairs, config, is_clock_free)
+    # What the user set is not estimated; of a clock whose offset is to be, this is the last step.
+    known = {"scale": config.is_known("scale"), "time": config.is_known("time_offset")}
+    known["time"] &= not is_clock_free
+    solution = adaptive_estimator.solve(
+        pose_pairs.stamps_ns,
+        pose_pairs.Ts_pw_p,
+        pose_pairs.Ts_cw_c,
+        [name for name in SYSTEMATIC if not known.get(name)],
+        is_clock_free=is_clock_free,
+    )
     works = solution.converged and not solution.is_drowned
     if not is_auto or works or len(pose_pairs) < MIN_POSES:
         reason = "auto: adaptive, because its noise model works here" if is_auto else ""
@@ -255,24 +252,7 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
     why = why if solution.is_drowned else "the adaptive estimator did not converge"
     dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
     reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
-    return replace(dnlo, method_reason=reason, model=solution)
-
-
-def _adaptive_solution(
-    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
-) -> AdaptiveSolution:
-    """The adaptive estimator's answer, without a scale or a time offset that the user set."""
-    options = {"scale": "scale", "time": "time_offset"}
-    known = {name for name, option in options.items() if config.is_known(option)}
-    if is_clock_free:
-        known.discard("time")  # the user asked for an estimate, of which this is the last step
-    return adaptive_estimator.solve(
-        pose_pairs.stamps_ns,
-        pose_pairs.Ts_pw_p,
-        pose_pairs.Ts_cw_c,
-        [name for name in SYSTEMATIC if name not in known],
-        is_clock_free=is_clock_free,
-    )
+    return replace(dnlo, method_reason=reason)
 
 
 def _of_model(
@@ -300,7 +280,6 @@ def _of_model(
         config=config,
         method_reason=reason,
         warnings=(warning,) if jumps > _MAX_JUMPS else (),
-        model=solution,
         shift=possible_shift(solution.part_products, solution.misfit),
     )
 

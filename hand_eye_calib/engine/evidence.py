@@ -1,6 +1,5 @@
 """What a report shows beside the result: paths, excitation, and both streams before any solve."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,17 +17,6 @@ from hand_eye_calib.stats import median
 
 # Most samples of the angular rates, and the shortest window of each (s).
 _MAX_RATES, _MIN_WINDOW_S = 1500, 0.2
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Paths (N, 3), m, of the parent sensor in its world, or of the sensor that has positions alone
-    in that of its positions: its own, and from the poses of the other one through the result.
-    """
-
-    times_s: FloatArray
-    parent: FloatArray
-    child: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +49,27 @@ class StreamView:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What the figures show beside the Calibration itself: both paths, how the sensors moved, both
-    streams; whether the parent has positions alone; and the streams as they were read.
+    """What the figures show beside the Calibration itself.
+
+    Attributes
+    ----------
+    times_s, parent, child : (N,), (N, 3), (N, 3) arrays
+        Times, s, and paths, m, of the parent sensor in its world, or of the sensor that has
+        positions alone in that of its positions: its own, and from the poses of the other one
+        through the result.
+    excitation : Excitation
+        How the sensors moved.
+    streams : StreamView
+    has_positions_of_parent : bool
+        The parent has positions alone.
     """
 
-    tracks: Tracks
+    times_s: FloatArray
+    parent: FloatArray
+    child: FloatArray
     excitation: Excitation
     streams: StreamView
     has_positions_of_parent: bool
-    as_read: Mapping[str, Trajectory]
 
 
 def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
@@ -77,20 +77,19 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     config = snapshot.config
     # The time offset is settled; estimating it again would cost time.
     settled = replace(config, time_offset=calibration.time_offset_s)
-    pose_pairs = replace(snapshot, config=settled).pose_pairs()
-    scaled = pose_pairs.child_scaled(calibration.scale)
-    rotating = scaled
+    pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(calibration.scale)
     of_parent = config.parent_measures == "positions"
-    if of_parent:
-        rotating = PosePairs(scaled.stamps_ns, scaled.Ts_cw_c, scaled.Ts_pw_p)
+    turned = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p)
     parent, child = snapshot.streams
     shifted = child.shifted(calibration.time_offset_s).scaled(calibration.scale)
+    paths = _paths(calibration, pose_pairs, of_parent)
     return Evidence(
-        tracks=_tracks(calibration, scaled, of_parent),
-        excitation=excitation(rotating),
+        times_s=(pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9,
+        parent=paths[0],
+        child=paths[1],
+        excitation=excitation(turned if of_parent else pose_pairs),
         streams=view_streams(parent, shifted, config.max_gap),
         has_positions_of_parent=of_parent,
-        as_read={"parent": parent, "child": child},
     )
 
 
@@ -117,11 +116,12 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
     )
 
 
-def _tracks(calibration: Calibration, pose_pairs: PosePairs, of_parent: bool) -> Tracks:
+def _paths(
+    calibration: Calibration, pose_pairs: PosePairs, of_parent: bool
+) -> tuple[FloatArray, FloatArray]:
     """Both paths, the child's world aligned with the parent's: by the mean over all poses, or by
     the paths if one sensor has positions alone.
     """
-    times_s = (pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
     if calibration.measured == "positions":
         poses, measured = pose_pairs.Ts_pw_p @ calibration.T_parent_child, pose_pairs.Ts_cw_c
         if of_parent:
@@ -131,10 +131,10 @@ def _tracks(calibration: Calibration, pose_pairs: PosePairs, of_parent: bool) ->
         rotation = se3.nearest_rotation((positions - positions.mean(axis=0)).T @ path)
         path = path @ rotation.T + positions.mean(axis=0)
         parent, child = (positions, path) if of_parent else (path, positions)
-        return Tracks(times_s, parent - positions[0], child - positions[0])
+        return parent - positions[0], child - positions[0]
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
     parent = pose_pairs.Ts_pw_p[:, :3, 3]
     child = Ts_cw_p[:, :3, 3] @ se3.nearest_rotation(rotations.mean(axis=0)).T
     child = child + np.median(parent - child, axis=0)
-    return Tracks(times_s, parent - parent[0], child - parent[0])
+    return parent - parent[0], child - parent[0]

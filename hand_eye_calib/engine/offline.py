@@ -230,5 +230,5 @@ def cross_check(
     config = config or offline_config(parent, child, {"method": calibration.method})
     config.require_poses("a cross-check")
     settled = replace(config, time_offset=calibration.time_offset_s)
-    pose_pairs = whole_snapshot(settled, parent, child).pose_pairs()
+    pose_pairs = whole_snapshot(settled, parent, child).pose_pairs
     return compare_answers(calibration, *other_answers(calibration, config, pose_pairs))

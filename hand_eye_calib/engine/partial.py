@@ -6,18 +6,18 @@ bias of a gyroscope. The adaptive estimator sees trajectories that never leave t
 it finds for the rotation does not depend on the rest. Of both: the time offset.
 """
 
+import contextlib
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.scale import horizontal_factors
 from hand_eye_calib.alignment.time_offset import PLAIN_RATE
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_lever_arm, assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
 from hand_eye_calib.checks.check import in_other_units
-from hand_eye_calib.checks.findings import Finding, finding
+from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import calibration_of, residuals_of
 from hand_eye_calib.errors import InputError
@@ -37,13 +37,9 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.results.records import ClockRate, RateBias
 
-# Two streams of which more than this share of the path, or of the rotation, stays unexplained are
-# not of one body. Of one body it is 0.05 of the path at most, of two 0.5 and more.
-_UNRELATED_PATH, _EXPLAINED_PATH, _UNRELATED_ROTATION = 0.3, 0.05, 0.5
-
-# Factors of x and y that differ by more than this are of wrong coordinates if they leave at most
-# this share of what was unexplained.
-_FACTORS_APART, _MENDED = 0.03, 0.3
+# Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
+# at most, of two 0.5 and more.
+_SUSPECT_PATH, _UNRELATED_PATH, _UNRELATED_ROTATION = 0.1, 0.3, 0.5
 
 # Poses between the ends of the motions that tell how much of the rotation is explained; the
 # quantile of their angles above which they count.
@@ -56,8 +52,6 @@ _DEGREES, _UNIT_WITHIN = float(np.degrees(1.0)), 0.2
 # along each axis.
 _POINT_M = 0.005
 
-_TRANSLATION, _ROTATION = slice(0, 3), slice(3, 6)
-
 
 def _calibration(
     solution: AdaptiveSolution | LeverArmSolution,
@@ -69,11 +63,12 @@ def _calibration(
 ) -> Calibration:
     """A result without frame names."""
     is_of_positions = isinstance(solution, LeverArmSolution)
+    known = slice(0, 3) if is_of_positions else slice(3, 6)
     return calibration_of(
         fused,
         residuals,
         config,
-        status=fused.status(solution.converged, _TRANSLATION if is_of_positions else _ROTATION),
+        status=fused.status(solution.converged, known),
         objective=solution.objective,
         method="adaptive",
         reference="increments",
@@ -91,29 +86,48 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     """Solve and assess synchronised poses and positions, on one clock: a result without frame names
     whose rotation is the identity, and unknown. Of the sensor that measures positions, orientations
     are not looked at. The poses already have the time offset of the options, in seconds.
+
+    Raises
+    ------
+    InputError
+        If no lever arm explains the positions.
     """
     stamps_ns, is_child = pose_pairs.stamps_ns, config.child_measures == "positions"
     given = 1.0 if isinstance(config.scale, str) else config.scale
-    of_child = pose_pairs.Ts_cw_c.copy()
-    of_child[:, :3, 3] *= given
-    poses, measured = pose_pairs.Ts_pw_p, of_child
+    poses, measured = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c.copy()
+    measured[:, :3, 3] *= given
     if not is_child:
         poses, measured = measured, poses
     positions = measured[:, :3, 3]
-    solution = _lever_arm(stamps_ns, poses, positions, config.scale in ("auto", "estimate"))
+    try:
+        solution = of_positions.solve(
+            stamps_ns, poses, positions, config.scale in ("auto", "estimate")
+        )
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "no lever arm explains the positions: they may jump, or be of another body; look at "
+            "both paths"
+        ) from None
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
     fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
-    axes = fused.assessment.observability[:3]
-    is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
-    findings = _of_path(solution, is_known, stamps_ns, poses, positions, is_child)
-    weights = ~(solution.jumps | solution.spikes[1:])
-    residuals = _steps(solution, poses, positions, pose_pairs, weights)
-    floor = np.zeros((6, 6))
-    floor[:3, :3] = 2.0 * _POINT_M**2 * np.eye(3)
+    findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child)
+    # The steps from each position to the next, along the axes of the sensor with poses.
+    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
+    residuals = Residuals(
+        translation=(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ along[:, :, None])[:, :, 0],
+        rotation=np.zeros((len(steps), 3)),
+        weights=(~(solution.jumps | solution.spikes[1:])).astype(float),
+        start_ns=stamps_ns[:-1],
+        end_ns=stamps_ns[1:],
+    )
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
-    offset_s = 0.0 if findings else sign * solution.time_offset_s
+    is_usable = not any(each.makes_unusable for each in findings)
+    offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
     middle_ns = int(stamps_ns[0] + (stamps_ns[-1] - stamps_ns[0]) // 2)
     return _calibration(
         solution,
@@ -122,105 +136,50 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         pose_pairs,
         config,
         T_method=T,
-        floor=floor,
-        time_offset_s=float(config.time_offset) + offset_s,
+        floor=2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+        time_offset_s=offset_s,
         clock_rate=ClockRate(
             ppm=1e6 * sign * solution.clock_rate,
             sigma_ppm=1e6 * solution.clock_rate_sigma,
-            at_ns=middle_ns - round((float(config.time_offset) + offset_s) * 1e9),
+            at_ns=middle_ns - round(offset_s * 1e9),
             is_used=abs(solution.clock_rate) > PLAIN_RATE * solution.clock_rate_sigma,
         ),
         scale=given * scale,
         scale_sigma=solution.scale_sigma * scale**2,
-        findings=tuple(findings),
-    )
-
-
-def _lever_arm(
-    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, with_scale: bool
-) -> LeverArmSolution:
-    try:
-        return of_positions.solve(stamps_ns, poses, positions, with_scale)
-    except np.linalg.LinAlgError:
-        raise InputError(
-            "no lever arm explains the positions: they may jump, or be of another body; look at "
-            "both paths"
-        ) from None
-
-
-def _steps(
-    solution: LeverArmSolution,
-    poses: FloatArray,
-    positions: FloatArray,
-    pose_pairs: PosePairs,
-    weights: BoolArray,
-) -> Residuals:
-    """Of the steps from each position to the next, along the axes of the sensor with poses."""
-    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
-    return Residuals(
-        translation=(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ along[:, :, None])[:, :, 0],
-        rotation=np.zeros((len(steps), 3)),
-        weights=weights.astype(float),
-        start_ns=pose_pairs.stamps_ns[:-1],
-        end_ns=pose_pairs.stamps_ns[1:],
+        findings=findings,
     )
 
 
 def _of_path(
     solution: LeverArmSolution,
-    is_known: bool,
+    fused: Fused,
     stamps_ns: IntArray,
     poses: FloatArray,
     positions: FloatArray,
     is_child: bool,
-) -> list[Finding]:
+) -> tuple[Finding, ...]:
     """A finding if the path of the positions is not that of the odometry, or in other units."""
-
-    def mended(positions: FloatArray, with_scale: bool) -> tuple[float, LeverArmSolution]:
-        """The share of the path that other positions leave unexplained, and their solution."""
-        try:
-            found = _lever_arm(stamps_ns, poses, positions, with_scale)
-        except InputError:
-            return 1.0, solution
-        return unexplained_share(poses, positions, found.lever_arm, found.scale), found
-
     share = unexplained_share(poses, positions, solution.lever_arm, solution.scale)
-    if share < _EXPLAINED_PATH:
-        return []
-    # What is wrong with east and north, if that explains the path.
-    factors = horizontal_factors(poses[:, :3, 3], positions)
-    hypotheses = [(1.0, 1.0, True)]
-    if abs(factors[0] - factors[1]) > _FACTORS_APART * factors[1]:
-        hypotheses = [(*factors, False), (*factors, True), *hypotheses]
-    for east, north, is_swapped in hypotheses:
-        order = [1, 0, 2] if is_swapped else [0, 1, 2]
-        left, _ = mended((positions * [east, north, 1.0])[:, order], with_scale=False)
-        if left < _MENDED * share:
-            known: dict[str, Any] = {
-                "factor_x": east,
-                "factor_y": north,
-                "unexplained_share": share,
-            }
-            known |= {"unexplained_share_mended": left}
-            swapped = " and then swapped" if is_swapped else ""
-            stream = "child" if is_child else "parent"
-            return [finding("coordinates", stream, swapped=swapped, **known)]
+    if share < _SUSPECT_PATH:
+        return ()
+    axes = fused.assessment.observability[:3]
+    is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
+    severity = Severity.ERROR
     if is_known and share < _UNRELATED_PATH:
-        return []
-    left, scaled = mended(positions, with_scale=True)
-    scale = scaled.scale if is_child else 1.0 / scaled.scale
-    found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
-    if left < _UNRELATED_PATH and found:
-        return [found]
-    what: dict[str, Any] = {
-        "other": "odometry",
-        "part": "motion of the positions",
-        "units": "the units, the scale",
-    }
-    return [finding("unrelated_parts", share=min(share, 1.0), **what)]
+        severity = Severity.WARNING
+    else:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            scaled = of_positions.solve(stamps_ns, poses, positions, True)
+            left = unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
+            scale = scaled.scale if is_child else 1.0 / scaled.scale
+            found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
+            if left < _UNRELATED_PATH and found:
+                return (found,)
+    what: dict[str, Any] = {"part": "motion of the positions", "other": "odometry"}
+    units = "the units, the scale, the order of the coordinates"
+    return (
+        finding("unrelated_parts", severity=severity, share=min(share, 1.0), units=units, **what),
+    )
 
 
 def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -264,18 +223,16 @@ def _rotation(
     The noise is fitted to increments of up to some seconds. What a bias does to these is linear
     only for what is left of it after a first solve.
     """
-    if not has_rates:
-        solution = adaptive_estimator.solve(
-            stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_ROTATIONS, is_clock_free=True
+    systematic = SYSTEMATIC_OF_RATES if has_rates else SYSTEMATIC_OF_ROTATIONS
+    first = None
+    if has_rates:
+        first = adaptive_estimator.solve(
+            stamps_ns, Ts_pw_p, Ts_cw_c, systematic, quick=True, is_clock_free=True
         )
+        Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
+    solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, systematic, is_clock_free=True)
+    if first is None:
         return solution, Ts_cw_c
-    first = adaptive_estimator.solve(
-        stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True, is_clock_free=True
-    )
-    Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
-    solution = adaptive_estimator.solve(
-        stamps_ns, Ts_pw_p, Ts_cw_c, SYSTEMATIC_OF_RATES, is_clock_free=True
-    )
     parameters = solution.parameters.copy()
     parameters[RATE] += first.parameters[RATE]
     return replace(solution, parameters=parameters), Ts_cw_c

@@ -14,7 +14,7 @@ from hand_eye_calib.checks.findings import Finding, Severity, finding, gravest_f
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.estimation import fixed_time_offset
-from hand_eye_calib.engine.snapshot import GAP_INTERVALS, STREAMS, Snapshot, conventions
+from hand_eye_calib.engine.snapshot import CONVENTIONS, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -24,10 +24,9 @@ from hand_eye_calib.results.calibration import Calibration
 Progress: TypeAlias = Callable[[float, str], None]
 Options: TypeAlias = Mapping[str, Any]
 
-# Findings whose options are certain; and options in whose convention a stream may have been
-# written: the second solve proves it.
+# Findings whose options are certain; and options that repair a stream: the second solve proves it.
 _MENDED = ("time_offset", "scale", "units")
-_CONVENTIONS = tuple(f"{each}_{kind}" for each in STREAMS for kind in ("invert", "quaternion"))
+_REPAIRS = (*CONVENTIONS["parent"], *CONVENTIONS["child"])
 
 # A model's own time offset moves poses along their velocities. From this one (s) on, poses are
 # paired anew instead; positions alone later, as their model knows the offset better than speeds do.
@@ -54,32 +53,6 @@ class Run:
     options: Options = field(default_factory=dict)
     told: tuple[str, ...] = ()
 
-    @property
-    def _noise_fits(self) -> bool:
-        """Whether the result is the noise model's, and its residuals fit."""
-        noise = self.calibration.noise
-        return noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
-
-    @property
-    def _n_serious(self) -> int:
-        return sum(each.severity is not Severity.NOTE for each in self.check.findings)
-
-    @property
-    def _is_sound(self) -> bool:
-        """Whether there cannot be less to say against another result."""
-        return self._noise_fits and not self._n_serious
-
-    def _is_better_than(self, other: "Run", by: int) -> bool:
-        """Whether at least so many findings fewer speak against it, and its noise fits as well."""
-        is_worse_fit = other._noise_fits and not self._noise_fits
-        return self._n_serious <= other._n_serious - by and not is_worse_fit
-
-    def _improved(self, options: Options, by: int) -> "Run | None":
-        """A second run with other options, if it is sound or better by so many findings."""
-        second = _solved_with(self.snapshot, options)
-        is_better = second and (second._is_sound or second._is_better_than(self, by))
-        return second if is_better else None
-
 
 def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | None = None) -> Run:
     """Calibrate.
@@ -104,10 +77,7 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     tell(0.0, "time offset")
     if checks is not False:
         snapshot = _at_clear_offset(snapshot)
-    snapshot.resolved()
-    tell(0.2, "pairing")
-    snapshot.pose_pairs()
-    tell(0.3, "solving")
+    tell(0.2, "solving")
     calibration = snapshot.estimate(cross_check=checks)
     found = Run(calibration, snapshot)
     if checks is not False:
@@ -133,18 +103,37 @@ def review(
     if not may_solve:
         return first
     given = snapshot.config.given.union(settled)
-    certain = _certain(first.check.findings, given)
-    if {*certain} & {*_CONVENTIONS, "parent_scale"}:
+    options, found = _certain(first.check.findings, given), first.check.findings
+    if {*options} & {*_REPAIRS}:
         # The scale was compared with that of a solve of streams as they should not be.
-        certain = {name: value for name, value in certain.items() if value != "estimate"}
-        second = _solved_with(snapshot, certain)
+        options = {name: value for name, value in options.items() if value != "estimate"}
+        second = _solved_with(snapshot, options)
         is_clear = second and not any(each.makes_unusable for each in second.check.findings)
-        return _repaired(first, second, certain) if second and is_clear else first
+        return _repaired(first, second, options) if second and is_clear else first
     if "time_offset" not in given and snapshot.config.time_offset == "estimate":
-        return _of_clear_offset(first, certain)
-    options = _offset_of_model(calibration, snapshot, given) | certain
-    second = first._improved(options, by=int(bool(certain)))
-    return _telling(second, options, first.check.findings) if second else first
+        return _of_clear_offset(first, options)
+    least = int(bool(options))
+    moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved.config)
+    if "time_offset" not in given and _is_large(moved_s, calibration):
+        options = {"time_offset": "estimate", **options}
+    second = _improved(first, options, by=least)
+    return _telling(second, options, found) if second else first
+
+
+def _improved(first: Run, options: Options, by: int) -> Run | None:
+    """A second run with other options, if nothing speaks against it, or at least so many findings
+    fewer than against the first and its noise model fits as well.
+    """
+    if not (second := _solved_with(first.snapshot, options)):
+        return None
+    serious, fits = [], []
+    for each in (first, second):
+        noise = each.calibration.noise
+        fits.append(noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT)
+        serious.append(sum(one.severity is not Severity.NOTE for one in each.check.findings))
+    is_sound = fits[1] and not serious[1]
+    is_better = serious[1] <= serious[0] - by and fits[1] >= fits[0]
+    return second if is_sound or is_better else None
 
 
 def _of_clear_offset(first: Run, certain: Options) -> Run:
@@ -157,7 +146,7 @@ def _of_clear_offset(first: Run, certain: Options) -> Run:
         offset_s = replace(clock, seconds=offset_s).largest_s(first.snapshot.child.duration_s)
     others = {name: value for name, value in certain.items() if name != "time_offset"}
     if _is_large(offset_s, first.calibration):
-        if second := first._improved(others, by=1):
+        if second := _improved(first, others, by=1):
             return _telling(second, ahead | others, first.check.findings)
         return _telling(first, ahead, ())
     without = _solved_with(first.snapshot, {"time_offset": CalibratorConfig.time_offset} | others)
@@ -189,14 +178,12 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    # As they are: what is put right is put right once.
-    names = {name for stream in STREAMS for name in conventions(config, stream)}
-    usual: dict[str, Any] = {name: getattr(CalibratorConfig, name) for name in names}
+    # As they came in: what is put right is put right once.
+    usual: dict[str, Any] = {name: getattr(CalibratorConfig, name) for name in _REPAIRS}
     parent, child = replace(snapshot, config=replace(snapshot.config, **usual)).streams
-    max_gap_s = max(config.max_gap, GAP_INTERVALS * parent.interval_s)
     return replace(
         snapshot,
-        config=replace(config, max_gap=max_gap_s),
+        config=replace(config, max_gap=snapshot.max_gap_s),
         kept=PosePairs.empty(),
         buffered_parent=parent,
         buffered_child=child,
@@ -220,7 +207,7 @@ def _at_clear_offset(snapshot: Snapshot) -> Snapshot:
     if not clock.spread_s < 0.5 * largest_s or largest_s - 0.5 * clock.spread_s < _MOST_MOVED_S:
         return snapshot
     moved = replace(snapshot, config=replace(config, time_offset="estimate"), time_offset=clock)
-    can_solve = all(len(each.pose_pairs()) >= config.min_pairs for each in (snapshot, moved))
+    can_solve = all(len(each.pose_pairs) >= config.min_pairs for each in (snapshot, moved))
     return moved if can_solve else snapshot
 
 
@@ -244,9 +231,10 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     """With warnings about options that were set because of findings, and what they gave."""
     what = {name: each.what for each in findings for name in each.options}
     offset_s = found.calibration.time_offset_s
+    direction = "behind" if offset_s > 0 else "ahead of"
     what["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {found.calibration.time_offset_sigma_s:.4f} "
-        f"s {'behind' if offset_s > 0 else 'ahead of'} the parent's"
+        f"s {direction} the parent's"
     )
     if (rate := found.calibration.clock_rate) and rate.is_used:
         what["time_offset"] += f" and {rate}"
@@ -258,14 +246,12 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
     calibration = replace(found.calibration, warnings=warnings)
     if "time_offset" in options and abs(offset_s) > _UNASKED_S:
-        large = finding(
-            "large_time_offset",
-            "child",
-            offset_s=offset_s,
-            size_s=abs(offset_s),
-            total_s=round(offset_s, 4),
-            direction="behind" if offset_s > 0 else "ahead of",
-        )
+        sizes: dict[str, Any] = {
+            "offset_s": offset_s,
+            "size_s": abs(offset_s),
+            "total_s": round(offset_s, 4),
+        }
+        large = finding("large_time_offset", "child", direction=direction, **sizes)
         calibration = replace(calibration, findings=gravest_first((*calibration.findings, large)))
     return replace(found, calibration=calibration, options=dict(options), told=told)
 
@@ -277,28 +263,15 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
     counts. Lengths that differ by a few per cent only give a warning: odometry whose scale drifts
     looks like that, too.
     """
-    return {
-        name: "estimate" if finding.code in ("time_offset", "scale") else value
-        for finding in findings
-        for name, value in finding.options.items()
-        if name not in given and _is_sure(finding, name)
-    }
-
-
-def _is_sure(finding: Finding, option: str) -> bool:
-    if option in _CONVENTIONS:
-        return finding.makes_unusable
-    is_warned = option == "time_offset" and finding.severity is Severity.WARNING
-    return finding.code in _MENDED and (finding.makes_unusable or is_warned)
-
-
-def _offset_of_model(
-    calibration: Calibration, snapshot: Snapshot, given: Collection[str]
-) -> dict[str, float | str]:
-    """The option that pairs the poses anew if the model found a large time offset by itself."""
-    moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved().config)
-    is_set = "time_offset" not in given and _is_large(moved_s, calibration)
-    return {"time_offset": "estimate"} if is_set else {}
+    certain = {}
+    for each in findings:
+        is_warning = each.severity is Severity.WARNING
+        for name, value in each.options.items():
+            is_sure = each.makes_unusable or (name == "time_offset" and is_warning)
+            is_known = each.code in _MENDED or name.endswith(("invert", "quaternion"))
+            if is_sure and is_known and name not in given:
+                certain[name] = "estimate" if each.code in ("time_offset", "scale") else value
+    return certain
 
 
 def _is_large(moved_s: float, calibration: Calibration) -> bool:

@@ -8,11 +8,9 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
-from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import cross_checked
 from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
-from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -21,30 +19,22 @@ from hand_eye_calib.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
+#: Options that say in which convention a stream was written.
+CONVENTIONS = {
+    "parent": ("parent_invert", "parent_quaternion", "parent_scale"),
+    "child": ("child_invert", "child_quaternion"),
+}
+
 # Options that have no meaning for streams that are no poses but with these values.
 _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
 
-# A time offset that is closer than this to the one that the poses were paired with stays (s).
-_NEGLIGIBLE_S = 0.005
-# One that is farther away is no time offset (s).
-_BELIEVABLE_S = 1.0
+# A time offset (s) of positions or rotations is used if it is closer than this to the one that they
+# were paired with; they are paired anew if it is farther away than this.
+_BELIEVABLE_S, _NEGLIGIBLE_S = 1.0, 0.005
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
-GAP_INTERVALS = 4
-
-
-@dataclass(frozen=True)
-class RawPoses:
-    """Poses as they came in, in order of time: stamps (N,) int64, and x y z qx qy qz qw (N, 7)."""
-
-    stamps_ns: IntArray
-    poses: FloatArray
-
-    @cached_property
-    def trajectory(self) -> Trajectory:
-        """The same as a Trajectory. This is the expensive part."""
-        return Trajectory.from_quat_xyzw(self.stamps_ns, self.poses[:, :3], self.poses[:, 3:])
+_GAP_INTERVALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +47,8 @@ class Snapshot:
     config : CalibratorConfig
     kept : PosePairs
         Pairs that were made before.
-    buffered_parent, buffered_child : RawPoses or Trajectory
-        Poses that are not paired yet.
+    buffered_parent, buffered_child : Trajectory
+        Poses that are not paired yet, as they came in.
     paired_at : {"parent", "child"} or None
         Stream whose stamps the pairs have; the slower one if None.
     parent_frame, child_frame : str
@@ -69,8 +59,8 @@ class Snapshot:
 
     config: CalibratorConfig
     kept: PosePairs = field(default_factory=PosePairs.empty)
-    buffered_parent: RawPoses | Trajectory
-    buffered_child: RawPoses | Trajectory
+    buffered_parent: Trajectory
+    buffered_child: Trajectory
     paired_at: str | None = None
     parent_frame: str
     child_frame: str
@@ -79,7 +69,7 @@ class Snapshot:
 
     @property
     def parent(self) -> Trajectory:
-        """Trajectory of the parent's poses that are not paired yet, in its right convention."""
+        """Trajectory of the parent's poses that are not paired yet, in the usual convention."""
         return _put_right(self.buffered_parent, "parent", self.config)
 
     @property
@@ -88,15 +78,12 @@ class Snapshot:
         child = _put_right(self.buffered_child, "child", self.config)
         return self.time_offset.steadied(child) if self.time_offset else child
 
+    @cached_property
     def resolved(self) -> "Snapshot":
         """The snapshot with its time offset in seconds, estimated if the options ask for that: from
         the buffered poses, unless pairs were made with an estimate before. NotEnoughDataError if it
         cannot be estimated.
         """
-        return self._resolved
-
-    @cached_property
-    def _resolved(self) -> "Snapshot":
         if not isinstance(self.config.time_offset, str):
             return self
         found = self.time_offset or estimated_time_offset(self.config, self.parent, self.child)
@@ -115,16 +102,15 @@ class Snapshot:
         """Longest time between two poses of the streams that interpolation may bridge, s."""
         if not len(self.kept):
             return self.config.max_gap
-        return max(self.config.max_gap, GAP_INTERVALS * self.streams[0].interval_s)
-
-    def pose_pairs(self) -> PosePairs:
-        """Synchronised pose pairs: the kept ones, and those of the buffered poses; errors as of
-        :meth:`resolved`.
-        """
-        return self.resolved()._pose_pairs
+        return max(self.config.max_gap, _GAP_INTERVALS * self.streams[0].interval_s)
 
     @cached_property
-    def _pose_pairs(self) -> PosePairs:
+    def pose_pairs(self) -> PosePairs:
+        """Synchronised pose pairs: the kept ones, and those of the buffered poses; errors as of
+        :attr:`resolved`.
+        """
+        if self.resolved is not self:
+            return self.resolved.pose_pairs
         kept = self.kept
         if len(kept):
             parent, child = (
@@ -156,7 +142,7 @@ class Snapshot:
                 f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
                 "nothing to calibrate between; give parent_frame and child_frame"
             )
-        resolved, pairs = self.resolved(), self.pose_pairs()
+        resolved, pairs = self.resolved, self.pose_pairs
         config = resolved.config
         if len(pairs) < config.min_pairs:
             raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
@@ -177,12 +163,14 @@ class Snapshot:
 
     def _estimate_part(self) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
+        from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
+
         for name, allowed in _OF_PARTS_ALONE.items():
             if getattr(self.config, name) not in allowed:
                 self.config.require_poses(f"{name} {getattr(self.config, name)}")
         of_positions = self.config.measured == "positions"
         estimate = estimate_lever_arm if of_positions else estimate_rotation
-        result = estimate(self._pose_pairs, self.config)
+        result = estimate(self.pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
         if not abs(found_s - given_s) < _BELIEVABLE_S:
             return replace(result, time_offset_s=given_s)
@@ -190,7 +178,7 @@ class Snapshot:
             return result
         # Interpolated where the other stream has its poses, rather than moved along its velocity.
         config = replace(self.config, time_offset=found_s)
-        moved = replace(self, config=config)._pose_pairs
+        moved = replace(self, config=config).pose_pairs
         return estimate(moved, config) if len(moved) >= self.config.min_pairs else result
 
     @cached_property
@@ -200,8 +188,7 @@ class Snapshot:
         """
         streams = [self.parent, self.child]
         if len(self.kept):
-            resolved = self.resolved()
-            pairs, offset_s = resolved._pose_pairs, fixed_time_offset(resolved.config)
+            pairs, offset_s = self.pose_pairs, fixed_time_offset(self.resolved.config)
             streams = [Trajectory(pairs.stamps_ns, Ts) for Ts in (pairs.Ts_pw_p, pairs.Ts_cw_c)]
             streams[1] = streams[1].shifted(-offset_s)
         for k, stream in enumerate(STREAMS):
@@ -212,49 +199,39 @@ class Snapshot:
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
-        if len(self.kept):
-            return needed
         parent, child = self.parent, self.child.shifted(fixed_time_offset(self.config))
         for name, stream in zip(STREAMS, (parent, child), strict=True):
             if len(stream) == 0:
                 return f"{needed}: no poses on the {name} stream"
         start_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
-        end_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1])
+        common_s = (min(parent.stamps_ns[-1], child.stamps_ns[-1]) - start_ns) * 1e-9
         counts = f"{len(parent)} parent and {len(child)} child poses"
-        if end_ns < start_ns:
+        if common_s < 0:
             return (
-                f"{needed}: the streams do not overlap in time ({counts}, "
-                f"{(start_ns - end_ns) * 1e-9:.3f} s apart); if their clocks differ, set "
-                "time_offset to estimate or to the seconds between them"
+                f"{needed}: the streams do not overlap in time ({counts}, {-common_s:.3f} s "
+                "apart); if their clocks differ, set time_offset to estimate or to the seconds "
+                "between them"
             )
         return (
-            f"{needed} from {counts} that overlap for {(end_ns - start_ns) * 1e-9:.2f} s; "
+            f"{needed} from {counts} that overlap for {common_s:.2f} s; "
             "record longer, or raise max_gap if a stream is slower than that"
         )
 
 
-def conventions(config: CalibratorConfig, stream: str) -> dict[str, float | str]:
-    """The options, by name, that say in which convention a stream was written, if it is not the
-    usual one.
-    """
-    names = [f"{stream}_invert", f"{stream}_quaternion"]
-    names += ["parent_scale"] if stream == "parent" else []
-    given = {name: getattr(config, name) for name in names}
-    return {name: each for name, each in given.items() if each != getattr(CalibratorConfig, name)}
-
-
-def _put_right(poses: RawPoses | Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
+def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
     """The trajectory of a stream in the usual convention, from that of the options."""
-    trajectory = poses if isinstance(poses, Trajectory) else poses.trajectory
-    if not conventions(config, stream):
-        return trajectory
     invert, order = getattr(config, f"{stream}_invert"), getattr(config, f"{stream}_quaternion")
-    needs = {"poses"} if invert == "poses" else {"poses", "rotations"}
-    if (invert, order) != ("none", "xyzw") and trajectory.measures not in needs:
-        name = f"{stream}_invert {invert}" if invert != "none" else f"{stream}_quaternion {order}"
-        raise ConfigError(f"{name} cannot be: the {stream} measures {trajectory.measures}")
-    right = replace(trajectory, poses=se3.put_right(trajectory.poses, invert, order))
-    return right.scaled(config.parent_scale) if stream == "parent" else right
+    if (invert, order) != ("none", "xyzw"):
+        needs = {"poses"} if invert == "poses" else {"poses", "rotations"}
+        if trajectory.measures not in needs:
+            name = (
+                f"{stream}_invert {invert}" if invert != "none" else f"{stream}_quaternion {order}"
+            )
+            raise ConfigError(f"{name} cannot be: the {stream} measures {trajectory.measures}")
+        right = se3.put_right(trajectory.poses, invert, order)
+        trajectory = replace(trajectory, poses=right)
+    is_scaled = stream == "parent" and config.parent_scale != 1.0
+    return trajectory.scaled(config.parent_scale) if is_scaled else trajectory
 
 
 def name_frames(
@@ -291,9 +268,8 @@ def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
         # Trace of the rotation between both neighbours: 1 + 2 cos(angle).
         traces = np.einsum("kij,kij->k", rotations[candidates - 1], rotations[candidates + 1])
         n_drop = min(len(pose_pairs) - max_pairs + max_pairs // 10, (len(candidates) + 1) // 2)
-        drop = candidates[np.argsort(-traces, kind="stable")[:n_drop]]
         keep = np.ones(len(pose_pairs), dtype=bool)
-        keep[drop] = False
+        keep[candidates[np.argsort(-traces, kind="stable")[:n_drop]]] = False
         pose_pairs = pose_pairs[keep]
     return pose_pairs
 
@@ -306,17 +282,8 @@ def pair_poses(
     kept: PosePairs,
 ) -> PosePairs:
     """Pose pairs of two trajectories that are keyframes, after the last pair of ``kept``."""
-    if len(parent) == 0 or len(child) == 0:
-        return PosePairs.empty()
     made = synchronise(parent, child.shifted(fixed_time_offset(config)), config.max_gap, at)
     if len(kept):
         made = made[made.stamps_ns > kept.stamps_ns[-1]]
-    return made[
-        select_keyframes(
-            made,
-            config.keyframe_min_translation,
-            config.keyframe_min_rotation,
-            config.keyframe_min_interval,
-            previous=kept[-1:],
-        )
-    ]
+    least = config.keyframe_min_translation, config.keyframe_min_rotation
+    return made[select_keyframes(made, *least, config.keyframe_min_interval, previous=kept[-1:])]

@@ -17,7 +17,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
@@ -98,9 +98,9 @@ def answer(job: Job) -> Answer:
     found: dict[str, Any] = {"time_offset": job.snapshot.time_offset}
     calibration = None
     try:
-        snapshot = with_options(job.snapshot, job.options).resolved()
+        snapshot = with_options(job.snapshot, job.options).resolved
         found["time_offset"] = snapshot.time_offset
-        found["seen"] = excitation(snapshot.pose_pairs())
+        found["seen"] = excitation(snapshot.pose_pairs)
         calibration = snapshot.estimate()
     except Exception as error:  # the node reports it
         found["failure"] = _failure(error)
@@ -115,8 +115,6 @@ def answer(job: Job) -> Answer:
                 found |= {"check": run.check, "options": dict(run.options), "told": run.told}
     except Exception as error:  # the node reports it
         found.setdefault("failure", _failure(error))
-    if calibration is not None:  # the node has no use for the noise model's whole solution
-        calibration = replace(calibration, model=None)
     seconds = time.monotonic() - start_s
     return Answer(job.session, seconds, calibration=calibration, is_checked=job.check, **found)
 

@@ -154,7 +154,7 @@ def _legend(figure: Figure, panel: Axes) -> None:
 
 @page_style()
 def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
-    tracks = evidence.tracks
+    tracks = evidence
     shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
     factor, unit = _time_axis(tracks.times_s[-1])
     first, second, across = _plane_of_motion(tracks.parent)

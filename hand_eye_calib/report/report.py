@@ -19,6 +19,7 @@ from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.report.figures import figures_of
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
@@ -241,11 +242,12 @@ def _data(
 ) -> dict[str, Any]:
     """What the result comes from, for the template."""
     options = snapshot.config.to_options() if snapshot else {}
-    names = [name for name in ("parent", "child") if evidence or name in inputs]
+    streams = dict(zip(("parent", "child"), snapshot.streams, strict=True)) if snapshot else {}
+    names = [name for name in ("parent", "child") if name in streams or name in inputs]
     return {
         "labels": inputs.get("labels", {}),
         "summary": _summary(calibration, evidence),
-        "streams": [_stream(name, inputs, evidence) for name in names],
+        "streams": [_stream(name, inputs, streams.get(name)) for name in names],
         "provenance": list(_provenance(inputs)),
         "options": {name: each for name, each in options.items() if each != ""},
     }
@@ -257,7 +259,7 @@ def _summary(calibration: Calibration, evidence: Evidence | None) -> dict[str, s
     scale = (calibration.scale, calibration.scale_sigma)
     poses = f"{calibration.n_poses:,} stops"
     if evidence:
-        span = duration(evidence.tracks.times_s[-1])
+        span = duration(evidence.times_s[-1])
         poses = f"{calibration.n_poses:,} synchronised pose pairs over {span}"
     reason = calibration.method_reason
     rows = {
@@ -275,7 +277,7 @@ def _summary(calibration: Calibration, evidence: Evidence | None) -> dict[str, s
     return rows
 
 
-def _stream(name: str, inputs: Plain, evidence: Evidence | None) -> dict[str, str]:
+def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, str]:
     """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
     known = inputs.get(name, {})
     count = known.get("messages", known.get("poses"))
@@ -284,7 +286,6 @@ def _stream(name: str, inputs: Plain, evidence: Evidence | None) -> dict[str, st
         "source": known.get("topic") or Path(known.get("file", "-")).name,
         "poses": "-" if count is None else f"{count:,}",
     }
-    stream = evidence.as_read[name] if evidence else None
     # In a very long recording only the newest poses are at hand: of the stream as a whole they say
     # nothing.
     if stream is not None and len(stream) >= max(2, count or 0):

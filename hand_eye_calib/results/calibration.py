@@ -61,7 +61,6 @@ _OF_THIS_DIRECTION = (
     "cross_check",
     "comparison",
     "motion_residuals",
-    "model",
     "recording",
     "T_base_parent",
 )

@@ -28,7 +28,7 @@ MATRICES = (
     "T_world_world",
     "cov_world_world",
 )
-NOT_IN_FILES = ("motion_residuals", "model", "recording")
+NOT_IN_FILES = ("motion_residuals", "recording")
 
 
 def values_of(of: type[Any], data: Mapping[str, Any]) -> dict[str, Any]:

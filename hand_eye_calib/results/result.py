@@ -109,8 +109,6 @@ class Result:
         the recording about this one; None without that cross-check.
     warnings : tuple of str
         What a person should know before using the result.
-    model : object
-        The adaptive estimator's solution, for the stream checks. Not part of files.
     recording : object
         The poses and options that gave it, for :meth:`Calibration.report`. Not part of files.
 
@@ -171,7 +169,6 @@ class Result:
     findings: tuple[Finding, ...] = ()
     cross_check: CrossCheck | None = None
     warnings: tuple[str, ...] = ()
-    model: object = field(default=None, repr=False, compare=False)
     recording: object = field(default=None, repr=False, compare=False)
 
     parent_frame: str = "parent"

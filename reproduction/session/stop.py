@@ -120,9 +120,9 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
             for stream, (start_ns, end_ns) in zip(streams, (of_parent, of_child), strict=True)
         ]
         try:
-            snapshot = whole_snapshot(config, *parts).resolved()
+            snapshot = whole_snapshot(config, *parts).resolved
             calibration = snapshot.estimate()
-            seen = excitation(snapshot.pose_pairs())
+            seen = excitation(snapshot.pose_pairs)
         except (HandEyeCalibError, np.linalg.LinAlgError):
             continue
         end_s = float(share * np.ptp(of_parent) * 1e-9)

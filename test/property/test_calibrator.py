@@ -68,5 +68,5 @@ def test_a_gap_leaves_pairs_out_but_invents_none(first, length, random):
         stream: {message[1] for message in kept if message[0] == stream}
         for stream in ("parent", "child")
     }
-    assert set(calibrator.snapshot().pose_pairs().stamps_ns.tolist()) <= stamps["child"]
+    assert set(calibrator.snapshot().pose_pairs.stamps_ns.tolist()) <= stamps["child"]
     np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)

@@ -160,7 +160,7 @@ def test_a_stream_on_its_own_does_not_fill_the_memory():
     assert calibrator.statistics("parent").dropped_unpaired > 0
     assert len(calibrator.snapshot().parent) <= 100
     feed(calibrator, "child", child)
-    assert len(calibrator.snapshot().pose_pairs()) > 20
+    assert len(calibrator.snapshot().pose_pairs) > 20
 
 
 def test_a_snapshot_does_not_change_when_poses_come_in():

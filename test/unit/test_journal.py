@@ -52,8 +52,8 @@ def test_a_resumed_session_is_the_session(tmp_path, n_poses):
     assert len(journal.stamps_ns) == 2 * n_poses
     assert again.snapshot().parent_frame == "lidar"
     assert again.statistics("child") == calibrator.statistics("child")
-    for name, value in vars(calibrator.snapshot().pose_pairs()).items():
-        np.testing.assert_array_equal(vars(again.snapshot().pose_pairs())[name], value)
+    for name, value in vars(calibrator.snapshot().pose_pairs).items():
+        np.testing.assert_array_equal(vars(again.snapshot().pose_pairs)[name], value)
     assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
 
 

@@ -52,7 +52,7 @@ def by_stamp(parent, child):
 def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
     parent, child = drive(child_every=child_every)
     calibrator = play(by_stamp(parent, child), max_gap=1.0)
-    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
+    assert np.array_equal(calibrator.snapshot().pose_pairs.stamps_ns, child.stamps_ns)
     assert len(calibrator.snapshot().parent) < 150
     np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert not calibrator.add_pose("parent", parent.stamps_ns[0] + 1, [0.0] * 3, [0.0, 0, 0, 1])
@@ -63,9 +63,9 @@ def test_reset_forgets_and_reconfigure_keeps():
     calibrator = play(by_stamp(*drive()))
     calibrator.reconfigure(dataclasses.replace(calibrator.config, reference="B5"))
     assert calibrator.estimate().reference == "B5"
-    before = len(calibrator.snapshot().pose_pairs())
+    before = len(calibrator.snapshot().pose_pairs)
     calibrator.reconfigure(dataclasses.replace(calibrator.config, time_offset=0.01))
-    assert 0 < len(calibrator.snapshot().pose_pairs()) < before
+    assert 0 < len(calibrator.snapshot().pose_pairs) < before
     calibrator.reset()
     assert calibrator.statistics("parent").received == 0
     with pytest.raises(NotEnoughDataError):
@@ -101,7 +101,7 @@ def test_a_stream_that_lags_by_half_a_minute_loses_nothing():
     arrivals = np.r_[parent.stamps_ns, child.stamps_ns + 30 * 10**9]
     sequence = messages("parent", parent) + messages("child", child)
     calibrator = play([sequence[k] for k in np.argsort(arrivals, kind="stable")])
-    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, child.stamps_ns)
+    assert np.array_equal(calibrator.snapshot().pose_pairs.stamps_ns, child.stamps_ns)
     assert calibrator.statistics("parent").dropped_unpaired == 0
 
 
@@ -110,7 +110,7 @@ def test_a_gap_in_one_stream_costs_the_pairs_in_it_and_no_more():
     kept = np.r_[0:200, 300:600]
     calibrator = play(by_stamp(parent[kept], child))
     expected = child.stamps_ns[kept]
-    assert np.array_equal(calibrator.snapshot().pose_pairs().stamps_ns, expected)
+    assert np.array_equal(calibrator.snapshot().pose_pairs.stamps_ns, expected)
 
 
 def test_the_informative_pairs_are_kept_not_the_newest():
@@ -120,7 +120,7 @@ def test_the_informative_pairs_are_kept_not_the_newest():
     parent = as_trajectory(np.concatenate([turning, straight]))
     child = dataclasses.replace(parent, poses=disturbed(child_of(parent.poses), 1, 1e-4, 1e-4))
     calibrator = play(by_stamp(parent, child), max_pairs=1500)
-    stamps_ns = calibrator.snapshot().pose_pairs().stamps_ns
+    stamps_ns = calibrator.snapshot().pose_pairs.stamps_ns
     assert len(stamps_ns) <= 1500
     assert (stamps_ns <= parent.stamps_ns[1199]).sum() > 900
     result = calibrator.estimate()
@@ -142,7 +142,7 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"), SMALL)
     feed(calibrator, "parent", parent)
     feed(calibrator, "child", child)
-    snapshot = calibrator.snapshot().resolved()
+    snapshot = calibrator.snapshot().resolved
     calibrator.adopt(snapshot.time_offset)
     monkeypatch.setattr("hand_eye_calib.engine.calibrator.estimated_time_offset", None)
     extra = as_trajectory(wandering_poses(900))[400:]

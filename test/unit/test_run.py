@@ -105,7 +105,7 @@ def test_kept_pairs_are_put_right_like_poses(streams):
     child = written_otherwise(child, REPAIRS[0])
     snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
     nothing = {"buffered_parent": parent[:0], "buffered_child": child[:0]}
-    kept = replace(snapshot, kept=snapshot.pose_pairs(), paired_at="child", **nothing)
+    kept = replace(snapshot, kept=snapshot.pose_pairs, paired_at="child", **nothing)
     found = with_options(kept, {"child_invert": "poses"})
     np.testing.assert_allclose(found.estimate().T_parent_child, expected, atol=1e-9)
     shifted = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})
@@ -206,7 +206,7 @@ def late():
 
 
 class TestClearOffset:
-    def test_it_is_estimated_before_the_first_solve(self, late, monkeypatch):
+    def test_it_is_estimated_before_the_first_solve(self, late):
         in_turn = review(late.estimate(), late)
         found = run(late)
         assert found.snapshot.config == in_turn.snapshot.config
@@ -216,11 +216,6 @@ class TestClearOffset:
         np.testing.assert_array_equal(found.calibration.covariance, expected.covariance)
         assert found.calibration.findings == expected.findings
         assert expected.time_offset_s == pytest.approx(0.05, abs=0.003)
-        # If something speaks against it, the streams are solved as they are, too.
-        monkeypatch.setattr("hand_eye_calib.engine.run.Run._is_sound", False)
-        found = run(late)
-        assert found.check.findings == in_turn.check.findings
-        assert found.told == in_turn.told
 
     @pytest.mark.parametrize(
         "options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}]
@@ -240,7 +235,7 @@ class TestClearOffset:
         monkeypatch.setattr(Snapshot, "estimate", counted)
         run(late)
         assert len(solved) == 1
-        spread = replace(with_options(late, {"time_offset": "estimate"}).resolved().time_offset)
+        spread = replace(with_options(late, {"time_offset": "estimate"}).resolved.time_offset)
         unclear = replace(spread, spread_s=0.4)
         monkeypatch.setattr(
             "hand_eye_calib.engine.run.refine_time_offset", lambda *given, **more: unclear

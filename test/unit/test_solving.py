@@ -105,7 +105,7 @@ def test_gives_the_same_bits_as_here_whatever_libraries_print(start, options):
     assert there.seen.n_poses == here.seen.n_poses == 250
     assert (there.time_offset is None) == ("time_offset" not in options)
     if there.time_offset is not None:
-        assert there.time_offset.seconds == work.resolved().time_offset.seconds
+        assert there.time_offset.seconds == work.resolved.time_offset.seconds
 
 
 def test_what_is_missing_and_defects_are_told_apart():
