@@ -1,17 +1,13 @@
 """The scale: factor from the child's unit of length to the parent's."""
 
-import numpy as np
-
 from hand_eye_calib.alignment.similarity import (
     MAX_UNEXPLAINED_TRANSLATION,
     SimilarityFit,
     fit_similarity,
 )
-from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.stats import median
 
 # Motions over these times (s) are compared; the lag with the smallest relative standard deviation
 # wins. Long motions show the scale best.

@@ -18,8 +18,8 @@ from hand_eye_calib.engine.evidence import Evidence, gather
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
