@@ -87,7 +87,7 @@ def frames_of_bag(path: str | Path) -> FrameTree:
     from hand_eye_calib.io.bags import PoseBag
 
     with PoseBag(path) as bag:
-        return bag.static_frames()
+        return bag.static_frames
 
 
 def _of_numbers(text: str) -> FloatArray:

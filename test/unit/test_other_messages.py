@@ -148,7 +148,7 @@ def test_messages_of_json(tmp_path):
         ("/array?t=header.stamp,x=pose.position.x,y=a,z=b", InputError, "has no pose.position.x"),
         ("/array?t", ConfigError, "fields are written NAME=PATH"),
         ("/array?t=header.stamp,x=header.frame_id,y=header,z=header", InputError, "float"),
-        ("/px4?x=position.0,y=position.1,z=position.2", InputError, "no column for t"),
+        ("/px4?x=position.0,y=position.1,z=position.2", InputError, "of its fields is a stamp"),
     ],
 )
 def test_what_cannot_be_read_is_told_in_one_sentence(bag, source, error, message):

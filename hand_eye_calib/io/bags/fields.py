@@ -58,12 +58,8 @@ def split_fields(source: str) -> tuple[str, str]:
 
 
 class FieldReader:
-    """Reads the fields of a topic's messages.
-
-    Raises
-    ------
-    ConfigError
-        If the fields are not written as they should be.
+    """Reads the fields of a topic's messages; a ConfigError if they are not written as they should
+    be.
     """
 
     def __init__(self, topic: str, fields: str) -> None:
@@ -77,15 +73,17 @@ class FieldReader:
         self._names = [name for name, _ in pairs]
         self._paths = [path.split(".") for _, path in pairs]
 
-    def cells_of(self, kind: MessageKind) -> Callable[[bytes], list[str]]:
+    def cells_of(self, kind: MessageKind) -> Callable[..., list[str]]:
         """What reads the values of a message of this kind, stamps in seconds with all their digits;
         an InputError if it lacks one.
         """
         decode = _decoder(kind)
-        return lambda data: self._cells(decode(data))
 
-    def _cells(self, message: Any) -> list[str]:
-        return [self._text(message, path) for path in self._paths]
+        def cells(data: bytes, is_ros1: bool) -> list[str]:
+            message = decode(data)
+            return [self._text(message, path) for path in self._paths]
+
+        return cells
 
     def _text(self, value: Any, path: list[str]) -> str:
         try:
@@ -105,17 +103,12 @@ class FieldReader:
 
     def poses(self, rows: Iterable[list[str]]) -> tuple[IntArray, FloatArray, list[str]]:
         """Stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of the cells of messages, and
-        notes for a person.
-
-        Raises
-        ------
-        InputError
-            If they are no poses.
+        notes for a person; an InputError if they are no poses.
         """
         measures = "twists" if {*TWIST} <= {*self._names} else AUTO
         table = table_of(self._topic, self._names, enumerate(rows, 1), list, measures)
         if not table.stamps:
-            raise InputError(f"no messages on {self._topic}")
+            raise InputError(f"no messages on {self._topic}, or none of its fields is a stamp, t")
         stamps_ns = stamps_in_ns(table, None)
         if measures == "twists":
             return stamps_ns, _integrated(stamps_ns, table.values), []
@@ -142,10 +135,8 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
     if kind.encoding == "json":
         return json.loads
     if kind.encoding not in ("cdr", "ros1"):
-        raise InputError(
-            f"messages of type {name} are encoded as {kind.encoding[:40]!r}; expected cdr, ros1 or "
-            "json"
-        )
+        encoding = f"{kind.encoding[:40]!r}; expected cdr, ros1 or json"
+        raise InputError(f"messages of type {name} are encoded as {encoding}")
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)

@@ -92,13 +92,7 @@ class _WholeReads(BufferedReader):
 
 
 def recovered_messages(path: Path, lose: Callable[[str], None]) -> Iterator[Message]:
-    """Messages of an mcap file in the order of the file, as far as it goes; what is lost is told.
-
-    Raises
-    ------
-    MissingDependencyError
-        Without the library mcap.
-    """
+    """Messages of an mcap file in their order, as far as it goes; what is lost is told."""
     try:
         from mcap import records as mcap
         from mcap.stream_reader import StreamReader

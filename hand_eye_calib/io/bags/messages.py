@@ -7,7 +7,9 @@ of a whole message and needs no type definitions. A new type is a row in :data:`
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -18,6 +20,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.fields import FIELDS
+from hand_eye_calib.io.bags.mcap_files import MessageKind
 from hand_eye_calib.io.bags.poses import PoseColumns
 from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin
 from hand_eye_calib.io.limits import LONGEST_NAME
@@ -25,6 +28,7 @@ from hand_eye_calib.io.transforms import PoseFields
 
 # What unpacking bytes that are not a message of its type may raise.
 MALFORMED = (struct.error, ValueError)
+Errors = type[Exception] | tuple[type[Exception], ...]
 
 Buffer = bytes | memoryview
 T = TypeVar("T")
@@ -132,17 +136,9 @@ def _fix(cursor: Cursor) -> Sequence[float]:
 
 
 class MessageType(NamedTuple):
-    """A type of messages with a header that are read.
-
-    Attributes
-    ----------
-    name : str
-    measures : mapping of str to slice
-        What its messages can be read as, the usual first, and where it is in what is unpacked.
-    unpack : callable
-        Reads the values behind the frames.
-    has_child_frame : bool
-        Whether the sensor's frame stands behind the header.
+    """A type of messages with a header that are read: its name; what they can be read as, the usual
+    first, and where that is in what is unpacked; what reads the values behind the frames; and
+    whether the sensor's frame stands behind the header.
     """
 
     name: str
@@ -183,12 +179,8 @@ SENSOR_TYPES = (
 
 
 def measured_as(message_type: str, wanted: str, source: object) -> str:
-    """What messages of a type are read as: what is wanted, or the usual for "auto".
-
-    Raises
-    ------
-    ConfigError
-        If they cannot be read as that.
+    """What messages of a type are read as: what is wanted, or the usual for "auto"; a ConfigError
+    if they cannot be read as that.
     """
     possible = ["positions"] if message_type == "foxglove.LocationFix" else [*_OF_POSES]
     if message_type in MESSAGE_TYPES:
@@ -212,18 +204,10 @@ def unpack_stamp_ns(data: Buffer) -> int:
 
 
 def each_unpacked(
-    messages: Sequence[Buffer],
-    unpack: Callable[[Any], T],
-    errors: type[Exception] | tuple[type[Exception], ...] = MALFORMED,
+    messages: Sequence[Buffer], unpack: Callable[[Any], T], errors: Errors = MALFORMED
 ) -> list[T]:
-    """What is unpacked of each message.
-
-    Raises
-    ------
-    MalformedMessage
-        At the first that raises one of the errors.
-    InputError
-        If it is one already.
+    """What is unpacked of each message; a MalformedMessage at the first that raises one of the
+    errors.
     """
     found = []
     for index, data in enumerate(messages):
@@ -234,6 +218,41 @@ def each_unpacked(
         except errors as error:
             raise MalformedMessage(index, error) from error
     return found
+
+
+@dataclass
+class Run:
+    """Messages of one kind that follow each other, their bag times (N,), and how many of their
+    topic were before.
+    """
+
+    kind: MessageKind
+    messages: list[bytes]
+    bag_ns: IntArray
+    n_before: int
+
+    def __len__(self) -> int:
+        return len(self.messages)
+
+    def unpacked(self, unpack: Callable[..., T], errors: Errors = MALFORMED) -> list[T]:
+        """What is unpacked of each message and whether it is of ROS 1; an InputError names the
+        first that raises one of the errors.
+        """
+        with self.named():
+            of_kind = partial(unpack, is_ros1=self.kind.is_ros1)
+            return each_unpacked(self.messages, of_kind, errors)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Give the message of a MalformedMessage its name."""
+        try:
+            yield
+        except MalformedMessage as error:
+            number = self.n_before + error.index + 1
+            raise InputError(
+                f"{self.kind.topic}, message {number}: not a readable {self.kind.type} ({error}); "
+                "the bag is damaged, record it again"
+            ) from error
 
 
 _Unpacked = tuple[int, str, str | None, Sequence[float], int]
@@ -322,17 +341,8 @@ class MessageReader:
     """Unpacks the messages of one topic, in their order, as poses: of what is no pose, the other
     part means nothing (level positions, rotations at the origin).
 
-    Parameters
-    ----------
-    message_type, measures : str
-        As of :func:`measured_as`.
-    origin : LocalOrigin, optional
-        Of latitudes and longitudes; the first one read by default.
-
-    Attributes
-    ----------
-    n_left_out : int
-        Messages without a fix or an orientation.
+    ``measures`` is as of :func:`measured_as`, ``origin`` that of latitudes and longitudes, the
+    first one read by default. ``n_left_out`` counts messages without a fix or an orientation.
     """
 
     def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
@@ -345,12 +355,7 @@ class MessageReader:
     def columns(self, messages: Sequence[Buffer], is_ros1: bool) -> tuple[PoseColumns, BoolArray]:
         """The next messages, and which of them have what is measured; the others are not finite.
 
-        Raises
-        ------
-        MalformedMessage
-            At the first that cannot be unpacked.
-        InputError
-            At a latitude beyond 90 deg.
+        Raises as :func:`unpack_poses`, and InputError at a latitude beyond 90 deg.
         """
         columns = unpack_poses(messages, self._row.name, is_ros1)
         if self._are_poses:
@@ -385,12 +390,8 @@ class MessageReader:
         return self._origin.local(lat, lon, values[rows, 2])
 
     def __call__(self, data: Buffer) -> PoseFields:
-        """The next message, in CDR, as it arrives.
-
-        Raises
-        ------
-        InputError
-            If it cannot be unpacked, or lacks what is measured.
+        """The next message, in CDR, as it arrives; an InputError if it cannot be unpacked, or lacks
+        what is measured.
         """
         try:
             if self._are_poses:

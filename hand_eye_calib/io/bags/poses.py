@@ -16,15 +16,8 @@ _FACTOR, _SMALLEST_JUMP_S = 10.0, 0.5
 
 
 class PoseColumns(NamedTuple):
-    """The unpacked part of N messages in columns.
-
-    Attributes
-    ----------
-    stamps_ns : (N,) int64 array
-    world_frames : list of str
-    sensor_frames : list of str or None
-    poses : (N, 7) array
-        x y z qx qy qz qw; of messages that are no poses, what :attr:`MessageType.unpack` reads.
+    """The unpacked part of N messages in columns: stamps (N,), frames, and poses (N, 7) of
+    x y z qx qy qz qw; of messages that are no poses, what :attr:`MessageType.unpack` reads.
     """
 
     stamps_ns: IntArray

@@ -6,7 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from itertools import chain, pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -19,7 +19,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.fields import FIELDS, split_fields
-from hand_eye_calib.io.bags.mcap_files import Message, MessageKind
+from hand_eye_calib.io.bags.mcap_files import Message
 from hand_eye_calib.io.bags.messages import (
     MESSAGE_TYPES,
     PATH_TYPE,
@@ -27,8 +27,7 @@ from hand_eye_calib.io.bags.messages import (
     POSE_TYPES,
     SENSOR_TYPES,
     TF_TYPES,
-    MalformedMessage,
-    each_unpacked,
+    Run,
     measured_as,
     unpack_transforms,
 )
@@ -45,7 +44,7 @@ from hand_eye_calib.io.bags.sources import (
     is_static,
 )
 from hand_eye_calib.io.bags.storage import message_blocks, open_bags
-from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
+from hand_eye_calib.io.transforms import TfSource, TfStream
 
 # A topic with fewer poses is not one of the two sensors: goals and initial poses are published
 # once.
@@ -70,14 +69,8 @@ class TopicInfo(NamedTuple):
 
 
 class PoseBag:
-    """One bag, or several of one recording, opened for reading; a context manager.
-
-    Parameters
-    ----------
-    *paths : str or path-like
-        Each a rosbag2 directory, a single ``.mcap`` or ``.db3`` file of one, or a rosbag1 ``.bag``
-        file. They are read in the order of their times; those that were recorded at the same time
-        are merged.
+    """One bag, or several of one recording, opened for reading; a context manager. They are read in
+    the order of their times; those that were recorded at the same time are merged.
 
     Attributes
     ----------
@@ -86,8 +79,8 @@ class PoseBag:
     start_ns, end_ns : int or None
         Bag time of the first and last message; None if there is none.
     shown : callable
-        Passes on items, here blocks of messages, and may show how far they are; of the items, the
-        sum of their sizes, what is being done, and the size of an item.
+        Passes on runs of messages, and may show how far they are; of the runs, the number of all
+        messages, what is being done, and the size of a run.
 
     Raises
     ------
@@ -97,7 +90,7 @@ class PoseBag:
 
     def __init__(self, *paths: str | Path) -> None:
         self.paths = [Path(path) for path in paths]
-        self.shown: Callable[..., Iterable[list[Message]]] = lambda blocks, *_: blocks
+        self.shown: Callable[..., Iterable[Run]] = lambda runs, *_: runs
         self._notes: list[str] = []
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
@@ -110,10 +103,9 @@ class PoseBag:
             name: TopicInfo(name, "" if len(types[name]) > 1 else types[name].pop(), counts[name])
             for name in sorted(types)
         }
-        spans = [(each.start_ns, each.end_ns) for each in self._storages]
-        known = [(first, last) for first, last in spans if first is not None and last is not None]
-        self.start_ns = min((first for first, _ in known), default=None)
-        self.end_ns = max((last for _, last in known), default=None)
+        spans = [each.span_ns for each in self._storages if each.span_ns]
+        self.start_ns = min((first for first, _ in spans), default=None)
+        self.end_ns = max((last for _, last in spans), default=None)
 
     def __enter__(self) -> Self:
         return self
@@ -154,32 +146,22 @@ class PoseBag:
         return [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
 
     def edges_on(self, topic: str) -> list[str]:
-        """Pairs of frames, ``parent:child``, in the first messages of a topic of transforms, if it
-        is one. An InputError if they cannot be read.
+        """Pairs of frames, ``parent:child``, in the first messages of a topic, if these are
+        transforms. An InputError if they cannot be read.
         """
-        if topic not in self._of_transforms():
-            return []
-        first = self._transforms(next(self._blocks([topic]), []))
-        return sorted({f"{each.world_frame}:{each.sensor_frame}" for each, _ in first})
+        runs = self._runs([topic] if self.topics[topic].type in TF_TYPES else [])
+        first = next((run.unpacked(unpack_transforms) for run in runs), [])
+        return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in chain(*first)})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
         """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
-        its type are for.
-
-        Raises
-        ------
-        ConfigError
-            If its messages do not have what is wanted.
+        its type are for; a ConfigError if they do not have what is wanted.
         """
         return measured_as(self._type_of(source), wanted, source)
 
     def check(self, source: Source) -> None:
-        """Refuse a topic without poses, and frames of a bag without transforms.
-
-        Raises
-        ------
-        InputError
-            The message lists the topics that are there.
+        """Raise InputError, with the topics that are there, for a topic without poses, and for
+        frames of a bag without transforms.
         """
         if isinstance(source, TfSource):
             if not self._of_transforms():
@@ -205,17 +187,13 @@ class PoseBag:
     def select(
         self, parent: Source | None = None, child: Source | None = None
     ) -> tuple[Source, Source]:
-        """Choose the sources of the parent's and the child's poses.
+        """Choose the sources of the parent's and the child's poses; an InputError if one that is
+        named cannot be used, both are the same, or there is a choice to make.
 
         What is not named is chosen if there is only one way to do it: with neither named, the bag
         has exactly two topics of poses. The parent is the one whose name has the word parent, base
         or lidar, or the first in alphabetical order. Topics of paths count if there are not enough
         others.
-
-        Raises
-        ------
-        InputError
-            If a named source cannot be used, both are the same, or there is a choice to make.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
@@ -232,11 +210,11 @@ class PoseBag:
         choices = [topics for topics in (poses, moving, moving + paths) if len(topics) == wanted]
         if wanted and not choices:
             found = sorted({edge for name in self.topics for edge in self.edges_on(name)})
-            more = f" and {len(found) - _MOST_FRAMES} more" if len(found) > _MOST_FRAMES else ""
             raise InputError(
                 "name the topics of poses with --parent-topic and --child-topic, or frames with "
                 f"--parent-tf and --child-tf. {self._listing()}"
-                + (f". Transforms are {', '.join(found[:_MOST_FRAMES])}{more}" if found else "")
+                + f". Transforms are {', '.join(found[:_MOST_FRAMES])}"
+                * bool(found)
             )
         chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
         return parent or chosen.pop(0), child or chosen.pop(0)
@@ -255,7 +233,8 @@ class PoseBag:
         max_gap_s: float = CalibratorConfig.max_gap,
         measures: Mapping[str, str] | None = None,
     ) -> PoseTable:
-        """The poses of one or two streams in the order of the bag's time.
+        """The poses of one or two streams in the order of the bag's time; an InputError if the bag
+        is damaged, or the transforms do not lead from one frame to the other.
 
         Parameters
         ----------
@@ -265,11 +244,6 @@ class PoseBag:
             Longest time that is interpolated between two transforms of a chain.
         measures : mapping, optional
             "parent" and "child" to what their topics are read as, see :meth:`measured`.
-
-        Raises
-        ------
-        InputError
-            If the bag is damaged, or the transforms do not lead from one frame to the other.
         """
         measures = measures or {}
         sources = {"parent": parent} | ({"child": child} if child else {})
@@ -282,24 +256,17 @@ class PoseBag:
             for topic in reading.topics:
                 takers[topic].append(reading)
         count = sum(self.topics[topic].count for topic in takers)
-        done = Counter[str]()
-        for block in self.shown(self._blocks(takers), count, f"reading {self}", len):
-            for kind, messages, bag_ns in _by_kind(block):
-                try:
-                    for reading in takers[kind.topic]:
-                        reading.take(kind, messages, bag_ns)
-                except MalformedMessage as error:
-                    raise _unreadable(kind, done[kind.topic], error) from error
-                done[kind.topic] += len(messages)
+        for run in self.shown(self._runs(takers), count, f"reading {self}", len):
+            for reading in takers[run.kind.topic]:
+                reading.take(run)
         tables = [reading.table() for reading in readings]
         self._notes += [note for reading in readings for note in reading.notes]
         return PoseTable.joined(tables)
 
     def _reading(self, stream: str, source: Source, measures: str, max_gap_s: float) -> Reading:
         if isinstance(source, TfSource):
-            tree = self.static_frames()
-            tree.route(*source)  # or it raises
-            of_tree = TfStream(source, max_gap_s, tree)
+            self.static_frames.route(*source)  # or it raises
+            of_tree = TfStream(source, max_gap_s, self.static_frames)
             return TransformReading(stream, of_tree, self._of_transforms())
         (topic, fields), type_ = split_fields(source), self._type_of(source)
         if type_ in MESSAGE_TYPES:
@@ -316,25 +283,9 @@ class PoseBag:
         )
 
     def trajectory(self, source: Source, measures: str = "auto") -> tuple[Trajectory, list[str]]:
-        """The trajectory of one source.
-
-        Parameters
-        ----------
-        source : str or TfSource
-        measures : str
-            What to read of the poses, see :meth:`measured`.
-
-        Returns
-        -------
-        Trajectory
-            In the order of stamps; of those with equal stamps the first.
-        notes : list of str
-            What a person should know.
-
-        Raises
-        ------
-        InputError
-            If the bag or a pose cannot be read.
+        """The trajectory of one source in the order of stamps, of those with equal stamps the
+        first, and what a person should know; ``measures`` as of :meth:`measured`. An InputError if
+        the bag or a pose cannot be read.
         """
         self.check(source)
         poses = self.poses(source, measures={"parent": measures})
@@ -351,62 +302,43 @@ class PoseBag:
         kind: Any = self.measured(source, measures)
         return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes
 
+    @cached_property
     def static_frames(self) -> FrameTree:
         """The frames of the bag and their static transforms; of repeated ones the last. As in tf2,
-        one that is no pose is left out.
-
-        Raises
-        ------
-        InputError
-            If the transforms form no tree or are damaged.
+        one that is no pose is left out. An InputError if they form no tree or are damaged.
         """
         tree, notes = FrameTree("the bag's transforms"), {}
-        blocks = self._blocks(self._of_transforms())
-        for transform, is_fixed in chain.from_iterable(map(self._transforms, blocks)):
-            parent, frame, pose = transform.world_frame, transform.sensor_frame or "", None
-            if is_fixed:
+        for run in self._runs(self._of_transforms()):
+            is_fixed = is_static(run.kind.topic)
+            for _, parent, frame, *values in chain(*run.unpacked(unpack_transforms)):
                 try:
-                    pose = checked_pose(transform.position, transform.quat_xyzw)
+                    pose = checked_pose(*values) if is_fixed else None
                 except InputError as error:
                     notes[frame] = f"transform {parent}:{frame} was left out: {error}"
-                    continue
-            tree.add(parent, frame, pose, is_fixed)
+                else:
+                    tree.add(parent, frame or "", pose, is_fixed)
         self._notes += notes.values()
         return tree
 
     # ---- messages
 
-    def _transforms(self, block: list[Message]) -> Iterator[tuple[PoseFields, bool]]:
-        """Transforms, and whether each is static."""
-        for kind, messages, _ in _by_kind(block):
-            try:
-                lists = each_unpacked(messages, partial(unpack_transforms, is_ros1=kind.is_ros1))
-            except MalformedMessage as error:
-                raise _unreadable(kind, 0, error) from error
-            yield from ((each, is_static(kind.topic)) for each in chain.from_iterable(lists))
+    def _runs(self, topics: Collection[str]) -> Iterator[Run]:
+        """Messages of some topics in the order of bag time, many of a kind at once."""
+        done = Counter[str]()
+        for block in self._blocks(topics):
+            for kind in {id(each): each for each, _, _ in block}.values():
+                messages = [data for each, _, data in block if each is kind]
+                bag_ns = np.array([bag_ns for each, bag_ns, _ in block if each is kind])
+                yield Run(kind, messages, bag_ns, done[kind.topic])
+                done[kind.topic] += len(messages)
 
     def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Messages of some topics in the order of bag time, many at once."""
-        storages = [each for each in self._storages if each.start_ns is not None]
-        if all((one.end_ns or 0) < (two.start_ns or 0) for one, two in pairwise(storages)):
-            return chain.from_iterable(storage.blocks(topics) for storage in storages)
-        streams = (chain.from_iterable(storage.blocks(topics)) for storage in storages)
+        spans = [each.span_ns for each in self._storages if each.span_ns]
+        if all(one[1] < two[0] for one, two in pairwise(spans)):
+            return chain.from_iterable(each.blocks(topics) for each in self._storages)
+        streams = (chain.from_iterable(each.blocks(topics)) for each in self._storages)
         return message_blocks(heapq.merge(*streams, key=itemgetter(1)))
-
-
-def _by_kind(block: list[Message]) -> Iterator[tuple[MessageKind, list[bytes], Any]]:
-    """The messages of each kind in a block, and their bag times (N,)."""
-    for kind in {id(each): each for each, _, _ in block}.values():
-        messages = [data for each, _, data in block if each is kind]
-        yield kind, messages, np.array([bag_ns for each, bag_ns, _ in block if each is kind])
-
-
-def _unreadable(kind: MessageKind, n_before: int, error: MalformedMessage) -> InputError:
-    """The error of a message that cannot be unpacked, after others of its topic."""
-    return InputError(
-        f"{kind.topic}, message {n_before + error.index + 1}: not a readable {kind.type} "
-        f"({error}); the bag is damaged, record it again"
-    )
 
 
 def _parent_first(topic: str) -> tuple[int, str]:

@@ -8,17 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.fields import FieldReader
-from hand_eye_calib.io.bags.mcap_files import MessageKind
-from hand_eye_calib.io.bags.messages import (
-    MessageReader,
-    each_unpacked,
-    unpack_path,
-    unpack_transforms,
-)
+from hand_eye_calib.io.bags.messages import MessageReader, Run, unpack_path, unpack_transforms
 from hand_eye_calib.io.bags.poses import PoseColumns, PoseTable, are_believable
 from hand_eye_calib.io.bags.scans import ScanOdometry, unpack_scan
 from hand_eye_calib.io.transforms import TfSource, TfStream
@@ -29,28 +23,16 @@ Source = str | TfSource
 class Reading:
     """Reads one stream; there is a subclass for each kind of source.
 
-    Attributes
-    ----------
-    topics : tuple of str
-        Those whose messages it takes.
-    notes : list of str
-        What a person should know; complete with :meth:`table`.
+    ``topics`` are those whose messages it takes, ``notes`` what a person should know, complete with
+    :meth:`table`.
     """
 
     def __init__(self, stream: str, *topics: str) -> None:
         self.stream, self.topics = stream, topics
         self.notes: list[str] = []
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
-        """Take the next messages of one of the topics, and their bag times (N,).
-
-        Raises
-        ------
-        MalformedMessage
-            At the first that cannot be unpacked.
-        InputError
-            If they cannot be used.
-        """
+    def take(self, run: Run) -> None:
+        """Take the next messages of one of the topics; an InputError if they cannot be used."""
         raise NotImplementedError
 
     def table(self) -> PoseTable:
@@ -68,17 +50,14 @@ class TopicReading(Reading):
 
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
-        self._reader, self._count = MessageReader(message_type, measures), 0
+        self._reader = MessageReader(message_type, measures)
         self._tables = [self._of_frames([], np.empty((0, 7)), [])]
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
-        try:
-            columns, keep = self._reader.columns(messages, kind.is_ros1)
-        except InputError as error:
-            raise InputError(f"{kind.topic}: {error}") from None
-        table = PoseTable.of_columns(self.stream, columns, bag_ns, self._count + 1)
+    def take(self, run: Run) -> None:
+        with run.named():
+            columns, keep = self._reader.columns(run.messages, run.kind.is_ros1)
+        table = PoseTable.of_columns(self.stream, columns, run.bag_ns, run.n_before + 1)
         self._tables.append(table[keep])
-        self._count += len(messages)
 
     def table(self) -> PoseTable:
         table = PoseTable.joined(self._tables)
@@ -103,10 +82,10 @@ class JoinedReading(Reading):
         super().__init__(parts[0].stream, *(topic for part in parts for topic in part.topics))
         self._parts = parts
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
+    def take(self, run: Run) -> None:
         for part in self._parts:
-            if kind.topic in part.topics:
-                part.take(kind, messages, bag_ns)
+            if run.kind.topic in part.topics:
+                part.take(run)
 
     def table(self) -> PoseTable:
         fixes, turning = (part.table() for part in self._parts)
@@ -133,9 +112,8 @@ class PathReading(Reading):
         self._stamps_ns, self._poses = np.empty(0, dtype=np.int64), np.empty((0, 7))
         self._frame = ""
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
-        for path in each_unpacked(messages, lambda data: unpack_path(data, kind.is_ros1)):
-            self._frame, stamps_ns, poses = path
+    def take(self, run: Run) -> None:
+        for self._frame, stamps_ns, poses in run.unpacked(unpack_path):
             if len(stamps_ns):
                 older = self._stamps_ns < stamps_ns.min()
                 self._stamps_ns = np.r_[self._stamps_ns[older], stamps_ns]
@@ -157,10 +135,9 @@ class ScanReading(Reading):
         self._lidar, self._topic = ScanOdometry(topic, bag, files), topic
         super().__init__(stream, *([] if self._lidar.kept else [topic]))
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
-        found = each_unpacked(messages, lambda data: unpack_scan(data, kind.is_ros1))
-        for scan, each_ns in zip(found, bag_ns.tolist(), strict=True):
-            self._lidar.add(scan, each_ns)
+    def take(self, run: Run) -> None:
+        for scan, bag_ns in zip(run.unpacked(unpack_scan), run.bag_ns.tolist(), strict=True):
+            self._lidar.add(scan, bag_ns)
 
     def table(self) -> PoseTable:
         found = self._lidar.odometry()
@@ -179,10 +156,10 @@ class FieldReading(Reading):
         self._reader = FieldReader(topic, fields)
         self._rows, self._bag_ns = list[list[str]](), list[int]()
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
+    def take(self, run: Run) -> None:
         # The library's errors are of many kinds.
-        self._rows += each_unpacked(messages, self._reader.cells_of(kind), Exception)
-        self._bag_ns += bag_ns.tolist()
+        self._rows += run.unpacked(self._reader.cells_of(run.kind), Exception)
+        self._bag_ns += run.bag_ns.tolist()
 
     def table(self) -> PoseTable:
         stamps_ns, poses, self.notes = self._reader.poses(self._rows)
@@ -199,12 +176,12 @@ class TransformReading(Reading):
         self._source = source
         self._found: list[tuple[Any, ...]] = []
 
-    def take(self, kind: MessageKind, messages: Sequence[bytes], bag_ns: IntArray) -> None:
-        lists = each_unpacked(messages, lambda data: unpack_transforms(data, kind.is_ros1))
-        for transforms, each_ns in zip(lists, bag_ns.tolist(), strict=True):
+    def take(self, run: Run) -> None:
+        lists = run.unpacked(unpack_transforms)
+        for transforms, bag_ns in zip(lists, run.bag_ns.tolist(), strict=True):
             for transform in transforms:
                 poses = self._source.edges_at(transform, False)
-                self._found += ((each_ns, *pose) for pose in poses)
+                self._found += ((bag_ns, *pose) for pose in poses)
 
     def table(self) -> PoseTable:
         frames = self._source.source

@@ -8,9 +8,12 @@ import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 from urllib.parse import quote
+
+import numpy as np
 
 from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.io.bags.mcap_files import (
@@ -48,30 +51,31 @@ class Storage:
     ----------
     counts : Counter of MessageKind
         Number of messages of each kind.
-    start_ns, end_ns : int or None
-        Bag time of the first and last message; None if there is none.
+    span_ns : tuple of two ints
+        Bag time of the first and last message; empty if there is none.
     losses : list of str
         What could not be read, one line each.
 
     Raises
     ------
     InputError
-        If nothing in it can be read.
+        If nothing in it can be read; from :meth:`blocks`, too.
     """
 
     def __init__(self, path: Path, file: Path) -> None:
         self.path, self._file = path, file
         self.counts = Counter[MessageKind]()
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
+        self.span_ns: tuple[int, ...] = ()
         self.losses: list[str] = []
         self._reader: Any = None
         self._kinds: dict[int, MessageKind] = {}
         with self._guarded():
             try:
                 self._open()
+            except (ImportError, MemoryError):
+                raise
             except Exception as error:
-                if isinstance(error, MissingDependencyError) or self._file.suffix != ".mcap":
+                if self._file.suffix != ".mcap":
                     raise
                 self.close()
                 self._search(error)
@@ -94,7 +98,7 @@ class Storage:
             self._kinds[each.id] = kind
             self.counts[kind] += each.msgcount
         if reader.message_count:
-            self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
+            self.span_ns = reader.start_time, reader.end_time - 1
 
     def _search(self, reason: Exception) -> None:
         """Go through a file that rosbags cannot open."""
@@ -105,18 +109,13 @@ class Storage:
         if self.losses and not times_ns:
             raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
         if times_ns:
-            self.start_ns, self.end_ns = min(times_ns), max(times_ns)
-            about = f"{len(times_ns)} messages covering {(self.end_ns - self.start_ns) * 1e-9:.1f}"
+            self.span_ns = min(times_ns), max(times_ns)
+            about = f"{len(times_ns)} messages covering {np.ptp(self.span_ns) * 1e-9:.1f}"
             self.losses = [f"{loss}; recovered are {about} s" for loss in self.losses]
 
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over the messages of some topics in the order of bag time, many at once. Chunks
         of mcap that overlap come one after the other.
-
-        Raises
-        ------
-        InputError
-            If they are damaged, or take too much memory.
         """
         blocks = message_blocks(self._messages(topics))
         while True:
@@ -179,12 +178,8 @@ def _opened(file: Path) -> Any:
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Messages in blocks that are neither long nor large; those compressed one by one unpacked.
-
-    Raises
-    ------
-    ValueError
-        At the first that is not bytes with a time.
+    """Messages in blocks that are neither long nor large; those compressed one by one unpacked. A
+    ValueError at the first that is not bytes with a time.
     """
     rows: list[Message] = []
     size = 0
@@ -216,12 +211,7 @@ def _zstd() -> Any:
 
 def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
     """The storage files of bags in the order of their start; those compressed as a whole are
-    unpacked first.
-
-    Raises
-    ------
-    InputError
-        If there is no bag or it cannot be read; one line that names the path.
+    unpacked first. An InputError if there is no bag or it cannot be read.
     """
     found = list[Storage]()
     for file in [file for path in paths for file in _files_of(path)]:
@@ -234,7 +224,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
         opened.callback(storage.close)
         storage.losses[:0] = filter(None, [lost])
         found.append(storage)
-    return sorted(found, key=lambda storage: (storage.start_ns is None, storage.start_ns or 0))
+    return sorted(found, key=attrgetter("span_ns"))
 
 
 def _unpack(file: Path, target: Path) -> str:

@@ -41,22 +41,11 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
         Without the library rosbags.
     """
     path = Path(path)
-    _check(path, streams, storage)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _writer(path, storage) as writer:
-            write_streams(writer, streams, storage)
-    except OSError as error:
-        raise InputError(f"cannot write bag {path}: {error.strerror}") from None
-
-
-def _check(path: Path, streams: Streams, storage: str) -> None:
-    if storage not in STORAGES:
-        raise ConfigError(f"unknown bag storage {storage!r}; known are {', '.join(STORAGES)}")
     unknown = [each for _, each in streams.values() if each not in POSE_TYPES]
-    if unknown:
+    if storage not in STORAGES or unknown:
         raise ConfigError(
-            f"cannot write messages of type {unknown[0]!r}; known are {', '.join(POSE_TYPES)}"
+            f"cannot write messages of {', '.join(unknown) or 'poses'} as {storage}; known are "
+            f"{', '.join((*STORAGES, *POSE_TYPES))}"
         )
     if (path.suffix == ".bag") != (storage == "rosbag1"):
         raise InputError(
@@ -65,18 +54,22 @@ def _check(path: Path, streams: Streams, storage: str) -> None:
         )
     if path.exists():
         raise InputError(f"{path} exists already; remove it or choose another name")
-
-
-def _writer(path: Path, storage: str) -> Any:
     try:
         from rosbags import rosbag1, rosbag2
     except ImportError as error:
         raise MissingDependencyError(
             "writing bags needs rosbags, which is not installed: pip install rosbags"
         ) from error
-    if storage == "rosbag1":
-        return rosbag1.Writer(path)
-    return rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer: Any = rosbag1.Writer(path) if storage == "rosbag1" else None
+        if writer is None:
+            plugin = rosbag2.StoragePlugin[storage.upper()]
+            writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        with writer:
+            write_streams(writer, streams, storage)
+    except OSError as error:
+        raise InputError(f"cannot write bag {path}: {error.strerror}") from None
 
 
 def write_streams(writer: Any, streams: Streams, storage: str) -> None:
@@ -100,29 +93,27 @@ def stamped_messages(
 ) -> Iterator[tuple[int, Any]]:
     """Iterate over stamps in ns and messages of a trajectory; ``types`` are rosbags' classes."""
 
-    def make(name: str, *values: Any, **more: Any) -> Any:
-        return types[f"geometry_msgs/msg/{name}"](*values, **more)
+    def make(name: str, *values: Any) -> Any:
+        return types[f"geometry_msgs/msg/{name}"](*values)
 
     zero, no_covariance = make("Vector3", 0.0, 0.0, 0.0), np.zeros(36)
     twist = make("TwistWithCovariance", make("Twist", zero, zero), no_covariance)
-    positions = trajectory.poses[:, :3, 3].tolist()
-    quats_xyzw = se3.to_quat_xyzw(trajectory.poses).tolist()
-    for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
+    quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
+    rows = zip(trajectory.stamps_ns, trajectory.poses[:, :3, 3], quats_xyzw, strict=True)
+    for number, (stamp_ns, position, quat_xyzw) in enumerate(rows):
         header = types["std_msgs/msg/Header"](
-            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, STAMP_UNITS["s"])),
+            stamp=types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), STAMP_UNITS["s"])),
             frame_id=trajectory.world_frame,
             **({"seq": number} if is_ros1 else {}),
         )
-        position, rotation = positions[number], make("Quaternion", *quats_xyzw[number])
-        pose: Any = make("Pose", make("Point", *position), rotation)
+        rotation = make("Quaternion", *quat_xyzw.tolist())
+        pose = make("Pose", make("Point", *position.tolist()), rotation)
+        transform = make("Transform", make("Vector3", *position.tolist()), rotation)
         with_covariance = make("PoseWithCovariance", pose, no_covariance)
         parts = {
             "nav_msgs/msg/Odometry": (trajectory.sensor_frame, with_covariance, twist),
             "geometry_msgs/msg/PoseStamped": (pose,),
             "geometry_msgs/msg/PoseWithCovarianceStamped": (with_covariance,),
-            "geometry_msgs/msg/TransformStamped": (
-                trajectory.sensor_frame,
-                make("Transform", make("Vector3", *position), rotation),
-            ),
+            "geometry_msgs/msg/TransformStamped": (trajectory.sensor_frame, transform),
         }[message_type]
-        yield stamp_ns, types[message_type](header, *parts)
+        yield int(stamp_ns), types[message_type](header, *parts)
