@@ -319,9 +319,8 @@ def widened_by_halves(
     """The model's covariance (6, 6), or that of a part of xi, widened along the direction in which
     both halves of the recording disagree by more than chance.
 
-    ``products`` (K, p + 1, p + 1) are what each part of the recording adds, see
-    :func:`~hand_eye_calib.gls.state_space.part_products`; ``misfit`` is a factor of the covariances
-    of the halves.
+    ``products`` (K, p + 1, p + 1) are what each part of the recording adds
+    (``Posterior.part_products``); ``misfit`` is a factor of the covariances of the halves.
     """
     half = len(products) // 2
     halves = NormalEquations(np.array([products[:half].sum(axis=0), products[half:].sum(axis=0)]))

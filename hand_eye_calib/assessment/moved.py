@@ -405,7 +405,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        Of :func:`~hand_eye_calib.gls.state_space.part_products`.
+        Of :func:`~hand_eye_calib.gls.state_space.Posterior.part_products`.
     misfit : float
         Factor of the covariances.
     """

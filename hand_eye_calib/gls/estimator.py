@@ -20,7 +20,6 @@ from hand_eye_calib.gls.noise_model import ROTATION
 from hand_eye_calib.gls.problem import Fit, Problem
 from hand_eye_calib.gls.solution import AdaptiveSolution
 from hand_eye_calib.gls.stages import STAGES, is_settled, start
-from hand_eye_calib.gls.state_space import part_products
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 from hand_eye_calib.stats import median
 
@@ -155,8 +154,8 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         heavy_tails=fit.has_heavy_tails and "tails" not in problem.without,
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
-        part_products=part_products(posterior),
-        objective=0.5 * (posterior.precision.log_determinant + normal.cost),
+        part_products=posterior.part_products(),
+        objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=is_settled(problem, fit),
         iterations=fit.n_evaluations,
     )

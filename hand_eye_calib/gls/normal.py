@@ -89,7 +89,7 @@ def answers_without(products: FloatArray, n_blocks: int = N_BLOCKS) -> FloatArra
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        Of :func:`~hand_eye_calib.gls.state_space.part_products`.
+        Of :func:`~hand_eye_calib.gls.state_space.Posterior.part_products`.
     n_blocks : int
     """
     block_of_part = np.arange(len(products)) * n_blocks // len(products)

@@ -136,7 +136,7 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
     walk = posterior.restricted_walk(states)
     of_walk = _chi_squares(
         walk[:, :, 0],
-        space.walk_covariance(levels) * space.relative[:, None, None],
+        posterior.walk_covariance * space.relative[:, None, None],
         walk_covariance(posterior) + _squared(walk[:, :, 1:]),
         space.cut,
     )
@@ -144,7 +144,7 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
     of_white = _chi_squares(
         white[:, :, 0],
         space.white_covariance(levels) / weights[:, None, None],
-        posterior.precision.selected_inverse[0][:, :WHITE, :WHITE] + _squared(white[:, :, 1:]),
+        posterior.selected_inverse[0][:, :WHITE, :WHITE] + _squared(white[:, :, 1:]),
         spikes,
     )
     return of_walk, of_white
@@ -231,7 +231,7 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     poses in inverse proportion to their weights.
     """
     states = posterior.states_after(posterior.normal.step)[:, :WHITE]
-    pulled = (posterior.precision.white @ states[:, :, None])[:, :, 0]
+    pulled = (posterior.white @ states[:, :, None])[:, :, 0]
     squares = (states * pulled).sum(axis=1)
     weights, free = posterior.space.weights, posterior.space.is_free
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)

@@ -53,7 +53,7 @@ from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, 
 from hand_eye_calib.gls.problem import known_products, sample
 from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.gls.stages import rough_levels
-from hand_eye_calib.gls.state_space import Posterior, StateSpace, part_products
+from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.gls.windows import aligned, first_lever_arm
 
 # Parameters that poses do not have: a rate of the clock, and what the positions less the odometry
@@ -303,7 +303,7 @@ class _State:
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
-        spread = posterior.precision.selected_inverse[0][:, range(3), range(3)]
+        spread = posterior.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
@@ -382,9 +382,9 @@ def _solution(
         worse=state.worse,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
-        part_products=selected(part_products(posterior), _SOLVED),
+        part_products=selected(posterior.part_products(), _SOLVED),
         misfit=misfit,
-        objective=0.5 * (posterior.precision.log_determinant + normal.cost),
+        objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=converged,
     )
 

@@ -133,18 +133,15 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
         [
             _white_gradient(posterior, states[:, :WHITE]),
             _walk_gradient(posterior, walk),
-            *(
-                _markov_gradient(posterior, process, states)
-                for process in posterior.precision.markov
-            ),
+            *(_markov_gradient(posterior, process, states) for process in posterior.markov),
         ]
     )
     return gradient, _average_information(posterior, states[:, :, 0], walk[:, :, 0])
 
 
 def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
-    space, precision = posterior.space, posterior.precision.white
-    covariance, _ = posterior.precision.selected_inverse
+    space, precision = posterior.space, posterior.white
+    covariance, _ = posterior.selected_inverse
     moments = states @ transposed(states)
     moments += covariance[:, :WHITE, :WHITE]
     moments *= space.weights[:, None, None]
@@ -161,9 +158,9 @@ def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
 
 
 def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
-    space, precision = posterior.space, posterior.precision.walk
+    space, precision = posterior.space, posterior.walk
     moments = walk_covariance(posterior) + walk @ walk.transpose(0, 2, 1)
-    total = np.tensordot(posterior.precision.evidence, moments, axes=1)
+    total = np.tensordot(posterior.evidence, moments, axes=1)
     excess = (~space.cut).sum() * precision - precision @ total @ precision
     first = space.n_white
     traces = [float((excess * basis).sum()) for basis in space.walk]
@@ -172,7 +169,7 @@ def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
 
 def walk_covariance(posterior: Posterior) -> FloatArray:
     """Covariance (n, 6, 6) of the walk's increments for known parameters."""
-    covariance, below = posterior.precision.selected_inverse
+    covariance, below = posterior.selected_inverse
     space, back = posterior.space, transposed(posterior.space.behind)
     half = space.ahead_times(covariance[1:])
     own = space.ahead_times(transposed(half)) + transposed(back) @ covariance[:-1] @ back
@@ -184,7 +181,7 @@ def walk_covariance(posterior: Posterior) -> FloatArray:
 
 def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
     phi, rest, group = process.phi, process.rest, process.group.states
-    covariance, below = posterior.precision.selected_inverse
+    covariance, below = posterior.selected_inverse
     own = states[:, group]
     here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
     ahead = np.einsum("nii->n", below[:, group, group])
@@ -208,19 +205,19 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     space = posterior.space
     variances = np.exp(posterior.levels)
     moved = np.zeros((*states.shape, len(variances)))
-    pulled = (posterior.precision.white @ states[:, :WHITE, None])[:, :, 0]
+    pulled = (posterior.white @ states[:, :WHITE, None])[:, :, 0]
     pulled[space.is_free] = 0.0
     for index, basis in enumerate(space.white):
         moved[:, :WHITE, index] = variances[index] * (basis @ pulled[:, :, None])[:, :, 0]
     along = variances[len(space.white)] * (space.twists * pulled).sum(axis=1)
     moved[:, :WHITE, len(space.white)] = along[:, None] * space.twists
-    for process in posterior.precision.markov:
+    for process in posterior.markov:
         group = process.group
         values = states[:, group.states]
         moved[:, group.states, group.variance] = values
         moved[:, group.states, group.tau] = _by_tau(process, values)
     columns = space.observed(moved)
-    pushed = walk @ posterior.precision.walk
+    pushed = walk @ posterior.walk
     for index, basis in enumerate(space.walk, start=space.n_white):
         columns[:, :, index] = variances[index] * pushed @ basis
     columns[space.cut] = 0.0

@@ -55,7 +55,7 @@ class ModelSolution:
         Weighted squared residual over its degrees of freedom. The covariance has this factor in it.
     part_products : (K, p + 1, p + 1) array
         What each part of the recording adds, see
-        :func:`~hand_eye_calib.gls.state_space.part_products`.
+        :func:`~hand_eye_calib.gls.state_space.Posterior.part_products`.
     objective : float
         Negative log likelihood.
     converged : bool

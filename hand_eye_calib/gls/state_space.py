@@ -143,10 +143,6 @@ class StateSpace:
         roots = roots - share * along @ (transposed(along) @ roots)
         return transposed(roots) @ roots, log_determinants + grown[:, 0, 0]
 
-    def walk_covariance(self, levels: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of the walk over a typical increment."""
-        return _combined(levels[self.n_white :], self.walk)
-
     def observed(self, states: FloatArray) -> FloatArray:
         """What states (N, d, k) contribute to the increments, (n, 6, k)."""
         observed = self.behind @ states[:-1]
@@ -180,6 +176,13 @@ class Markov:
     phi: FloatArray
     rest: FloatArray
 
+    @classmethod
+    def of(cls, group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
+        """At these log levels."""
+        ratio = intervals_s / np.exp(levels[group.tau])
+        variance = float(np.exp(levels[group.variance]))
+        return cls(group, variance, ratio, np.exp(-ratio), -np.expm1(-2.0 * ratio))
+
     def transitions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """What each increment (n,) adds to the precision for unit variance: beside the diagonal, to
         the state before and to that behind. The first state has 1 of its own.
@@ -195,16 +198,8 @@ class Markov:
         return factor.restore(factor.whiten(columns[:, None]))[:, 0]
 
 
-def markov(group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
-    """A group's process at given log levels."""
-    ratio = intervals_s / np.exp(levels[group.tau])
-    variance = float(np.exp(levels[group.variance]))
-    return Markov(group, variance, ratio, np.exp(-ratio), -np.expm1(-2.0 * ratio))
-
-
-class Precision:
-    """What is known of the states of a space at log levels: all that does not depend on the columns
-    of its increments.
+class Posterior:
+    """States, parameters and likelihood of a state space at given log levels.
 
     Parameters
     ----------
@@ -213,6 +208,20 @@ class Precision:
         Logarithms: variances of the white bases, along v and of the walk bases, then variance and
         time constant (s) of every group.
 
+    Attributes
+    ----------
+    white : (1 or N, 6, 6) array
+        Precisions of the white errors for weight 1.
+    walk_covariance, walk : (6, 6) arrays
+        Covariance of the walk over a typical increment, and its inverse.
+    evidence : (n,) array
+        Factors of the latter: zero for increments that are no evidence.
+    markov : list of Markov
+    factor : Factor
+        Of the precision P of all states.
+    log_determinant : float
+        log|V|, increments that are no evidence left out.
+
     Raises
     ------
     numpy.linalg.LinAlgError
@@ -220,28 +229,37 @@ class Precision:
     """
 
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
-        self._space = space
-        self.white, self._white_log_determinants = space.white_precision(levels)
-        walk = space.walk_covariance(levels)
-        self.walk = np.linalg.inv(walk)
-        self._walk_log_determinant = np.linalg.slogdet(walk)[1]
+        self.space, self.levels = space, levels
+        self.white, of_white = space.white_precision(levels)
+        self.walk_covariance = _combined(levels[space.n_white :], space.walk)
+        self.walk = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
-        self.weights = self.evidence[:, None, None] * self.walk
-        self.markov = [markov(group, levels, space.intervals_s) for group in space.groups]
-        diagonal, below = self.blocks()
-        diagonal[0] += self.prior_block()
+        self._weights = self.evidence[:, None, None] * self.walk
+        self.markov = [Markov.of(group, levels, space.intervals_s) for group in space.groups]
+        diagonal, below = self._blocks(0, len(space))
+        diagonal[0] += self._first_block()
         states = range(space.n_states)
         diagonal[:, states, states] *= 1.0 + _ROUNDING
         self.factor = Factor(diagonal, below)
-        self.log_determinant = self._log_determinant()
+        n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
+        white = WHITE * np.log(np.where(given, space.weights, 1.0)) - of_white
+        prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
+        for process in self.markov:
+            of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
+            prior -= process.group.size * of_one
+        of_walk = (
+            kept.sum() * np.linalg.slogdet(self.walk_covariance)[1]
+            + 6 * np.log(space.relative[kept]).sum()
+        )
+        self.log_determinant = float(of_walk + self.factor.log_determinant - prior)
 
-    def blocks(self, start: int = 0, end: int | None = None) -> tuple[FloatArray, FloatArray]:
+    def _blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d), of the m increments
         from pose to pose; without what is known of the first pose by itself.
         """
-        space, size = self._space, self._space.n_states
-        part = slice(start, len(space) if end is None else end)
-        behind, weights, here = space.behind[part], self.weights[part], slice(1, None)
+        space, size = self.space, self.space.n_states
+        part, here = slice(start, end), slice(1, None)
+        behind, weights = space.behind[part], self._weights[part]
         n = len(behind)
         diagonal, below = np.zeros((n + 1, size, size)), np.zeros((n, size, size))
         diagonal[here, :WHITE, :WHITE] = weights
@@ -250,14 +268,12 @@ class Precision:
         if space.slow_ahead is not None:
             slow = space.slow_ahead[part]
             beside = weights @ slow
-            diagonal[here, :WHITE, WHITE:], diagonal[here, WHITE:, :WHITE] = (
-                beside,
-                transposed(beside),
-            )
+            diagonal[here, :WHITE, WHITE:] = beside
+            diagonal[here, WHITE:, :WHITE] = transposed(beside)
             diagonal[here, WHITE:, WHITE:] = transposed(slow) @ beside
             below[:, WHITE:] = transposed(slow) @ below[:, :WHITE]
         diagonal[:-1] += transposed(behind) @ weighed
-        diagonal[here, :WHITE, :WHITE] += self._of_poses(slice(part.start + 1, part.stop + 1))
+        diagonal[here, :WHITE, :WHITE] += self._of_poses(slice(start + 1, end + 1))
         for process in self.markov:
             states = range(process.group.states.start, process.group.states.stop)
             beside, before, after = (
@@ -270,30 +286,18 @@ class Precision:
 
     def _of_poses(self, part: slice) -> FloatArray:
         """Precisions (m, 6, 6) of the white errors of some poses."""
-        weights = self._space.weights[part, None, None]
+        weights = self.space.weights[part, None, None]
         white = self.white if len(self.white) == 1 else self.white[part]
         return np.where(weights > 0.0, weights * white, FREE * np.eye(WHITE))
 
-    def prior_block(self) -> FloatArray:
+    def _first_block(self) -> FloatArray:
         """What is known of the state (d, d) of the first pose by itself."""
-        block = np.zeros((self._space.n_states,) * 2)
+        block = np.zeros((self.space.n_states,) * 2)
         block[:WHITE, :WHITE] = self._of_poses(slice(0, 1))[0]
         for process in self.markov:
             states = range(process.group.states.start, process.group.states.stop)
             block[states, states] = 1.0 / process.variance
         return block
-
-    def _log_determinant(self) -> float:
-        """log|V|, increments that are no evidence left out."""
-        space = self._space
-        n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
-        white = WHITE * np.log(np.where(given, space.weights, 1.0)) - self._white_log_determinants
-        prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
-        for process in self.markov:
-            of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
-            prior -= process.group.size * of_one
-        walk = kept.sum() * self._walk_log_determinant + 6 * np.log(space.relative[kept]).sum()
-        return float(walk + self.factor.log_determinant - prior)
 
     @cached_property
     def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
@@ -302,43 +306,10 @@ class Precision:
         """
         return self.factor.selected_inverse()
 
-
-class Posterior:
-    """States, parameters and likelihood of a state space at given log levels.
-
-    Parameters
-    ----------
-    space : StateSpace
-    levels : (m,) array
-        See :class:`Precision`.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the levels make a matrix that is not positive definite to rounding.
-    """
-
-    def __init__(self, space: StateSpace, levels: FloatArray) -> None:
-        self.space, self.levels = space, levels
-        self.precision = Precision(space, levels)
-
     def halves(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""
-        weighed = self.precision.weights @ columns
-        return weighed, self.precision.factor.whiten(self.space.gathered(weighed))
-
-    def part(self, start: int, end: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Blocks of :meth:`Precision.blocks`, forces (m + 1, d, k) of the columns and products (k,
-        k) of the increments from pose to pose.
-        """
-        here = slice(start, end)
-        space = self.space
-        columns = space.columns[here]
-        weighed = self.precision.weights[here] @ columns
-        forces = replace(space, ahead=space.ahead[here], behind=space.behind[here]).gathered(
-            weighed
-        )
-        return *self.precision.blocks(start, end), forces, multiplied(columns, weighed)
+        weighed = self._weights @ columns
+        return weighed, self.factor.whiten(self.space.gathered(weighed))
 
     @cached_property
     def _halves(self) -> tuple[FloatArray, FloatArray]:
@@ -367,8 +338,7 @@ class Posterior:
         """Negative restricted log likelihood, constants left out (Patterson, Thompson, Biometrika
         58, 1971).
         """
-        determinants = self.precision.log_determinant + self.normal.log_determinant
-        return 0.5 * (determinants + self.normal.cost)
+        return 0.5 * (self.log_determinant + self.normal.log_determinant + self.normal.cost)
 
     def with_weights(self, weights: FloatArray) -> Posterior:
         """The posterior at other weights (N,) of the white errors."""
@@ -377,17 +347,67 @@ class Posterior:
     def states_after(self, step: FloatArray) -> FloatArray:
         """States (N, d) expected after a step of the parameters."""
         mixing = np.r_[step, 1.0][:, None]
-        return self.precision.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
+        return self.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
 
     def restricted(self) -> FloatArray:
         """States (N, d, 1 + q): expected values and, behind them, what the parameters' uncertainty
         adds, as columns whose squares sum to it.
         """
-        return self.precision.factor.restore(_mixed(self.whitened, self.normal.mixing))
+        return self.factor.restore(_mixed(self.whitened, self.normal.mixing))
 
     def restricted_walk(self, states: FloatArray) -> FloatArray:
         """The same of the walk, (n, 6, 1 + q), from all states."""
         return _mixed(self.space.columns, self.normal.mixing) - self.space.observed(states)
+
+    def part_products(self) -> FloatArray:
+        """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20.
+
+        Leaving increments out as such would cut the trajectory there, and with white noise most is
+        known across the gap: answers without a part would scatter more than the error does. What a
+        part adds, its innovations, is independent of the other parts if the model is right.
+
+        Each part is a quadratic form of the states at its two ends and of the columns: all states
+        between are eliminated. The forms are added in order of time.
+        """
+        n, size, n_columns = len(self.space), self.space.n_states, self.space.columns.shape[2]
+        ends = np.linspace(0, n, min(_N_PARTS, n) + 1).astype(int).tolist()
+        known = np.zeros((size + n_columns, size + n_columns))
+        known[:size, :size] = self._first_block()
+        totals = [np.zeros((n_columns, n_columns))]
+        for start, end in zip(ends[:-1], ends[1:], strict=True):
+            form = self._form_of_part(start, end)
+            # States at the start, at the end, columns; what is known of the start so far is added.
+            here = np.r_[np.arange(size), np.arange(2 * size, len(form))]
+            form[np.ix_(here, here)] += known
+            known = _eliminated(form, size)
+            totals.append(_eliminated(known, size))
+        # What is known beforehand counts in equal shares.
+        return np.diff(np.array(totals), axis=0) + self.space.prior / (len(ends) - 1)
+
+    def _form_of_part(self, start: int, end: int) -> FloatArray:
+        """Quadratic form (2 d + k, 2 d + k) of the states at pose ``start`` and at ``end`` and of k
+        columns, of the increments between; of the states before the start nothing is known.
+        """
+        space, part, size = self.space, slice(start, end), self.space.n_states
+        diagonal, below = self._blocks(start, end)
+        weighed = self._weights[part] @ space.columns[part]
+        here = replace(space, ahead=space.ahead[part], behind=space.behind[part])
+        forces = here.gathered(weighed)
+        form = np.zeros((2 * size + forces.shape[2],) * 2)
+        first, last, columns = slice(size), slice(size, 2 * size), slice(2 * size, None)
+        form[first, first], form[last, last] = diagonal[0], diagonal[-1]
+        form[first, columns], form[last, columns] = forces[0], forces[-1]
+        form[columns, first], form[columns, last] = forces[0].T, forces[-1].T
+        form[columns, columns] = multiplied(space.columns[part], weighed)
+        if len(diagonal) == 2:
+            form[last, first], form[first, last] = below[0], below[0].T
+            return form
+        right = np.zeros((len(diagonal) - 2, size, len(form)))
+        right[:, :, columns] = forces[1:-1]
+        right[0, :, first] += below[0]
+        right[-1, :, last] += below[-1].T
+        whitened = Factor(diagonal[1:-1], below[1:-1]).whiten(right)
+        return np.asarray(form - multiplied(whitened, whitened))
 
 
 def _mixed(columns: FloatArray, mixing: FloatArray) -> FloatArray:
@@ -402,57 +422,6 @@ def _combined(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
     for level, basis in zip(levels[1:], bases[1:], strict=False):
         total = total + np.exp(level) * basis
     return total
-
-
-def part_products(posterior: Posterior) -> FloatArray:
-    """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20.
-
-    Leaving increments out as such would cut the trajectory there, and with white noise most is
-    known across the gap: answers without a part would scatter more than the error does. What a part
-    adds, its innovations, is independent of the other parts if the model is right.
-
-    Each part is a quadratic form of the states at its two ends and of the columns: all states
-    between are eliminated. The forms are added in order of time.
-    """
-    n, size = len(posterior.space), posterior.space.n_states
-    ends = np.linspace(0, n, min(_N_PARTS, n) + 1).astype(int).tolist()
-    of_start = posterior.precision.prior_block()
-    n_columns = posterior.space.columns.shape[2]
-    known = np.zeros((size + n_columns, size + n_columns))
-    known[:size, :size] = of_start
-    totals = [np.zeros((n_columns, n_columns))]
-    for start, end in zip(ends[:-1], ends[1:], strict=True):
-        form = _form_of_part(posterior, start, end)
-        # States at the start, at the end, columns; what is known of the start so far is added.
-        here = np.r_[np.arange(size), np.arange(2 * size, len(form))]
-        form[np.ix_(here, here)] += known
-        known = _eliminated(form, size)
-        totals.append(_eliminated(known, size))
-    # What is known beforehand counts in equal shares.
-    return np.diff(np.array(totals), axis=0) + posterior.space.prior / (len(ends) - 1)
-
-
-def _form_of_part(posterior: Posterior, start: int, end: int) -> FloatArray:
-    """Quadratic form of the states (d) at pose ``start`` and at ``end`` and of k columns, (2 d + k,
-    2 d + k), of the increments between; of the states before the start nothing is known in it.
-    """
-    diagonal, below, forces, products = posterior.part(start, end)
-    size, n_columns = diagonal.shape[1], products.shape[0]
-    form = np.zeros((2 * size + n_columns, 2 * size + n_columns))
-    first, last, columns = slice(size), slice(size, 2 * size), slice(2 * size, None)
-    form[first, first], form[last, last] = diagonal[0], diagonal[-1]
-    form[first, columns], form[last, columns] = forces[0], forces[-1]
-    form[columns, first], form[columns, last] = forces[0].T, forces[-1].T
-    form[columns, columns] = products
-    if len(diagonal) == 2:
-        form[last, first], form[first, last] = below[0], below[0].T
-        return form
-    right = np.zeros((len(diagonal) - 2, size, len(form)))
-    right[:, :, columns] = forces[1:-1]
-    right[0, :, first] += below[0]
-    right[-1, :, last] += below[-1].T
-    whitened = Factor(diagonal[1:-1], below[1:-1]).whiten(right)
-    return np.asarray(form - multiplied(whitened, whitened))
 
 
 def _eliminated(form: FloatArray, size: int) -> FloatArray:

@@ -11,7 +11,6 @@ from hand_eye_calib.gls.state_space import (
     Group,
     Posterior,
     StateSpace,
-    part_products,
 )
 
 N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
@@ -161,7 +160,7 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
 def test_parts_add_what_a_recording_that_ends_there_would_know():
     space = space_of()
     posterior = Posterior(space, LEVELS)
-    parts = part_products(posterior)
+    parts = posterior.part_products()
     np.testing.assert_allclose(parts.sum(axis=0), posterior.products, atol=1e-8)
     n_known = 9  # of 14 parts, one increment each
     rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space)) < 6 * n_known)
