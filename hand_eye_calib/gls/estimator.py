@@ -157,5 +157,4 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         part_products=posterior.part_products(),
         objective=0.5 * (posterior.log_determinant + normal.cost),
         converged=is_settled(problem, fit),
-        iterations=fit.n_evaluations,
     )

@@ -48,37 +48,6 @@ SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Steps (n, 3) in m of a sensor, and what those around make of them.
-
-    Attributes
-    ----------
-    raw : (n, 3) array
-    smooth : (n, 3) array
-        With the mean velocity of the steps two before and two after.
-    variance : float
-        Of what they differ by, as a rule.
-    """
-
-    raw: FloatArray
-    smooth: FloatArray
-    variance: float
-
-    @classmethod
-    def of(cls, raw: FloatArray, intervals_s: FloatArray) -> Steps:
-        """From steps over these intervals."""
-        rates = raw / intervals_s[:, None]
-        around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
-        smooth = 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None]
-        return cls(raw, smooth, median((raw - smooth) ** 2))
-
-    def cleaned(self, noise_m: float) -> FloatArray:
-        """Smooth steps (n, 3), as far as what they differ by may be noise."""
-        believed = max(1.0 - _CAUTION * noise_m**2 / max(self.variance, _LEAST_VARIANCE), 0.0)
-        return self.smooth + believed * (self.raw - self.smooth)
-
-
-@dataclass(frozen=True)
 class Streams:
     """Poses of both sensors at common stamps.
 
@@ -115,16 +84,22 @@ class Streams:
         return motions(self.Ts_pw_p)
 
     @cached_property
-    def steps(self) -> tuple[Steps, Steps]:
-        """Of parent and child."""
-        by_child, intervals_s = motions(self.Ts_cw_c), np.diff(self.stamps_s)
-        of_parent = Steps.of(self.motions_p[:, :3, 3], intervals_s)
-        return of_parent, Steps.of(by_child[:, :3, 3].copy(), intervals_s)
+    def motions_c(self) -> FloatArray:
+        """Motions (N - 1, 4, 4) of the child."""
+        return motions(self.Ts_cw_c)
 
     @cached_property
     def twists(self) -> FloatArray:
-        """Velocity (N, 6), m/s and rad/s, of the child in its own frame."""
-        return _twists(motions(self.Ts_cw_c), np.diff(self.stamps_s))
+        """Velocity (N, 6), m/s and rad/s, of the child in its own frame: of the four motions around
+        a pose the mean of the middle two, component by component. Jumps are no velocity.
+        """
+        rates = se3.log(self.motions_c) / np.diff(self.stamps_s)[:, None]
+        padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
+        around = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
+        first, second, third, fourth = np.moveaxis(around, 2, 0)
+        lower = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
+        upper = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
+        return 0.5 * (lower + upper)
 
     def __getitem__(self, index: IntArray | slice) -> Streams:
         return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
@@ -163,18 +138,32 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
         Standard deviation per axis of the noise of a step. The smaller it is beside what steps
         differ from their neighbours by, the more they are believed themselves.
     """
-    of_parent, of_child = streams.steps
+    of_parent, of_child = streams.motions_p[:, :3, 3], streams.motions_c[:, :3, 3]
     rotation, lever_arm = T_parent_child[:3, :3], T_parent_child[:3, 3]
     chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
-    as_child = (chords + of_parent.raw) @ rotation
-    step = Steps.of(0.5 * (of_child.raw + as_child), np.diff(streams.stamps_s)).cleaned(noise_m)
-    metres_c = np.linalg.norm(of_child.cleaned(noise_m), axis=1)
+    of_both = 0.5 * (of_child + (chords + of_parent) @ rotation)
+    step, child_step = (
+        _cleaned(each, np.diff(streams.stamps_s), noise_m) for each in (of_both, of_child)
+    )
+    metres_c = np.linalg.norm(child_step, axis=1)
     axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,
         summed(turned(axes_c, step)),
         summed(axes_c * metres_c[:, None, None]),
     )
+
+
+def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> FloatArray:
+    """Steps (n, 3) with the mean velocity of those two before and two after, as far as what they
+    differ by may be noise.
+    """
+    rates = steps / intervals_s[:, None]
+    around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
+    smooth = 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None]
+    variance = max(median((steps - smooth) ** 2), _LEAST_VARIANCE)
+    believed = max(1.0 - _CAUTION * noise_m**2 / variance, 0.0)
+    return smooth + believed * (steps - smooth)
 
 
 def motions(Ts_world_sensor: FloatArray) -> FloatArray:
@@ -199,19 +188,6 @@ def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
 def summed(steps: FloatArray) -> FloatArray:
     """Sums (N, ...) of the steps (N - 1, ...) up to each instant, from zero on."""
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
-
-
-def _twists(by_child: FloatArray, intervals_s: FloatArray) -> FloatArray:
-    """Velocities (N, 6): of the four motions around a pose the mean of the middle two, component
-    by component. Jumps are no velocity.
-    """
-    rates = se3.log(by_child) / intervals_s[:, None]
-    padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
-    around = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
-    first, second, third, fourth = np.moveaxis(around, 2, 0)
-    lower = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
-    upper = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
-    return 0.5 * (lower + upper)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.increments import Linearisation, Streams
-from hand_eye_calib.gls.reml import Levels, Prior
+from hand_eye_calib.gls.reml import Prior
 from hand_eye_calib.gls.state_space import WHITE, Group, StateSpace
 
 # What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
@@ -36,7 +36,7 @@ _LEAST_WHITE, _LEAST_WALK = np.exp(-14.0), np.exp(-12.0)
 _LOWEST_LEVEL, _HIGHEST_LEVEL = -32.0, 14.0
 
 # Expected jitter of stamps (s^2), and how well it is known; time constants, too.
-_JITTER, _JITTER_PRECISION, _TAU_PRECISION = np.exp(-14.0), 0.05, 0.3
+JITTER_VARIANCE, _JITTER_PRECISION, _TAU_PRECISION = np.exp(-14.0), 0.05, 0.3
 
 # Time constants are between an interval and this share of the recording.
 _LONGEST_SHARE = 0.25
@@ -208,17 +208,13 @@ class NoiseModel:
         lower[:N_FAST] = np.log(LOWEST_VARIANCE)
         lower[:2] = np.maximum(lower[:2], total + np.log(_LEAST_WHITE))
         lower[3:5] = np.maximum(lower[3:5], total + np.log(_LEAST_WALK))
-        mean[JITTER], precision[JITTER] = np.log(_JITTER), _JITTER_PRECISION
+        mean[JITTER], precision[JITTER] = np.log(JITTER_VARIANCE), _JITTER_PRECISION
         lower[JITTER] = _LOWEST_LEVEL
         for group in self._groups():
             precision[group.tau] = _TAU_PRECISION
             lower[group.tau] = np.log(extent.interval_s)
             upper[group.tau] = np.log(max(_LONGEST_SHARE * extent.duration_s, extent.interval_s))
         return Prior(mean, precision, lower, upper)
-
-    def first_levels(self, white: FloatArray, walk: FloatArray) -> FloatArray:
-        """Log levels to start at, from log variances (2,) of white noise and walk."""
-        return np.array([*white, np.log(_JITTER), *walk])
 
     def raised(self, levels: FloatArray) -> FloatArray:
         """Log levels with no white noise and no walk so small that a search cannot hear it."""
@@ -250,19 +246,12 @@ class NoiseModel:
                 variances[PARTS[process.part]] += np.exp(levels[group.variance])
         return variances
 
-    def reduced(self, fit: Levels) -> tuple[NoiseModel, FloatArray]:
+    def reduced(self, levels: FloatArray, information: FloatArray) -> tuple[NoiseModel, FloatArray]:
         """The model and log levels without the slow processes that make no difference."""
-        keep = [
-            bool(fit.information[group.variance, group.variance] > _LEAST_INFORMATION)
-            for group in self._groups()
-        ]
-        levels = [
-            fit.levels[[group.variance, group.tau]]
-            for group, kept in zip(self._groups(), keep, strict=True)
-            if kept
-        ]
-        slow = tuple(process for process, kept in zip(self.slow, keep, strict=True) if kept)
-        return dataclasses.replace(self, slow=slow), np.concatenate([fit.levels[:N_FAST], *levels])
+        kept = np.diag(information)[N_FAST::2] > _LEAST_INFORMATION
+        slow = tuple(process for process, is_kept in zip(self.slow, kept, strict=True) if is_kept)
+        left = levels[np.r_[np.ones(N_FAST, dtype=bool), np.repeat(kept, 2)]]
+        return dataclasses.replace(self, slow=slow), left
 
     def lasting(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray

@@ -88,10 +88,6 @@ class Outliers:
         differing = np.sum(self.jumps != other.jumps) + np.sum(self.spikes != other.spikes)
         return float(differing) / len(self.spikes)
 
-    def same_as(self, other: Outliers) -> bool:
-        """Whether nothing differs."""
-        return np.array_equal(self.jumps, other.jumps) and np.array_equal(self.spikes, other.spikes)
-
 
 def first_outliers(residuals: FloatArray) -> Outliers:
     """What stands out of residuals (n, 6) without knowing their noise.

@@ -175,9 +175,8 @@ class _State:
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
         worse = _worse(np.concatenate(around))
-        white, walk = rough_levels(residuals, worse[1:] | worse[:-1])
-        white[1], walk[1] = _ANY_ROTATION, _FIRST_WALK
-        levels = state.model.first_levels(white, walk)
+        levels = rough_levels(residuals, worse[1:] | worse[:-1])
+        levels[ROTATION], levels[WALK_ROTATION] = _ANY_ROTATION, _FIRST_WALK
         streams = bridged(streams, state.X, worse)
         return replace(state, streams=streams, levels=levels, worse=worse)
 
@@ -275,7 +274,7 @@ class _State:
     def fitted(self) -> _State:
         """With noise levels fitted."""
         space, prior = self.sampled_space(), _prior(self.model, self.levels)
-        return replace(self, levels=reml.fit(space, self.levels, prior).levels)
+        return replace(self, levels=reml.fit(space, self.levels, prior)[0].levels)
 
     def with_lasting_error(self) -> _State:
         """With an error of the positions that lasts, fixed to the body or to the world, if the data
@@ -284,7 +283,8 @@ class _State:
         fits = []
         for kind in ("body", "world"):
             model, levels = self.model.with_lasting([Slow(kind, "translation")], self.levels)
-            fits.append((model, reml.fit(self.sampled_space(model), levels, _prior(model, levels))))
+            found, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
+            fits.append((model, found))
         model, fit = min(fits, key=lambda each: each[1].loss)
         before = Posterior(self.sampled_space(), self.levels).loss
         if before - fit.loss < _LEAST_GAIN:

@@ -117,8 +117,6 @@ class Fit:
     has_heavy_tails : bool
     parameters : (8,) array
         Of systematic errors.
-    n_evaluations : int
-        Of the likelihood.
     """
 
     poses: Streams
@@ -132,7 +130,6 @@ class Fit:
     sigmas: FloatArray
     has_heavy_tails: bool = False
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
-    n_evaluations: int = 0
 
     def moved(self, step: FloatArray, columns: list[int]) -> Fit:
         """After a step of xi and of the parameters in the model."""

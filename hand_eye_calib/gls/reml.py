@@ -44,25 +44,12 @@ class Prior:
         return self.precision * (levels - self.mean)
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Log levels, the posterior at them, and the average information (m, m)."""
-
-    levels: FloatArray
-    posterior: Posterior
-    information: FloatArray
-    n_evaluations: int
-
-    @property
-    def loss(self) -> float:
-        """Negative restricted log likelihood."""
-        return self.posterior.loss
-
-
-def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Levels:
-    """Levels of the least loss of a state space near a start, by Newton steps within a radius."""
+def fit(space: StateSpace, start: FloatArray, prior: Prior) -> tuple[Posterior, FloatArray]:
+    """The posterior at the levels of the least loss near a start, by Newton steps within a radius;
+    and the average information (m, m).
+    """
     levels = np.clip(start, prior.lower, prior.upper)
-    posterior, radius, n_evaluations = Posterior(space, levels), _FIRST_RADIUS, 1
+    posterior, radius = Posterior(space, levels), _FIRST_RADIUS
     loss = posterior.loss + prior.loss(levels)
     for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
@@ -75,7 +62,6 @@ def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Levels:
             if np.abs(step).max() < _SETTLED_STEP or (is_newton and promised < _SETTLED_LOSS):
                 break
             rival = _at_or_none(space, levels + step)
-            n_evaluations += 1
             gain = loss - _total(rival, prior)
             if rival is not None and gain > 0.0:
                 break
@@ -89,7 +75,7 @@ def fit(space: StateSpace, start: FloatArray, prior: Prior) -> Levels:
             radius = 0.5 * float(np.abs(step).max())
         if gain < 0.5 * _SETTLED_LOSS:
             break
-    return Levels(levels, posterior, information, n_evaluations)
+    return posterior, information
 
 
 def _at_or_none(space: StateSpace, levels: FloatArray) -> Posterior | None:

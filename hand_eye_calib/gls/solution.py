@@ -114,8 +114,6 @@ class AdaptiveSolution(ModelSolution):
         Whether white errors are weighed as of Student's t distribution.
     metres_per_pose : float
         Path of the parent from pose to pose.
-    iterations : int
-        Evaluations of the likelihood.
     """
 
     T_parent_child: FloatArray
@@ -124,7 +122,6 @@ class AdaptiveSolution(ModelSolution):
     weights: FloatArray
     heavy_tails: bool
     metres_per_pose: float
-    iterations: int
     is_drowned: bool = False
 
     @property
@@ -144,11 +141,6 @@ class AdaptiveSolution(ModelSolution):
         child, and its standard deviations, rad/s.
         """
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
-
-    @property
-    def left_out(self) -> BoolArray:
-        """(n,) bool array: increments that are no evidence, across a jump or at a spike."""
-        return self.jumps | self.spikes[1:] | self.spikes[:-1]
 
     def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
         """Variance (rad^2) per axis of the rotation over so many typical intervals."""

@@ -24,7 +24,19 @@ from hand_eye_calib.gls.increments import (
     course_of,
     linearise,
 )
-from hand_eye_calib.gls.noise_model import CENTRES, LASTING, LOWEST_VARIANCE, Extent, NoiseModel
+from hand_eye_calib.gls.noise_model import (
+    CENTRES,
+    JITTER_VARIANCE,
+    LASTING,
+    LOWEST_VARIANCE,
+    N_FAST,
+    ROTATION,
+    TRANSLATION,
+    WALK_ROTATION,
+    WALK_TRANSLATION,
+    Extent,
+    NoiseModel,
+)
 from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.outliers import (
     Outliers,
@@ -66,7 +78,7 @@ def start(problem: Problem) -> Fit:
         course=course,
         T=T,
         model=model,
-        levels=model.first_levels(*rough_levels(residuals, beside)),
+        levels=rough_levels(residuals, beside),
         outliers=outliers,
         weights=np.ones(len(streams)),
         sigmas=np.array(tuning.sizes),
@@ -85,38 +97,39 @@ def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: fl
     return best if sizes[best] < decisive * sizes["sensors"] else "sensors"
 
 
-def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> tuple[FloatArray, FloatArray]:
-    """Log variances of white noise (2,) and of the walk (2,), from scatter and correlation.
+def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> FloatArray:
+    """Log levels (5,) to start at, from scatter and correlation.
 
     Differences of white noise have variance 2 s^2 and a covariance of -s^2 with their neighbours;
     the walk adds variance alone.
     """
     kept = ~left_out
     together = kept[1:] & kept[:-1]
-    white, walk = np.empty((2, 2))
+    levels = np.full(N_FAST, np.log(JITTER_VARIANCE))
     for index, part in enumerate((slice(0, 3), slice(3, 6))):
         of_part = residuals[:, part]
         total = np.mean(of_part[kept] ** 2) if kept.any() else LOWEST_VARIANCE
         total = max(float(total), 100 * LOWEST_VARIANCE)
         products = of_part[1:][together] * of_part[:-1][together]
         neighbours = np.mean(products) if together.any() else -total / 2
-        white[index] = np.clip(-neighbours, 0.05 * total, 0.5 * total)
-        walk[index] = max(total - 2 * white[index], 0.02 * total)
-    return np.log(white), np.log(walk)
+        white = float(np.clip(-neighbours, 0.05 * total, 0.5 * total))
+        levels[[TRANSLATION, ROTATION][index]] = np.log(white)
+        walk = max(total - 2 * white, 0.02 * total)
+        levels[[WALK_TRANSLATION, WALK_ROTATION][index]] = np.log(walk)
+    return levels
 
 
 def noise(problem: Problem, fit: Fit) -> Fit:
     """Noise levels of white noise and walk, and one step of X."""
     kept = sample(len(problem.streams), problem.tuning.most_poses)
-    found = reml.fit(problem.space(fit, kept), fit.levels, fit.model.prior(fit.levels))
-    step = NormalEquations(selected(found.posterior.products, list(range(6)))).step
+    found, _ = reml.fit(problem.space(fit, kept), fit.levels, fit.model.prior(fit.levels))
+    step = NormalEquations(selected(found.products, list(range(6)))).step
     T = after(fit.T, step)
     return replace(
         fit,
         levels=found.levels,
         T=T,
         course=course_of(problem.streams, T, fit.model.step_noise(found.levels)),
-        n_evaluations=fit.n_evaluations + found.n_evaluations,
     )
 
 
@@ -141,7 +154,7 @@ def _outliers_found(problem: Problem, fit: Fit, rounds: int, with_spikes: bool =
             fit = _freed(problem, fit)
         of_walk, of_white = surprises(problem.posterior(fit), fit.outliers.spikes)
         found = judged(fit.outliers, of_walk, of_white, with_spikes)
-        if found.same_as(fit.outliers):
+        if not found.differs_by(fit.outliers):
             break
         fit = fit.bridged(problem.streams, found)
     if with_spikes:
@@ -167,12 +180,11 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning.most_poses_lasting)
     model, levels = fit.model.with_lasting(LASTING, fit.model.raised(fit.levels))
-    found = reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))
+    found, information = reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))
     before = Posterior(problem.space(fit, kept), fit.levels)
-    fit = replace(fit, n_evaluations=fit.n_evaluations + found.n_evaluations + 1)
     if before.loss - found.loss < tuning.least_gain:
         return fit
-    reduced, levels = model.reduced(found)
+    reduced, levels = model.reduced(found.levels, information)
     return replace(fit, model=reduced, levels=levels)
 
 
@@ -216,8 +228,8 @@ def polish(problem: Problem, fit: Fit) -> Fit:
         if fit.has_heavy_tails and "tails" not in problem.without:
             fit = replace(fit, weights=tail_weights(posterior))
         step = posterior.normal.step
-        fit = replace(fit.moved(step, problem.columns), n_evaluations=fit.n_evaluations + 1)
-        fit = fit.freed(problem.streams, posterior.states_after(step))
+        moved = fit.moved(step, problem.columns)
+        fit = moved.freed(problem.streams, posterior.states_after(step))
     return fit
 
 
