@@ -164,7 +164,7 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
         return deliver(*stops.solved(arguments), arguments)
     if len(paths) > 1 and any(map(reading.journal_in, paths)):
-        return _together(arguments, [[path] for path in paths])
+        return _run_together(arguments, [[path] for path in paths])
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
     if arguments.topics or (len(paths) > 2 and not are_bags):
         from hand_eye_calib.cli.rig import calibrate_rig
@@ -178,14 +178,14 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
             recording = reading.read_pair(arguments, options)
     except reading.SeveralRecordings as several:
         note(f"{several.reason}; they give one result, as recordings of one rig")
-        return _together(arguments, several.groups)
+        return _run_together(arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     bag = paths[0] if are_bags else None
     return deliver(calibration, as_given(recording.inputs), arguments, recording.snapshot, bag)
 
 
-def _together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path]]) -> int:
+def _run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path]]) -> int:
     from hand_eye_calib.cli.batch.run import run_together
 
     return run_together(arguments, groups)
@@ -198,17 +198,19 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     from hand_eye_calib.io.bags import PoseBag
     from hand_eye_calib.io.bags.messages import SENSOR_TYPES
 
-    topics: list[dict[str, Any]] = []
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
-        for each in bag.topics.values():
-            is_sampled = each.count > 1 and bag.duration_s > 0
-            topics.append(dict(each._asdict()))
-            topics[-1]["rate_hz"] = (each.count - 1) / bag.duration_s if is_sampled else None
-            topics[-1]["frames"] = bag.edges_on(each.name)
-            topics[-1]["is_usable"] = each.type in SENSOR_TYPES
-        document = {"bag": as_given(str(bag)), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
-        document |= {"duration_s": bag.duration_s, "topics": topics}
-        document["warnings"] = as_given(bag.warnings)
+        topics = [
+            {
+                **each._asdict(),
+                "rate_hz": (each.count - 1) / (bag.duration_s or 1.0) if each.count > 1 else None,
+                "frames": bag.edges_on(each.name),
+                "is_usable": each.type in SENSOR_TYPES,
+            }
+            for each in bag.topics.values()
+        ]
+        document: dict[str, Any] = {"bag": str(bag), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
+        document |= {"duration_s": bag.duration_s, "topics": topics, "warnings": bag.warnings}
+    document = as_given(document)
     for text in document["warnings"]:
         note(text)
     if arguments.json:
@@ -218,9 +220,9 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     print(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
     for topic in topics:
         rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
-        usable = "yes" if topic["is_usable"] else ""
         cells = (printable(topic["name"]), topic["type"] or "several types", topic["count"], rate)
-        print(_ROW.format(*cells, usable, " ".join(map(printable, topic["frames"]))).rstrip())
+        usable, frames = "yes" * topic["is_usable"], " ".join(map(printable, topic["frames"]))
+        print(_ROW.format(*cells, usable, frames).rstrip())
     print(
         "--parent-topic and --child-topic take the topics with poses, --parent-tf and --child-tf "
         "frames of /tf: odom:lidar"

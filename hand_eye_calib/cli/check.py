@@ -9,11 +9,12 @@ from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
     add_json_argument,
-    config_from,
     options_from,
     sources_from,
 )
+from hand_eye_calib.cli.present import wrapped
 from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.results.verdict import Verdict
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ def _opened(
 ) -> "tuple[dict[str, str], list[Trajectory], list[str]]":
     """Where both streams are from, their poses, and what was wrong with the stamps."""
     from hand_eye_calib.cli import reading
+    from hand_eye_calib.config import CalibratorConfig
+    from hand_eye_calib.io.bags import PoseBag
 
     paths = arguments.paths
     is_bag = reading.are_bags(paths)
@@ -96,10 +99,9 @@ def _opened(
     if not is_bag:
         names = dict(zip(STREAMS, map(str, paths), strict=True))
         return names, *reading.read_files(arguments, paths, options)
-    from hand_eye_calib.io.bags import PoseBag
-
+    config = CalibratorConfig.from_options(options)
     with PoseBag(paths[0]) as bag:
-        sources, measures = reading.select(bag, sources_from(arguments), config_from(arguments))
+        sources, measures = reading.select(bag, sources_from(arguments), config)
         names = {stream: str(source) for stream, source in sources.items()}
         return names, *reading.read_sources(
             bag, zip(sources.values(), measures.values(), strict=True)
@@ -121,26 +123,22 @@ def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -
 
 def _verdict(findings: "Sequence[Finding]") -> str:
     """What the findings mean for a calibration with these streams, in one sentence."""
-    from hand_eye_calib.results.verdict import Verdict
-
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:
         return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
     errors = [finding for finding in serious if finding.makes_unusable]
-    word = (Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value
+    codes = ", ".join(finding.code for finding in errors or serious)
+    told = f"look at the findings first ({codes})"
     if all(finding.options for finding in serious):
         options = " ".join(typed_options(finding.options.items()) for finding in serious)
-        return f"{word}: not as they are; calibrate with {options}."
-    codes = ", ".join(finding.code for finding in errors or serious if not finding.options)
-    if not errors:
-        return f"{word}: look at the findings first ({codes})."
-    return f"{word}: no result from these streams is right ({codes or errors[0].code})."
+        told = f"not as they are; calibrate with {options}"
+    elif errors:
+        told = f"no result from these streams is right ({codes})"
+    return f"{(Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value}: {told}."
 
 
 def _table(findings: "Sequence[Finding]") -> Iterator[str]:
     """Lines of the findings, in their order."""
-    from hand_eye_calib.cli.present import wrapped
-
     if not findings:
         yield "No findings."
     for finding in findings:

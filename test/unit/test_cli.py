@@ -336,11 +336,11 @@ def parsed(options):
     """The configuration that ``calibrate`` makes of its options."""
     import argparse
 
-    from hand_eye_calib.cli.options import add_config_arguments, config_from
+    from hand_eye_calib.cli.options import add_config_arguments, options_from
 
     parser = argparse.ArgumentParser()
     add_config_arguments(parser)
-    return config_from(parser.parse_args(options))
+    return CalibratorConfig.from_options(options_from(parser.parse_args(options)))
 
 
 @pytest.mark.parametrize(
