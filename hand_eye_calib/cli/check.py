@@ -68,15 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
     both = zip(STREAMS, (parent, child), strict=True)
     streams = {name: summarise(one) for name, one in both if len(one) > 1}
     if arguments.json:
-        found, turning = checked.correlation, None
-        if config.measured == "poses":
-            turning = {
-                "time_offset_s": found.offset_s,
-                "correlation": found.correlation,
-                "distinctness": found.distinctness,
-            }
         summaries = {name: {"source": sources[name], **vars(streams[name])} for name in streams}
-        print(json_text({"streams": summaries, "turning": turning, "findings": findings}))
+        print(json_text({"streams": summaries, "findings": findings}))
     else:
         lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
         print_result("\n".join(lines))

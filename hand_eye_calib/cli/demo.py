@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo; returns the exit code."""
     from hand_eye_calib.cli.present import exit_code
     from hand_eye_calib.cli.reading import read_recording
-    from hand_eye_calib.cli.reporting import rendered, write_report
+    from hand_eye_calib.cli.reporting import write_report
     from hand_eye_calib.io.bags import PoseBag, write_bag
     from hand_eye_calib.plain import json_text
     from hand_eye_calib.ros.player import Player
@@ -90,8 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json_text(document), flush=True)
     else:
         print_result("\n".join(_lines(document)))
-    of = offline, recording.snapshot, recording.inputs
-    write_report(arguments.out, lambda: rendered(*of))
+    write_report(arguments.out, offline, recording.snapshot, recording.inputs)
     note(f"4/4 done; everything is in {arguments.out}")
     if max(document["agreement"].values()) > AGREEMENT:
         differ = f"offline and online differ by {document['agreement']}: they must give the same"

@@ -3,7 +3,7 @@
 import argparse
 
 from hand_eye_calib.cli.console import print_result
-from hand_eye_calib.cli.options import add_json_argument, add_verbose_argument
+from hand_eye_calib.cli.options import add_json_argument
 from hand_eye_calib.config import EXPORT_FORMATS
 
 
@@ -20,8 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--as", dest="format", choices=EXPORT_FORMATS, metavar="FORMAT", help=formats
     )
-    add_json_argument(parser)
-    add_verbose_argument(parser)
+    add_json_argument(parser, or_verbose=True)
 
 
 def run(arguments: argparse.Namespace) -> int:

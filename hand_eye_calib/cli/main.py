@@ -47,8 +47,6 @@ unobservable or the verdict is DO NOT USE"""
 
 # How the names of ROS 2's packages end.
 _OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
-# Set by the shell functions of argcomplete.
-_COMPLETING = "_ARGCOMPLETE"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -150,14 +148,12 @@ def _run(argv: Sequence[str]) -> int:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    module: Any = None
-    of_command = parser
-    for name, summary in COMMANDS.items():
-        added = commands.add_parser(name, help=summary, description=summary)
-        if name == command or _COMPLETING in os.environ:
-            module, of_command = module_of(name), added
-            module.add_arguments(added)
-    if _COMPLETING in os.environ:
+    added = {each: commands.add_parser(each, help=COMMANDS[each]) for each in COMMANDS}
+    is_completing = "_ARGCOMPLETE" in os.environ  # set by the shell functions of argcomplete
+    for name in COMMANDS if is_completing else filter(None, [command]):
+        added[name].description = COMMANDS[name]
+        module_of(name).add_arguments(added[name])
+    if is_completing:
         with contextlib.suppress(ModuleNotFoundError):
             import argcomplete
 
@@ -165,7 +161,8 @@ def _run(argv: Sequence[str]) -> int:
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
         word = next((each for each in rest if each.startswith("-")), rest[0]).partition("=")[0]
-        of_command.error(f"unknown {word!r}{did_you_mean(word, of_command._option_string_actions)}")
+        of = added.get(command or "", parser)
+        of.error(f"unknown {word!r}{did_you_mean(word, of._option_string_actions)}")
     if arguments.version:
         from hand_eye_calib.version import package_version
 
@@ -174,5 +171,5 @@ def _run(argv: Sequence[str]) -> int:
         parser.print_help()
     else:
         arguments.passed_on, arguments.typed = rest, list(argv)
-        return module.run(arguments)
+        return int(module_of(command).run(arguments))
     return 0

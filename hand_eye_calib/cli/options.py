@@ -272,20 +272,16 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         type=_label,
         help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
     )
-    add_json_argument(group)
-    add_verbose_argument(group)
+    add_json_argument(group, or_verbose=True)
 
 
-def add_json_argument(parser: argparse._ActionsContainer) -> None:
-    """Add ``--json``."""
+def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:
+    """Add ``--json``, and ``--verbose`` if there are details to print."""
     text = "print one JSON document on stdout instead of text"
     parser.add_argument("--json", action="store_true", help=text)
-
-
-def add_verbose_argument(parser: argparse._ActionsContainer) -> None:
-    """Add ``--verbose``."""
-    text = "print details of the solution, too"
-    parser.add_argument("-v", "--verbose", action="store_true", help=text)
+    if or_verbose:
+        text = "print details of the solution, too"
+        parser.add_argument("-v", "--verbose", action="store_true", help=text)
 
 
 @argument_type

@@ -16,7 +16,6 @@ from hand_eye_calib.cli.console import (
     typed_options,
     waiting_for,
 )
-from hand_eye_calib.cli.reporting import rendered, static_transform_command, write_report
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
@@ -74,7 +73,9 @@ def deliver(
         steps = next_steps(calibration, arguments, snapshot)
         print_result(as_text(calibration, steps, arguments.verbose))
     if arguments.out and calibration.motion_residuals:
-        write_report(arguments.out, lambda: rendered(calibration, snapshot, inputs))
+        from hand_eye_calib.cli.reporting import write_report
+
+        write_report(arguments.out, calibration, snapshot, inputs)
     for one in calibration.reasons[:1] if calibration.status.failure else ():
         fail(f"{one.sentence}; do not use this result, {one.what_to_do}", _EXIT_FAILED)
     return exit_code(calibration)
@@ -143,7 +144,7 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
             lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
             lines += transform_lines(document[name], reach, with_details)
     lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
-    if command := static_transform_command(calibration):
+    if command := calibration.static_transform_command():
         by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]

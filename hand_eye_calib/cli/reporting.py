@@ -4,14 +4,14 @@ process that writes them for a session of the node.
 
 import os
 import pickle
-import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import fail, note, waiting_for
 from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.io.results import save_text
 from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -24,56 +24,29 @@ REPORT = "report.html"
 _NAMELESS = "child_sensor"
 
 
-def static_transform_command(calibration: Calibration) -> str:
-    """Shell command that publishes the child's pose as a static transform, in the frame that it is
-    mounted on.
-
-    Empty if the verdict is DO NOT USE. For an axis that the motion does not determine it has a word
-    that static_transform_publisher refuses.
+def write_report(
+    directory: Path,
+    calibration: Calibration,
+    snapshot: "Snapshot | None",
+    inputs: Mapping[str, Any],
+) -> None:
+    """Write the report of a result, of the poses and options that gave it, and of where the data
+    came from in plain values.
     """
-    numbers = calibration.usable_numbers()
-    if not numbers:
-        return ""
-    told = " ".join(
-        f"--{name} {value if isinstance(value, str) else f'{round(value, 9) + 0.0:.9f}'}"
-        for name, value in numbers.items()
-    )
-    parent, child = map(shlex.quote, (calibration.mounting[0], calibration.child_frame))
-    return (
-        f"ros2 run tf2_ros static_transform_publisher {told} "
-        f"--frame-id {parent} --child-frame-id {child}"
-    )
-
-
-# ----------------------------------------------------------------------- pages
-
-
-def rendered(
-    calibration: Calibration, snapshot: "Snapshot | None", inputs: Mapping[str, Any]
-) -> str:
-    """The report as HTML, of a result, the poses and options that gave it, and where the data came
-    from in plain values.
-    """
-    from hand_eye_calib.report.report import render
-
-    command = static_transform_command(calibration)
-    return render(calibration, snapshot, inputs=inputs, command=command)
-
-
-def write_report(directory: Path, render: Callable[[], str]) -> None:
-    """Write the report that a function gives, such as :func:`rendered`."""
-    from hand_eye_calib.io.results import save_text
-
     with waiting_for(f"writing {REPORT}"):
-        save_text(directory / REPORT, render())
-    note(f"wrote {directory / REPORT}")
+        from hand_eye_calib.report.report import render
+
+        path = save_text(directory / REPORT, render(calibration, snapshot, inputs))
+    note(f"wrote {path}")
 
 
-def rendered_rig(rig: "RigCalibration", names: Any) -> str:
-    """The report of a rig, whose sensors have these files, topics or frames."""
-    from hand_eye_calib.report.rig_page import render_rig
+def write_rig_report(directory: Path, rig: "RigCalibration", names: Sequence[str]) -> None:
+    """Write the report of a rig, whose sensors have these files, topics or frames."""
+    with waiting_for(f"writing {REPORT}"):
+        from hand_eye_calib.report.rig_page import render_rig
 
-    return render_rig(rig, names)
+        path = save_text(directory / REPORT, render_rig(rig, names))
+    note(f"wrote {path}")
 
 
 # ----------------------------------------------------------- a session's pages
@@ -97,8 +70,7 @@ def write_session() -> None:
             found = review(result.calibration, result.snapshot, may_solve=False)
             # The file and the report beside it say the same.
             save_result(found.calibration, directory, result.inputs)
-            of = found.calibration, result.snapshot, result.inputs
-            write_report(directory, lambda: rendered(*of))
+            write_report(directory, found.calibration, result.snapshot, result.inputs)
     except (HandEyeCalibError, OSError) as error:
         sys.exit(fail(error, 1))
 
@@ -131,4 +103,4 @@ def _session_rig(directory: Path, result: "SessionResult") -> None:
     rig = solve_rig(sensors, {name: options[name] for name in of_all})
     inputs = {**result.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
-    write_report(directory, lambda: rendered_rig(rig, rig.sensors))
+    write_rig_report(directory, rig, rig.sensors)

@@ -7,7 +7,7 @@ from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
 from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.present import exit_code, transform_lines, wrapped
 from hand_eye_calib.cli.reading import read_files, read_sources, refuse_recordings, source_of
-from hand_eye_calib.cli.reporting import rendered_rig, write_report
+from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import json_text
 
@@ -60,7 +60,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     else:
         print_result("\n".join(printable(line) for line in as_lines(rig)))
     if arguments.out:
-        write_report(arguments.out, lambda: rendered_rig(rig, names))
+        write_rig_report(arguments.out, rig, names)
     failed = [each for each in rig.calibrations if each.status.failure]
     for each in failed:
         fail(f"{each.child_frame}: {each.headline}", 1)

@@ -92,14 +92,12 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
 def render(
     calibration: Calibration,
     snapshot: Snapshot | None,
-    *,
     inputs: Plain | None = None,
-    command: str = "",
 ) -> str:
     """The report as HTML, of a result and the poses and options that gave it (none for stops);
-    ``inputs`` say in plain values where the data came from, ``command`` publishes the result.
+    ``inputs`` say in plain values where the data came from.
     """
-    inputs = inputs or {}
+    inputs, command = inputs or {}, calibration.static_transform_command()
     calibration = replace(
         calibration,
         parent_frame=_named(calibration.parent_frame, inputs.get("parent", {})),

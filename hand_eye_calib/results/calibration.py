@@ -1,5 +1,6 @@
 """The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -196,6 +197,19 @@ class Calibration(Result):
         path = Path(path, "report.html") if Path(path).is_dir() else Path(path)
         page = upstairs("report.report", "render")(self, self.recording)
         return cast(Path, upstairs("io.results", "save_text")(path, page))
+
+    def static_transform_command(self) -> str:
+        """Shell command that publishes the child's pose as a static transform, in the frame that it
+        is mounted on; empty if the verdict is DO NOT USE. For an axis that the motion does not
+        determine it has a word that static_transform_publisher refuses.
+        """
+        told = "".join(
+            f"--{name} {value if isinstance(value, str) else f'{round(value, 9) + 0.0:.9f}'} "
+            for name, value in self.usable_numbers().items()
+        )
+        parent, child = map(shlex.quote, (self.mounting[0], self.child_frame))
+        frames = f"--frame-id {parent} --child-frame-id {child}"
+        return told and f"ros2 run tf2_ros static_transform_publisher {told}{frames}"
 
     def child_as_parent(self, child: Trajectory) -> Trajectory:
         """The trajectory that the parent sensor has according to the child's: with the time offset

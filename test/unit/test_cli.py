@@ -25,7 +25,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.present import as_text, static_transform_command
+from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.config import CalibratorConfig, option_name
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -227,7 +227,7 @@ def some_calibration(**changes):
 
 def test_static_transform_command_carries_the_extrinsic():
     calibration = some_calibration(child_frame="left camera")
-    words = shlex.split(static_transform_command(calibration))
+    words = shlex.split(calibration.static_transform_command())
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
     options = dict(zip(words[4::2], words[5::2], strict=True))
     assert (options.pop("--frame-id"), options.pop("--child-frame-id")) == ("lidar", "left camera")

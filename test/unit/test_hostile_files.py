@@ -142,15 +142,6 @@ def bag(tmp_path):
     return tmp_path / "bag"
 
 
-def test_a_folder_that_is_a_link_out_of_the_directory_is_refused(run, tmp_path, bag):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "bag").symlink_to(tmp_path / "elsewhere")
-    code, _, err = run("replay", "--batch", bag, "--out", tmp_path / "out", "--jobs", "1")
-    assert (code, "is a link out of" in err) == (1, True)
-    assert list((tmp_path / "elsewhere").iterdir()) == []
-
-
 @pytest.mark.parametrize("state", ["5", "[" * 100_000, '{"key": 1}\n{}', '{"key": "K"}\n{}'])
 def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
     task = Task(name="a", bags=("absent",))

@@ -18,8 +18,7 @@ pytest.importorskip("matplotlib")
 import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
-from hand_eye_calib.cli.present import static_transform_command
-from hand_eye_calib.cli.reporting import rendered, write_report
+from hand_eye_calib.cli.reporting import write_report
 from hand_eye_calib.engine import evidence
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.geometry import se3
@@ -83,8 +82,6 @@ def simulated(planar=False, poses=200, frames=("lidar", "camera"), **options):
 
 
 def page_of(snapshot, calibration, **more):
-    if calibration.verdict is not Verdict.DO_NOT_USE:
-        more.setdefault("command", static_transform_command(calibration))
     text = render(calibration, snapshot, **more)
     page = Page(text)
     assert (page.errors, page.open) == ([], [])
@@ -163,7 +160,7 @@ def test_numbers_are_the_calibrations(drive, request):
         number, unit, verdict = known.groups()
         assert float(number) == pytest.approx(per_unit[unit] * total, rel=0.06)
         assert verdict == dof.verdict.value
-    assert static_transform_command(calibration) in page.text
+    assert calibration.static_transform_command() in page.text
     assert f"{calibration.n_inliers} of {calibration.n_pairs} are inliers" in page.text
     for warning in calibration.warnings:
         assert " ".join(warning.split()) in page.text
@@ -269,7 +266,7 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
         offline_config(drive.parent, drive.child, options), drive.parent, drive.child
     )
     calibration = snapshot.estimate()
-    write_report(tmp_path, lambda: rendered(calibration, snapshot, {}))
+    write_report(tmp_path, calibration, snapshot, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
     assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
@@ -302,7 +299,7 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     assert f"wrote {tmp_path / 'out' / 'report.html'}" in capsys.readouterr().err
     page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     saved = hec.load(tmp_path / "out")
-    assert (static_transform_command(saved) in page.text) == (saved.status == "ok")
+    assert (saved.static_transform_command() in page.text) == (saved.status == "ok")
     assert list(saved.cross_check) == [dof.name for dof in saved.observability]
     # Names of the files, not of the folders: the page goes to customers.
     assert all(Path(file).name in page.text for file in files)
@@ -313,7 +310,7 @@ def test_without_out_nothing_is_drawn(files, capsys, monkeypatch):
     def never(*_, **__):
         raise AssertionError("a report was written that nobody asked for")
 
-    monkeypatch.setattr("hand_eye_calib.cli.present.write_report", never)
+    monkeypatch.setattr("hand_eye_calib.cli.reporting.write_report", never)
     assert cli.main(["calibrate", *files, "--parent-frame", "a", "--child-frame", "b"]) in (0, 3)
 
 

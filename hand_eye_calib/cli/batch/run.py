@@ -112,14 +112,9 @@ def _all_done(
 
 
 def stored(task: Task, directory: Path) -> Outcome | None:
-    """What an earlier run did; None if there is nothing, it failed, or something has changed since.
-    A folder that is a link out of the directory is an InputError.
-    """
-    folder = directory / task.name
-    if folder.is_symlink() and not folder.resolve().is_relative_to(directory.resolve()):
-        raise InputError(f"{folder} is a link out of {directory}; remove it")
+    """What an earlier run did; None if there is nothing, it failed, or something has changed."""
     try:
-        about, text = (folder / work.STATE).read_text(encoding="utf-8").splitlines()
+        about, text = (directory / task.name / work.STATE).read_text(encoding="utf-8").splitlines()
         state = json.loads(about)
         return Outcome(state["row"], state["code"], text) if state["key"] == task.key() else None
     except Exception:  # to be done again, whatever is wrong with it

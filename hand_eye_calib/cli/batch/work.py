@@ -25,7 +25,6 @@ from hand_eye_calib.cli.console import STREAMS
 from hand_eye_calib.cli.options import Options
 from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.cli.reading import read_recording
-from hand_eye_calib.cli.reporting import rendered
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.limits import limit_memory
@@ -210,12 +209,14 @@ Work = Callable[[Task], Outcome]
 
 def work(task: Task) -> Outcome:
     """Do a task; what goes wrong becomes part of the outcome, so that the others go on."""
+    from hand_eye_calib.report.report import render
+
     limit_memory()  # this may be a process of its own
     try:
         with remote.local_copies(task.bags) as (paths, as_given):
             recording = read_recording([*map(Path, paths)], task.sources, task.options)
             result, inputs = recording.solved(task.with_fingerprints), recording.inputs
-            page = rendered(result, recording.snapshot, inputs) if task.with_report else ""
+            page = render(result, recording.snapshot, inputs) if task.with_report else ""
             failure = result.status.failure or None
             return Outcome.of(task, failure, result, inputs, page, as_given)
     except HandEyeCalibError as error:
