@@ -79,42 +79,26 @@ def render_batch(
         listing([f"{count} {verdict}" for verdict, count in counts.most_common()]),
         batch=title.rpartition("/")[2],
         vehicles_left_out=max(0, len(ordered) - _MOST_VEHICLES),
-        vehicles=[_vehicle(*one, n) for n, one in enumerate(ordered[:_MOST_VEHICLES], start=1)],
+        vehicles=[
+            (name, result, _values(row_of_result(result.to_dict())))
+            for name, result in ordered[:_MOST_VEHICLES]
+        ],
+        figures=[_trend(each, n) for n, (_, each) in enumerate(ordered[:_MOST_FIGURES], start=1)],
         rows=cells,
         tones=TONES,
         headings=[f"{name} {unit}" for name, unit in _AXES.items()],
     )
 
 
-def _vehicle(name: str, result: Calibration, number: int) -> dict[str, Any]:
-    assert result.together is not None, "the result of a vehicle is of several recordings"
-    row = row_of_result(result.to_dict())
-    figures = []
-    if number <= _MOST_FIGURES:
-        said = (
-            "Difference of each recording from the common value along and about the parent's axes, "
-            "with its standard deviation. The band is two standard deviations of the common value. "
-            "Squares do not belong to the others."
-        )
-        title, svg = "Each recording against the common extrinsic", draw_trend(result, number)
-        figures = [Drawn(f"vehicle-{number}", title, said, svg)]
-    return {
-        "title": name,
-        "frames": f"{result.child_frame} in {result.parent_frame}",
-        "count": counted(len(result.together.recordings), "recording"),
-        "headline": result.headline,
-        "sentence": result.together.sentence,
-        "left_out": [
-            f"{each.name} is left out: {each.left_out}"
-            for each in result.together.recordings
-            if each.left_out
-        ],
-        "tone": TONES[result.verdict.value],
-        "values": list(
-            zip([f"{axis}, {unit}" for axis, unit in _AXES.items()], _values(row), strict=True)
-        ),
-        "figures": figures,
-    }
+def _trend(result: Calibration, number: int) -> Drawn:
+    """The figure of a vehicle's recordings; ``number`` is that of the vehicle on the page."""
+    said = (
+        "Difference of each recording from the common value along and about the parent's axes, "
+        "with its standard deviation. The band is two standard deviations of the common value. "
+        "Squares do not belong to the others."
+    )
+    title, svg = "Each recording against the common extrinsic", draw_trend(result, number)
+    return Drawn(f"vehicle-{number}", title, said, svg)
 
 
 def _values(row: Plain) -> list[str]:

@@ -1,6 +1,7 @@
 """``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence."""
 
 import math
+import os
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -20,12 +21,13 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import figures_of
-from hand_eye_calib.results.calibration import Calibration, Reason, Verdict
+from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.text import (
     amount,
     angle,
+    counted,
     duration,
     fixed,
     given_or_estimated,
@@ -35,6 +37,7 @@ from hand_eye_calib.text import (
     printed_angle,
     with_sigma,
 )
+from hand_eye_calib.version import package_version
 
 Plain = Mapping[str, Any]
 
@@ -51,7 +54,8 @@ _WORDS = {
     "unobservable": "do not use this value",
     "prior": "mostly from the prior",
 }
-_AXIS_NAMES = {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "about z (yaw)"}
+_AXIS_NAMES = {axis: f"along {axis}" for axis in TRANSLATIONS}
+_AXIS_NAMES |= {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "about z (yaw)"}
 
 # A bar reaches from a thousandth of the target to ten times the target, by its logarithm.
 _BAR_DECADES, _BAR_ABOVE = 4.0, 1.0
@@ -83,6 +87,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
         lstrip_blocks=True,
     )
     environment.filters |= {"number": fixed, "in_words": in_words, "printable": printable}
+    environment.globals |= {"amount": amount, "counted": counted, "axis_names": _AXIS_NAMES}
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
     return environment.get_template(template).render(
         **values, marks=MARKS, said=f"{said[:1].upper()}{said[1:]}"
@@ -127,12 +132,11 @@ def render(
             _direction(document[key], unknown) for key in ("T_parent_child", "T_child_parent")
         ],
         axes=list(_axes(calibration)),
-        differences=list(_differences(calibration)),
         advice=advice,
         command=command,
         unknown=listing(by_hand),
         target=_targets(calibration),
-        reasons=[_reason(reason) for reason in shown(calibration.reasons)],
+        reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
         shown_first=_SHOWN_FIRST,
         **_data(calibration, snapshot, evidence, inputs),
@@ -168,12 +172,6 @@ def _targets(calibration: Calibration) -> str:
     )
 
 
-def _reason(reason: Reason) -> dict[str, str]:
-    options = ", ".join(f"{name} {value}" for name, value in reason.options.items())
-    what_to_do = f"{reason.what_to_do}: {options}" if options else reason.what_to_do
-    return {"sentence": reason.sentence, "what_to_do": what_to_do}
-
-
 def _direction(transform: Plain, unknown: set[str]) -> dict[str, Any]:
     """A transform as rows: each printed number with its standard deviation."""
     rows = []
@@ -202,7 +200,7 @@ def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
         if dof.name not in calibration.out_of_reach:
             yield {
                 "name": dof.name,
-                "title": _AXIS_NAMES.get(dof.name, f"along {dof.name}"),
+                "title": _AXIS_NAMES[dof.name],
                 "sigma": amount(dof.name, total),
                 "verdict": dof.verdict.value,
                 "words": _WORDS[dof.verdict.value],
@@ -217,19 +215,6 @@ def _bar(ratio: float) -> float:
     if not np.isfinite(ratio):
         return 100.0
     return float(np.clip(100 * (1 - (_BAR_ABOVE - math.log10(ratio)) / _BAR_DECADES), 1, 100))
-
-
-def _differences(calibration: Calibration) -> Iterable[dict[str, str]]:
-    """Rows of the comparison with what is installed; none without one."""
-    for compared in calibration.comparison.differences if calibration.comparison else ():
-        for axis, row in compared.axes.items():
-            difference, sigma = amount(axis, row.difference), amount(axis, row.sigma)
-            yield {
-                "title": _AXIS_NAMES.get(axis, f"along {axis}"),
-                "difference": f"{difference} ± {sigma}",
-                "visible": amount(axis, row.visible),
-                "verdict": row.verdict,
-            }
 
 
 # ---------------------------------------------------------------- data and provenance
@@ -279,33 +264,22 @@ def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, st
     """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
     known = inputs.get(name, {})
     count = known.get("messages", known.get("poses"))
-    row = dict.fromkeys(("rate", "duration", "gap", "path"), "-") | {
-        "name": name,
-        "source": known.get("topic") or Path(known.get("file", "-")).name,
-        "poses": "-" if count is None else f"{count:,}",
-    }
+    row = {"name": name, "source": known.get("topic") or Path(known.get("file", "-")).name}
+    row |= dict.fromkeys(("poses", "rate", "duration", "gap", "path"), "-")
     # In a very long recording only the newest poses are at hand: of the stream as a whole they say
     # nothing.
     if stream is not None and len(stream) >= max(2, count or 0):
-        whole = summarise(stream)
-        return row | {
-            "gap": f"{whole.longest_interval_s:.2f} s",
-            "path": "-" if whole.path_m is None else length(whole.path_m),
-            "duration": duration(whole.duration_s),
-            "poses": f"{whole.poses:,}",
-            "rate": f"{whole.rate_hz:.1f} Hz",
-        }
-    return row
+        whole, count = summarise(stream), len(stream)
+        row |= {"gap": f"{whole.longest_interval_s:.2f} s", "rate": f"{whole.rate_hz:.1f} Hz"}
+        row |= {"duration": duration(whole.duration_s)}
+        row |= {"path": "-" if whole.path_m is None else length(whole.path_m)}
+    return row if count is None else row | {"poses": f"{count:,}"}
 
 
 def _provenance(inputs: Plain) -> Iterable[tuple[str, str]]:
     """Versions, files and the rest of the inputs, as names and values."""
-    versions = {"python": platform.python_version()}
-    for name in ("hand_eye_calib", "numpy", "scipy"):
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
+    versions = {"python": platform.python_version(), "hand_eye_calib": package_version()}
+    versions |= {name: metadata.version(name) for name in ("numpy", "scipy")}
     yield "Written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     yield "Versions", in_words(versions)
     # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
@@ -318,10 +292,7 @@ def _provenance(inputs: Plain) -> Iterable[tuple[str, str]]:
 
 
 def _without_folders(value: Any) -> Any:
-    """A path, or paths in a list or mapping, as names alone; anything else as it is."""
+    """A path, or paths in a mapping, as names alone; anything else as it is."""
     if isinstance(value, Mapping):
         return {name: _without_folders(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_folders(item) for item in value]
-    is_path = isinstance(value, str) and (value.startswith(("/", "~", "./", "../")))
-    return Path(value).name if is_path and Path(value).exists() else value
+    return Path(value).name if isinstance(value, str) and os.path.exists(value) else value

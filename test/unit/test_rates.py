@@ -304,7 +304,6 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     assert main(["check", parts[1], *with_itself, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["streams"]["child"]["path_m"] is None
-    assert document["turning"] is None
     found = hec.read_trajectory(parts[1], topic="/imu")
     assert (found.measures, len(found)) == ("rates", len(stamps_ns))
 
