@@ -33,9 +33,6 @@ from hand_eye_calib.text import amount, angle, counted, length, listing, share
 # Points drawn of a line, and of dots that each stand alone.
 _MOST_ON_A_LINE, _MOST_DOTS, _MOST_OUTLIERS = 1500, 600, 300
 
-# A path is flat if it extends less than this share of its second extent along the third.
-_FLAT = 0.5
-
 # From m and rad to the units of the figures.
 _UNITS = {"x": (100.0, "translation (cm)"), "yaw": (180 / np.pi, "rotation (deg)")}
 
@@ -147,17 +144,14 @@ def _figure(
     return figure, panels.ravel()
 
 
-def _legend(figure: Figure, panel: Axes) -> None:
-    handles = panel.get_legend_handles_labels()
-    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
-
-
 @page_style()
 def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     tracks = evidence
     shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
     factor, unit = _time_axis(tracks.times_s[-1])
-    first, second, across = _plane_of_motion(tracks.parent)
+    # A camera moves in its x and z: x and y would be a view from the side.
+    across = int(np.argmin(np.ptp(tracks.parent, axis=0)))
+    first, second = (axis for axis in range(3) if axis != across)
     figure, (plane, side) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
     names = [calibration.parent_frame, calibration.child_frame]
     is_reversed = calibration.measured == "positions" and not evidence.has_positions_of_parent
@@ -178,7 +172,7 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     low, high = side.get_ylim()
     if high - low < 0.5:  # rounding is no relief
         side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
-    _legend(figure, plane)
+    figure.legend(loc="lower center", ncols=3, borderaxespad=0)
     apart = np.linalg.norm(tracks.parent - tracks.child, axis=1)
     furthest_s = tracks.times_s[int(np.argmax(apart))]
     path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
@@ -191,20 +185,6 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     )
     svg = as_svg(figure, "trajectories")
     return Drawn("trajectories", "Both trajectories, aligned", said, svg)
-
-
-def _plane_of_motion(points: FloatArray) -> tuple[int, int, int]:
-    """Axes to draw a path by: two in the plane of motion, and the one across it.
-
-    A camera moves in its x and z; for it, x and y would be a view from the side. A path that fills
-    all three axes is drawn from above.
-    """
-    extents = np.ptp(points, axis=0)
-    across = int(np.argmin(extents))
-    if extents[across] > _FLAT * np.sort(extents)[1]:
-        across = 2
-    first, second = (axis for axis in range(3) if axis != across)
-    return first, second, across
 
 
 @page_style()
@@ -231,7 +211,8 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
         _draw_residuals(panel, times, np.maximum(values * to_unit, 1e-5), is_out)
         panel.set_ylabel(of_axis)
     panels[-1].set_xlabel(label)
-    _legend(figure, panels[0])
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
     halves, furthest = (
         listing([amount(name, float(of(values))) for name, values in sizes.items()])
         for of in (np.median, np.max)

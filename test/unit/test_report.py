@@ -369,20 +369,6 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     assert stated["differences"][0]["axes"]["z"]["sigma"] is None
 
 
-@pytest.mark.parametrize(
-    ("order", "plane"),
-    [((0, 1, 2), (0, 1, 2)), ((0, 2, 1), (0, 2, 1)), ((2, 1, 0), (1, 2, 0))],
-    ids=["vehicle", "camera", "x up"],
-)
-def test_the_path_is_drawn_in_the_plane_of_motion(order, plane):
-    from hand_eye_calib.report.figures import _plane_of_motion
-
-    time = np.linspace(0, 6, 100)
-    path = np.stack([30 * np.sin(time), 20 * np.cos(time), 0.5 * np.sin(9 * time)], axis=1)
-    assert _plane_of_motion(path[:, list(order)]) == plane
-    assert _plane_of_motion(path * [1, 1, 60])[2] == 2  # a flight: from above
-
-
 @pytest.mark.usefixtures("no_figures")
 def test_no_page_names_folders(hilly):
     snapshot, calibration, *_ = hilly
