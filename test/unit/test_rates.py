@@ -191,7 +191,7 @@ class TestFiles:
     def test_four_columns_without_names_need_to_be_told(self, tmp_path):
         path = tmp_path / "data.txt"
         path.write_text("1 0 0 1\n2 0 0 1\n")
-        with pytest.raises(InputError, match="four columns"):
+        with pytest.raises(InputError, match="name the 4 with `columns`"):
             read_trajectory_file(path, "auto")
         assert read_trajectory_file(path, "auto", measures="rates").trajectory.measures == "rates"
         found = read_trajectory_file(path, "auto", measures="positions").trajectory

@@ -58,7 +58,6 @@ def assert_is_the_trajectory(found, stamps_ns=TRAJECTORY.stamps_ns):
     [
         ("1317375625.661736", 1317375625661736000),
         ("1317375625.661736123", 1317375625661736123),
-        ("9223372036.854775807", 2**63 - 1),
         ("1317375625.6617361234", 1317375625661736123),  # a tenth digit is rounded
         (".5", 500_000_000),
         ("-0.000000001", -1),
@@ -181,7 +180,7 @@ def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
 
 def test_without_a_header_the_columns_must_be_named(file):
     path = file(rows(TRAJECTORY.stamps_ns, "wxyz", " "))
-    said = "so the order of the quaternion is unknown; name them with `columns`, .* there are 8"
+    said = "so that their order is unknown; name the 8 with `columns`, such as"
     with pytest.raises(InputError, match=said):
         hec.read_trajectory(path, "csv")
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))

@@ -24,7 +24,7 @@ Groups = Sequence[tuple[str, ...]]
 # Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
 # plane, fewer.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
-_ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"))
+_ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"), UNNAMED)
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
 _ALL_POSITIONS = (*_POSITIONS, ("x", "y"), ("lat", "lon"))
 _ALL_ORIENTATIONS = (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS)
@@ -60,6 +60,7 @@ _ALIASES = {
     ),
     **_ends("v", "v"),
     **_ends("q", "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_"),
+    **{name: (name,) for name in (*MATRIX, *UNNAMED)},
 }
 # Names that stand for a part of an orientation, even if it is not known which.
 _ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.I).search
@@ -84,12 +85,6 @@ class Columns(NamedTuple):
     measures: str = "poses"
     stamp_unit: str = ""
     units: Mapping[str, str] = MappingProxyType({})
-
-    @classmethod
-    def in_order(cls, *quantities: str, stamp_unit: str = "", has_stamp: bool = True) -> "Columns":
-        """A stamp, and quantities of poses in this order."""
-        at = {name: place for place, name in enumerate(quantities, start=has_stamp)}
-        return cls([0][:has_stamp], at, stamp_unit=stamp_unit)
 
 
 def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -> Columns:
@@ -128,8 +123,9 @@ def _quantities(found: dict[str, list[int]], measures: str) -> tuple[str, ...]:
     """The quantities to read: of poses, or of the part of them that is measured; of "twists",
     velocities. The preferred ones if none are complete.
     """
-    if measures in ("rates", "twists"):
-        return RATES if measures == "rates" else TWIST
+    whole = {"rates": RATES, "twists": TWIST} | ({"poses": MATRIX} if MATRIX[0] in found else {})
+    if measures in whole:
+        return whole[measures]
     orientation = (_complete(_ALL_ORIENTATIONS, found) or _ORIENTATIONS)[0]
     is_planar = measures == "positions" or orientation in _PLANAR_ORIENTATIONS
     position = (_complete(_ALL_POSITIONS if is_planar else _POSITIONS, found) or _POSITIONS)[0]

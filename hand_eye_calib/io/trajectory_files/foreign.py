@@ -21,9 +21,10 @@ from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.files import read_text
 from hand_eye_calib.io.limits import LARGEST_TEXT
+from hand_eye_calib.io.trajectory_files.columns import MATRIX, POSITION, QUATERNION
 
-_POSE = "x,y,z,qx,qy,qz,qw"
-_PLACE = "t [s],lat [deg],lon [deg],height [m]"
+_POSE = (*POSITION, *QUATERNION)
+_PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
 _HEAD_BYTES = 4096
 # Binary files by their first bytes: what they are, and what to do.
 _NOT_READ = {
@@ -44,7 +45,7 @@ class Rows(NamedTuple):
     images whose poses they are.
     """
 
-    header: str
+    header: Sequence[str]
     rows: Iterable[Sequence[Any]]
     notes: tuple[str, ...] = ()
     images: Sequence[str] = ()
@@ -144,7 +145,7 @@ def _of_rtklib(text: str, _: str | None) -> Rows:
 def _of_g2o(text: str, _: str | None) -> Rows:
     vertices = (line.split() for line in text.splitlines() if line.startswith("VERTEX_SE3:QUAT "))
     rows = sorted((cells[1:9] for cells in vertices), key=lambda row: int(row[0]))
-    return Rows(f"t [s],{_POSE}", rows, (_NUMBERED.format("vertices"),))
+    return Rows(("t [s]", *_POSE), rows, (_NUMBERED.format("vertices"),))
 
 
 def _of_colmap(text: str, _: str | None) -> Rows:
@@ -165,9 +166,7 @@ def _of_json(text: str, _: str | None) -> Rows:
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames or "transform_matrix" not in frames[0]:
         raise ValueError("JSON that is not read; expected transforms.json of nerfstudio, or csv")
-    matrices = np.array([each["transform_matrix"] for each in frames], dtype=float)
-    Ts_world_camera = np.tile(np.eye(4), (len(frames), 1, 1))
-    Ts_world_camera[:, :3] = matrices[:, :3]
+    Ts_world_camera = np.array([each["transform_matrix"] for each in frames], dtype=float)
     Ts_world_camera[:, :3, :3] = Ts_world_camera[:, :3, :3] @ _FLIP
     turned = "axes of the camera: x right, y down, z forward, not those of OpenGL in the file"
     return _of_images([str(each["file_path"]) for each in frames], Ts_world_camera, turned)
@@ -186,14 +185,15 @@ def _of_motive(text: str, choice: str | None) -> Rows:
         if kind == "Rigid Body" and part in ("Rotation", "Position"):
             key = axis.lower() if part == "Position" else f"q{axis.lower()}"
             found.setdefault(name, {})[key] = at
-    body, wanted = _chosen(found, choice, "rigid bodies"), _POSE.split(",")
-    if {*wanted} - found[body].keys():
+    body = _chosen(found, choice, "rigid bodies")
+    if {*_POSE} - found[body].keys():
         raise ValueError("Motive with Euler angles: export with rotation type Quaternion")
     about = dict(zip(lines[0][::2], lines[0][1::2], strict=False))
     units = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
-    places = [lines[top].index("Time (Seconds)"), *(found[body][name] for name in wanted)]
+    places = [lines[top].index("Time (Seconds)"), *(found[body][name] for name in _POSE)]
     rows = [[row[k] for k in places] for row in lines[top + 1 :] if len(row) > max(places)]
-    header = _with_unit(units[about.get("Length Units", "Meters")])
+    unit = units[about.get("Length Units", "Meters")]
+    header = ("t [s]", *(f"{axis} [{unit}]" for axis in POSITION), *QUATERNION)
     return Rows(header, [row for row in rows if all(row)], (f"poses of rigid body {body}",))
 
 
@@ -209,11 +209,11 @@ def _of_vicon(text: str, choice: str | None) -> Rows:
     rows = [cells for cells in lines[5:] if len(cells) >= at + 6 and all(cells[at : at + 6])]
     values = np.array([[float(each) for each in cells[at : at + 6]] for cells in rows])
     angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
-    poses = se3.from_rotation_translation(se3.rotation_exp(angles), values[:, 3:])
+    positions = values[:, 3:] * {"m": 1.0, "cm": 0.01, "mm": 0.001}[units[at + 3]]
+    poses = se3.from_rotation_translation(se3.rotation_exp(angles), positions)
     seconds = [int(cells[0]) / rate_hz for cells in rows]
     note = f"poses of {body}; rotations read as rotation vectors"
-    joined = np.c_[seconds, values[:, 3:], se3.to_quat_xyzw(poses)].tolist()
-    return Rows(_with_unit(units[at + 3]), joined, (note,))
+    return Rows(("t [s]", *MATRIX), np.c_[seconds, _as_rows(poses)].tolist(), (note,))
 
 
 def _of_numpy(path: Path) -> Rows:
@@ -226,7 +226,7 @@ def _of_numpy(path: Path) -> Rows:
             f"an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, z, qx, "
             "qy, qz, qw, or (N, 4) of t, x, y, z"
         )
-    return Rows(f"t,{_POSE}" if values.shape[1] == 8 else "t,x,y,z", values.tolist())
+    return Rows(("t", *_POSE)[: values.shape[1]], values.tolist())
 
 
 def _of_ulog(path: Path) -> Rows:
@@ -238,7 +238,7 @@ def _of_ulog(path: Path) -> Rows:
             f"{path} is a log of PX4; to read it needs pyulog: pip install 'hand_eye_calib[px4]'"
         ) from None
     try:
-        (log,) = ULog(str(path), ["vehicle_odometry"]).data_list
+        log = ULog(str(path), ["vehicle_odometry"]).data_list[0]
         names = "xyz" if "x" in log.data else [f"position[{k}]" for k in range(3)]
         names = [*names, *(f"q[{k}]" for k in (1, 2, 3, 0))]
         stamps = log.data["timestamp_sample" if "timestamp_sample" in log.data else "timestamp"]
@@ -250,11 +250,10 @@ def _of_ulog(path: Path) -> Rows:
     positions, quats = values[good, :3], values[good, 3:]
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     rotations = _ENU_NED @ se3.from_quat_xyzw(positions, quats)[:, :3, :3] @ _FLIP
-    quats = se3.to_quat_xyzw(se3.from_rotation_translation(rotations, positions))
-    poses = np.c_[positions @ _ENU_NED.T, quats].tolist()
+    poses = _as_rows(se3.from_rotation_translation(rotations, positions @ _ENU_NED.T)).tolist()
     rows = [(int(stamp), *pose) for stamp, pose in zip(stamps[good], poses, strict=True)]
     note = "axes: x forward, y left, z up, in east, north, up; PX4 has forward, right, down"
-    return Rows(f"t [us],{_POSE}", rows, (note,))
+    return Rows(("t [us]", *MATRIX), rows, (note,))
 
 
 # ---- parts of several
@@ -262,29 +261,26 @@ def _of_ulog(path: Path) -> Rows:
 _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
 
 
-def _with_unit(unit: str) -> str:
-    return f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw"
+def _as_rows(poses: FloatArray) -> FloatArray:
+    """The first three rows of each pose (N, 4, 4) as one of (N, 12)."""
+    return poses[:, :3].reshape(-1, 12)
 
 
 def _of_images(names: Sequence[str], poses: FloatArray, *notes: str) -> Rows:
     """Poses (N, 4, 4) of images, whose stamps are the last numbers in their names; none if one has
     no number.
     """
-    rotations = se3.nearest_rotation(poses[:, :3, :3])
-    if np.abs(rotations - poses[:, :3, :3]).max() > 1e-3:
-        raise ValueError("a matrix is no rotation")
-    quats = se3.to_quat_xyzw(se3.from_rotation_translation(rotations, poses[:, :3, 3]))
-    values, images = np.c_[poses[:, :3, 3], quats].tolist(), [Path(name).stem for name in names]
+    values, images = _as_rows(poses).tolist(), [Path(name).stem for name in names]
     numbers = [re.findall(r"\d+\.\d+|\d+", image) for image in images]
     if not all(numbers):
-        return Rows(_POSE, values, notes, images)
+        return Rows(MATRIX, values, notes, images)
     stamps = [each[-1] for each in numbers]
     order = sorted(range(len(stamps)), key=lambda row: float(stamps[row]))
     rows = [(stamps[row], *values[row]) for row in order]
     # Seconds since 1970 have ten digits before the point, and no recording has so many images.
     if min(len(each.partition(".")[0]) for each in stamps) < 10:
         notes = (_NUMBERED.format("images"), *notes)
-    return Rows(f"t,{_POSE}", rows, notes, [images[row] for row in order])
+    return Rows(("t", *MATRIX), rows, notes, [images[row] for row in order])
 
 
 def _chosen(found: Any, choice: str | None, what: str) -> str:

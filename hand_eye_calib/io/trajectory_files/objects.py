@@ -10,12 +10,10 @@ from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
     QUATERNION,
-    Columns,
     choose_columns,
 )
 from hand_eye_calib.io.trajectory_files.table import Table
 
-_POSE = (*POSITION, *QUATERNION)
 _KINDS = (
     "a path, an array (N, 4, 4), (N, 8) of t, x, y, z, qx, qy, qz, qw or (N, 7), or a table with "
     "named columns"
@@ -43,9 +41,9 @@ def table_of_object(source: Any, times: Any = None) -> Table:
         except (TypeError, ValueError):
             raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
         if values.shape[1:] == (4, 4):
-            columns, values = Columns.in_order(*MATRIX), values.reshape(-1, 16)[:, :12]
+            columns, values = choose_columns("", MATRIX), values.reshape(-1, 16)[:, :12]
         elif values.ndim == 2 and values.shape[1] in (7, 8):
-            columns = Columns.in_order(*_POSE)
+            columns = choose_columns("", (*POSITION, *QUATERNION))
             times = values[:, 0] if times is None and values.shape[1] == 8 else times
             values = values[:, -7:]
         else:

@@ -7,7 +7,6 @@ in all directions; of them this says nothing.
 """
 
 from collections.abc import Mapping, Sequence
-from decimal import Decimal
 
 import numpy as np
 
@@ -26,7 +25,8 @@ from hand_eye_calib.io.trajectory_files.columns import MATRIX, QUATERNION, UNNAM
 from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.stats import median
 
-_LARGEST_NS = int(np.iinfo(np.int64).max)
+# Below the largest number of 64 bits, in the year 2261.
+_LARGEST_NS = 9.2e18
 # Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
 # mistaken.
 _LONGEST_INTERVAL_S = 10
@@ -63,16 +63,14 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         If they are too large, or their unit is not clear.
     """
     unit = stamp_unit or table.columns.stamp_unit
-    largest = max(map(abs, table.stamps))
+    sizes = np.abs(np.array(table.stamps, dtype=float))
     # Seconds since 1970 have ten digits, and each smaller unit three more.
-    by_size = (
-        each for each, digits in (("ns", 17), ("us", 14), ("ms", 11)) if largest >= 10**digits
-    )
+    digits = {"ns": 17, "us": 14, "ms": 11}
+    by_size = (each for each, count in digits.items() if sizes.max() >= 10.0**count)
     recognised = unit or next(by_size, "s")
     factor = STAMP_UNITS[recognised]
-    is_large = np.array([abs(stamp) > Decimal(_LARGEST_NS) / factor for stamp in table.stamps])
     table.refuse(
-        is_large,
+        np.asarray(sizes * factor > _LARGEST_NS),
         lambda index: (
             f"the timestamp {table.stamps[index]:.6g} is too large for {recognised}; name its unit "
             "with `stamp_unit`"
@@ -81,7 +79,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     rounded = (int((stamp * factor).to_integral_value()) for stamp in table.stamps)
     stamps_ns = np.fromiter(rounded, dtype=np.int64, count=len(table.stamps))
     # Stamps with a fraction are in seconds.
-    if not unit and all(stamp == stamp.to_integral_value() for stamp in table.stamps):
+    if not unit and not any(stamp % 1 for stamp in table.stamps):
         intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
         if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
             raise InputError(
@@ -222,18 +220,15 @@ def _in_si(
 
 def _from_matrices(table: Table, rotations: FloatArray) -> FloatArray:
     """Quaternions (N, 4), scalar last, of the nearest rotations: files have few digits."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        products = np.swapaxes(rotations, 1, 2) @ rotations
-        is_rotation = np.abs(products - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
-    is_rotation[is_rotation] = np.linalg.det(rotations[is_rotation]) > 0
+    nearest = se3.nearest_rotation(rotations)
     table.refuse(
-        ~is_rotation,
+        np.asarray(np.abs(nearest - rotations).max(axis=(1, 2)) > ROTATION_TOLERANCE),
         lambda _: (
             f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
             "of the values"
         ),
     )
-    return se3.to_quat_xyzw(se3.nearest_rotation(rotations))
+    return se3.to_quat_xyzw(nearest)
 
 
 def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:

@@ -25,6 +25,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
     QUATERNION,
+    RATES,
     UNNAMED,
     Columns,
     are_columns,
@@ -53,7 +54,7 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 _TIMES = "times.txt"
 # What four columns without names are.
-_OF_FOUR = {"positions": "t,x,y,z", "rates": "t,wx,wy,wz"}
+_OF_FOUR = {"positions": ("t", *POSITION), "rates": ("t", *RATES)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,21 +166,22 @@ class Head(NamedTuple):
                 comments[len(cells)] = cells
         return cls(0, "", [], None)
 
-    def layout(self) -> tuple[str, bool]:
+    def layout(self) -> tuple[str, Sequence[str] | None]:
         """The format that a file has, one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum
-        in doubt, so that its reader says what is wrong; and whether it names its columns.
+        in doubt, so that its reader says what is wrong; and the names of its columns, if they are
+        known.
         """
         is_separated, n_cells = "," in self.text or ";" in self.text, len(self.cells)
-        if self.names is self.cells:
-            is_table = is_separated or n_cells >= 8 or are_columns(self.cells)
-            return ("csv" if is_table else "tum"), is_table
-        if self.names is not None and are_columns(self.names):
+        if self.names and (self.names is self.cells or are_columns(self.names)):
             is_tum = " ".join(self.names).lower().endswith(TUM_COLUMNS[10:])
-            return ("tum" if is_tum and not is_separated else "csv"), True
-        if not is_separated:
-            return ("kitti" if n_cells == 12 else "tum"), False
-        is_ns = self.cells[0].isdecimal() and len(self.cells[0]) >= _DIGITS_OF_NS
-        return ("euroc" if is_ns and n_cells >= 8 else "csv"), False
+            return (
+                ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", self.names)
+            )
+        if not is_separated and n_cells != 4:
+            return ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
+        if n_cells >= 8 and self.cells[0].isdecimal() and len(self.cells[0]) >= _DIGITS_OF_NS:
+            return "euroc", _FORMATS["euroc"][0]
+        return "csv", _UNNAMED if n_cells == 8 else None
 
 
 # ---- tables
@@ -239,7 +241,6 @@ class Table:
         lines: Iterable[tuple[int, Any]],
         cells_of: Callable[[Any], list[str]],
         n_columns: int,
-        may_have_more: bool = False,
     ) -> Self:
         """Add rows from their text.
 
@@ -251,7 +252,7 @@ class Table:
         stamp_at, at = self.columns.stamp, [*self.columns.quantities.values()]
         for number, text in lines:
             cells = cells_of(text)
-            if len(cells) != n_columns and not (may_have_more and len(cells) > n_columns):
+            if len(cells) != n_columns:
                 shown = text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
                 raise InputError(
                     f"{self.path}, line {number}: expected {self.expected}; found {len(cells)}: "
@@ -299,22 +300,18 @@ def _stamp(cells: Sequence[str]) -> Decimal:
 
 # ---- formats
 
-# Of the formats whose columns have an order: what a row is, the columns, and how it is split.
-_ORDERED: dict[str, tuple[str, Columns, Callable[[str], list[str]]]] = {
-    "tum": (f"8 numbers, {TUM_COLUMNS}", Columns.in_order(*POSITION, *QUATERNION), str.split),
-    "kitti": (
-        "12 numbers, the first three rows of a pose",
-        Columns.in_order(*MATRIX, has_stamp=False),
-        str.split,
-    ),
+# Of the formats whose columns have an order: their names, what a row is, and how it is split.
+_FORMATS: dict[str, tuple[Sequence[str], str, Callable[[str], list[str]]]] = {
+    "tum": (("t", *POSITION, *QUATERNION), f"8 numbers, {TUM_COLUMNS}", str.split),
+    "kitti": (MATRIX, "12 numbers, the first three rows of a pose", str.split),
     "euroc": (
+        ("t [ns]", *POSITION, "qw", "qx", "qy", "qz"),
         "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
-        Columns.in_order(*POSITION, "qw", "qx", "qy", "qz", stamp_unit="ns"),
-        lambda text: [*map(str.strip, text.split(","))],
+        lambda text: [*map(str.strip, text.split(","))][:8],
     ),
 }
 # A stamp, a position and a quaternion, whose order is to be found.
-_UNNAMED = Columns.in_order(*POSITION, *UNNAMED)
+_UNNAMED = ("t", *POSITION, *UNNAMED)
 
 
 def read_table(path: _Path, options: FileOptions) -> Table:
@@ -326,65 +323,48 @@ def read_table(path: _Path, options: FileOptions) -> Table:
         If a line cannot be used, or columns have no names.
     """
     if (found := rows_of(path, options.columns)) is not None:
-        names, rows = found.header.split(","), enumerate(found.rows, 1)
-        table = table_of(path, names, rows, lambda row: [*map(str, row)], options.measures)
+        rows = enumerate(found.rows, 1)
+        table = table_of(path, found.header, rows, lambda row: [*map(str, row)], options.measures)
         table.guesses, table.images = [f"{path}: {note}" for note in found.notes], found.images
         return table
     head, guesses = Head.of(path), list[str]()
     format, columns, times = options.format, options.columns, options.times
-    is_named = True
-    if format == AUTO and (columns or times):
-        format = "csv" if columns else "kitti"
-    elif format == AUTO:
-        format, is_named = head.layout()
-        if not is_named and len(head.cells) == 4:
-            if (columns := _OF_FOUR.get(options.measures)) is None:
-                raise InputError(
-                    f"{path}: four columns without names; name them with `columns`: t,x,y,z for "
-                    "positions, t,wx,wy,wz for angular rates"
-                )
-            format = "csv"
-        elif format != "tum":
+    if format != AUTO or columns or times:
+        format = format if format != AUTO else "csv" if columns else "kitti"
+        header = _FORMATS[format][0] if format != "csv" else head.names
+    else:
+        format, header = head.layout()
+        header = header or _OF_FOUR.get(options.measures) if len(head.cells) == 4 else header
+        if format != "tum":
             guesses = [f"{path} looks like format {format}; to change that, give `format`"]
         beside = Path(path).with_name(_TIMES)
         if format == "kitti" and beside.is_file():
             times = beside
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
-    if format == "csv":
-        table = _read_csv(path, head, columns, options)
-    else:
-        expected, places, cells_of = _ORDERED[format]
-        n_columns = len(places.stamp) + len(places.quantities)
-        table = Table(path, expected, places if is_named or format != "tum" else _UNNAMED, format)
-        table.fill(_data(path), cells_of, n_columns, may_have_more=format == "euroc")
+    after = head.number if head.names is head.cells else 0
+    if columns:
+        header = [name.strip() for name in columns.split(",")]
+        after = 0 if any(map(_NUMBER.fullmatch, head.cells)) else head.number
+    if header is None and head.cells:
+        raise InputError(
+            f"{path}: the first line names no columns, so that their order is unknown; name the "
+            f"{len(head.cells)} with `columns`, such as t,x,y,z,qx,qy,qz,qw or t,wx,wy,wz"
+        )
+    _, expected, cells_of = _FORMATS.get(format, ((), "", _cells_of))
+    lines = _data(path, after=after if format == "csv" else 0)
+    measures = options.measures if format == "csv" else AUTO
+    table = table_of(path, header or _UNNAMED, lines, cells_of, measures, expected)
     if format == "kitti" and times is not None:
-        stamps = Table(times, "a stamp", Columns.in_order())
-        table.stamps = stamps.fill(_data(times, "stamps"), str.split, 1, True).stamps
+        stamps = Table(times, "a stamp", Columns([0], {}))
+        lines = _data(times, "stamps")
+        table.stamps = stamps.fill(lines, lambda text: text.split()[:1], 1).stamps
         if len(table.stamps) != len(table):
             raise InputError(
                 f"{path}: {len(table)} poses, but {times} has {len(table.stamps)} stamps; they "
                 "belong to different recordings"
             )
-    table.guesses[:0] = guesses
+    table.guesses, table.format = guesses, format
     return table
-
-
-def _read_csv(path: _Path, head: Head, columns: str | None, options: FileOptions) -> Table:
-    """Columns by the names in the header, or by those given."""
-    names, after = head.names, head.number if head.names is head.cells else 0
-    if columns is not None:
-        names = [name.strip() for name in columns.split(",")]
-        after = 0 if any(map(_NUMBER.fullmatch, head.cells)) else head.number
-    if names is not None:
-        return table_of(path, names, _data(path, after=after), _cells_of, options.measures)
-    if head.cells and not (options.format == AUTO and len(head.cells) == 8):
-        raise InputError(
-            f"{path}: the first line names no columns, so the order of the quaternion is "
-            "unknown; name them with `columns`, such as t,x,y,z,qx,qy,qz,qw; there are "
-            f"{len(head.cells)}"
-        )
-    table = Table(path, "8 columns: a stamp, a position and a quaternion", _UNNAMED)
-    return table.fill(_data(path), _cells_of, 8)
 
 
 def table_of(
@@ -393,6 +373,7 @@ def table_of(
     lines: Iterable[tuple[int, Any]],
     cells_of: Callable[[Any], list[str]],
     measures: str = AUTO,
+    expected: str = "",
 ) -> Table:
     """The numbers of lines whose columns have names.
 
@@ -401,6 +382,6 @@ def table_of(
     InputError
         If a column is missing, or a line cannot be used.
     """
-    columns, expected = choose_columns(path, names, measures), listed(names)
-    table = Table(path, f"{len(names)} columns: {expected}", columns, header=tuple(names))
-    return table.fill(lines, cells_of, len(names))
+    columns = choose_columns(path, names, measures)
+    expected = expected or f"{len(names)} columns: {listed(names)}"
+    return Table(path, expected, columns, header=tuple(names)).fill(lines, cells_of, len(names))
