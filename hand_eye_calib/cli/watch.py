@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import os
 import queue
+import re
 import select
 import signal
 import sys
@@ -24,7 +25,7 @@ examples:
   hand_eye_calib watch                     on this terminal
   hand_eye_calib watch --web               also in a browser, on a phone for example
   hand_eye_calib watch --node /robot1/calibrator
-  hand_eye_calib watch > seen.txt          in lines, whenever something new is said"""
+  hand_eye_calib watch > seen.txt          a line whenever something else is said"""
 
 _PORT = 8765
 _LISTEN_S = 0.1
@@ -100,8 +101,6 @@ class Session:
         return self._board.view(now_s)
 
     def _press(self, key: str, now_s: float, buttons: tuple[str, ...]) -> None:
-        from hand_eye_calib.watch.web import BUTTONS
-
         request = _KEYS.get(key, "")
         if key in ("q", "\x03", "\x04"):
             self.is_over = True
@@ -112,10 +111,8 @@ class Session:
         elif key in _SURE and (key != self._sure or now_s > self._sure_until_s):
             self._sure, self._sure_until_s = key, now_s + _SURE_WITHIN_S
             self._board.answer(request, False, f"{_SURE[key]}: press {key} again", now_s)
-        elif request == "acknowledge":
-            self._board.acknowledge()
         else:
-            self._requests.put(BUTTONS[request])
+            self._requests.put(request)
 
 
 @contextlib.contextmanager
@@ -126,14 +123,18 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     from rich.live import Live
     from rich.text import Text
 
-    from hand_eye_calib.watch.terminal import LineLog, screen
+    from hand_eye_calib.watch.terminal import lines, screen
 
     if not sys.stdout.isatty():
-        log, started_s = LineLog(), time.monotonic()
+        said: set[str] = set()
 
         def write(view: "View", shows_code: bool) -> None:
-            for line in log.lines(view, time.monotonic() - started_s):
-                print(line, flush=True)
+            before = said.copy()
+            said.clear()
+            for line in lines(view):  # those that differ in their numbers only are the same
+                said.add(key := re.sub(r"[\d.]+", "", line))
+                if key not in before:
+                    print(line, flush=True)
 
         yield write
         return

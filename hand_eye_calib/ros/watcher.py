@@ -66,14 +66,17 @@ class Watcher:
             self._follow(asked)
 
     def ask(self, request: str) -> None:
-        """Call ``solve``, ``save`` or ``reset`` of the node that is shown, or set a parameter, as
-        in ``monitor:=false``; the answer goes to the board.
+        """Do what a button asks for: call ``solve``, ``save`` or ``reset`` of the node that is
+        shown, or set a parameter, as in ``prior.z:=1.85m+/-0.02m``; the answer goes to the board.
         """
-        if self._board.node and request not in self._asked:
+        if request == "acknowledge":
+            self._board.acknowledge()
+        elif self._board.node and request not in self._asked:
             name, is_parameter, value = request.partition(":=")
             kind, message = Trigger, Trigger.Request()
-            if is_parameter:
-                parameter = Parameter(name, value=False if value == "false" else value)
+            if is_parameter or request == "recalibrate":
+                off = Parameter("monitor", value=False)
+                parameter = Parameter(name, value=value) if is_parameter else off
                 message = SetParameters.Request(parameters=[parameter.to_parameter_msg()])
                 kind, name = SetParameters, "set_parameters"
             client = self._node.create_client(kind, f"{self._board.node}/{name}")

@@ -4,7 +4,6 @@ Nothing here knows ROS, a terminal or a browser: states go in, a :class:`View` c
 """
 
 import math
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -18,15 +17,15 @@ from hand_eye_calib.live.state import (
     NodeState,
     ResultState,
 )
-from hand_eye_calib.results.records import AxisProgress, Comparison
+from hand_eye_calib.results.records import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.text import amount, duration, fixed, listing, two_digits
 
 # A node that has said nothing for so long is silent; it reports once a second (s).
 SILENT_AFTER_S = 3.5
 
-# Words whose sentence has figures that change all the time.
-SILENT, LEARNING, MOVED = COUNTING = "SILENT", "LEARNING", "MOUNT MOVED"
+MOVED = "MOUNT MOVED"
+_ADVICE = " Check it. Then recalibrate, or acknowledge; a reset ends the alarm."
 
 # A shift is told from this many standard deviations on.
 _CLEARLY = 3.0
@@ -60,12 +59,11 @@ class Line:
 
 @dataclass(frozen=True)
 class Bar:
-    """One axis of the parent sensor's frame against its target.
+    """One axis of the parent sensor's frame, such as "about z", against its target.
 
-    ``name`` is such as "about z", ``meaning`` such as "turn", if the axes are those of a vehicle.
-    ``share`` is 0 to 1, of the information that the target needs: it grows evenly while the motion
-    stays as it is. ``word`` is such as "30 s left", ``against`` such as "± 0.065 of 0.3 deg";
-    ``difference`` is from what is installed, empty if not known.
+    ``meaning`` is such as "turn", if the axes are those of a vehicle; ``share``, 0 to 1, of the
+    information that the target needs; ``word`` such as "30 s left"; ``against`` such as "± 0.065 of
+    0.3 deg"; ``difference`` from what is installed, empty if not known.
     """
 
     name: str
@@ -81,13 +79,10 @@ class Bar:
 class View:
     """Everything a person is shown of one node.
 
-    The pose (``values``: each axis with its value) has the angles as they are printed, with their
-    own standard deviations. The bars are about the axes of the parent sensor's frame. ``buttons``
-    are the requests that make sense now, that to be pressed first; ``by_hand`` is the axis that
-    somebody may measure instead of driving on; ``saved_in`` is the directory of the files.
-
-    A node that only watches the mount has no bars, verdict and comparison, but a line for each axis
-    (``watched``): whether it has moved, or which change would be seen.
+    ``values`` is the pose as it is printed, by axis. ``buttons`` are the requests that make sense
+    now, that to be pressed first; ``by_hand`` is the axis that somebody may measure instead of
+    driving on; ``saved_in`` is the directory of the files. A node that only watches the mount has a
+    line for each axis (``watched``), and no bars, verdict and comparison.
     """
 
     node: str
@@ -118,57 +113,51 @@ class Board:
     def __init__(self, wanted: str = "") -> None:
         self.topics: tuple[str, ...] = ()
         self._wanted = wanted
-        self._state: NodeState | None = None
-        self._heard_s = self._answered_s = -math.inf
-        self._answer: Line | None = None
-        self._acknowledged: int | None = -1
-        self._lock = threading.Lock()
+        # One assignment each, so that no other thread sees half of it: what, and when.
+        self._heard: tuple[NodeState, float] | None = None
+        self._answer: tuple[Line, float] | None = None
+        self._acknowledged: tuple[str, int | None] | None = None
 
     @property
     def node(self) -> str:
         """Fully qualified name of the node that is shown; empty if none was heard."""
-        state = self._state
-        return state.node if state is not None else ""
+        return self._heard[0].node if self._heard else ""
 
     def take(self, state: NodeState, now_s: float) -> None:
         """Take the state of a node."""
-        with self._lock:
-            shown = self._wanted or self.node
-            is_silent = now_s - self._heard_s > SILENT_AFTER_S
-            if state.node != shown and (self._wanted or not is_silent):
-                return
-            if state.node != self.node:
-                self._answer, self._acknowledged = None, -1
-            self._state, self._heard_s = state, now_s
+        is_silent = not self._heard or now_s - self._heard[1] > SILENT_AFTER_S
+        if state.node == (self._wanted or self.node) or (is_silent and not self._wanted):
+            self._heard = state, now_s
 
     def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
         """Take the answer to a button; ``good`` is None while it is awaited."""
         tone = Tone.BUSY if good is None else Tone.GOOD if good else Tone.ACT
-        with self._lock:
-            self._answer, self._answered_s = Line(tone, request, text), now_s
+        self._answer = Line(tone, request, text), now_s
 
     def acknowledge(self) -> None:
         """Somebody knows that the mount has moved: it is said without alarm, until the next one."""
-        with self._lock:
-            mount = self._state.mount if self._state else None
-            self._acknowledged = mount.since_ns if mount else -1
+        self._acknowledged = _alarm_of(self._heard[0]) if self._heard else None
 
     def view(self, now_s: float) -> View:
         """What to show; ``now_s`` is on the same clock as that of :meth:`take`."""
-        with self._lock:
-            state = self._state
-            if state is None:
-                who = f"of {self._wanted}" if self._wanted else "of a calibrator"
-                text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and "
-                return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
-            view = _view(state, now_s - self._heard_s)
-            if view.word == MOVED and state.mount and state.mount.since_ns == self._acknowledged:
-                facts = f"{view.facts}; acknowledged"
-                view = replace(view, tone=Tone.ACT, buttons=("recalibrate",), facts=facts)
-            if view.word in ("CHECK INPUT", "BAD INPUT"):
-                view = replace(view, topics=self.topics)
-            is_answered = now_s - self._answered_s < ANSWER_FOR_S
-            return replace(view, answer=self._answer if is_answered else None)
+        if self._heard is None:
+            who = f"of {self._wanted}" if self._wanted else "of a calibrator"
+            text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and "
+            return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
+        state, heard_s = self._heard
+        view = _view(state, now_s - heard_s)
+        if view.word == MOVED and _alarm_of(state) == self._acknowledged:
+            facts, buttons = f"{view.facts}; acknowledged", ("recalibrate", "reset")
+            view = replace(view, tone=Tone.ACT, buttons=buttons, facts=facts)
+        if view.word in ("CHECK INPUT", "BAD INPUT"):
+            view = replace(view, topics=self.topics)
+        if self._answer and now_s - self._answer[1] < ANSWER_FOR_S:
+            view = replace(view, answer=self._answer[0])
+        return view
+
+
+def _alarm_of(state: NodeState) -> tuple[str, int | None]:
+    return state.node, state.mount.since_ns if state.mount else None
 
 
 def _view(state: NodeState, silent_s: float) -> View:
@@ -178,27 +167,29 @@ def _view(state: NodeState, silent_s: float) -> View:
         head = _of_end(state)
     elif is_old:
         text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
-        head = Tone.BAD, SILENT, text
-    health, saved_in = tuple(_health(state, is_old)), state.saved.directory if state.saved else ""
-    view = View(state.node, *head, health=health, saved_in=saved_in)
+        head = Tone.BAD, "SILENT", text
+    saved_in = state.saved.directory if state.saved else ""
+    view = View(state.node, *head, health=tuple(_health(state, is_old)), saved_in=saved_in)
     if state.mount is not None:
-        asked = ("recalibrate", "acknowledge") if view.word == MOVED else ()
+        asked = ("recalibrate", "acknowledge", "reset") if view.word == MOVED else ()
         watched = tuple(_watched(axis, state.mount) for axis in AXES)
         return replace(view, facts=_ago(state.mount), watched=watched, buttons=asked)
-    is_to_be_saved = view.word == "DONE" and not state.saved
-    buttons = ("save", "solve", "reset") if is_to_be_saved else ("solve", "save", "reset")
-    result, at = state.extrinsic.result if state.extrinsic else None, state.progress
-    return replace(
-        view,
-        facts=_facts(state),
-        title=f"pose of {result.child_frame} in {result.parent_frame}" if result else "",
-        values=tuple(_values(result)) if result else (),
-        bars=tuple(_bar(axis, state) for axis in AXES) if at else (),
-        result=tuple(_result(state)),
-        reasons=result.reasons if result else (),
-        buttons=() if is_old else buttons,
-        by_hand=at.progress.limiting_axis if at and at.progress.will_not_get_there else "",
-    )
+    buttons = ("solve", "save", "reset")
+    if view.word == "DONE" and not state.saved:
+        buttons = ("save", "solve", "reset")
+    if result := _result_of(state):
+        title = f"pose of {result.child_frame} in {result.parent_frame}"
+        view = replace(view, title=title, values=tuple(_values(result)), reasons=result.reasons)
+    if at := state.progress:
+        asks = at.progress.will_not_get_there
+        bars, by_hand = tuple(_bar(axis, state) for axis in AXES), at.progress.limiting_axis * asks
+        view = replace(view, bars=bars, by_hand=by_hand)
+    shown = () if is_old else buttons
+    return replace(view, facts=_facts(state), result=tuple(_result(state)), buttons=shown)
+
+
+def _result_of(state: NodeState) -> ResultState | None:
+    return state.extrinsic.result if state.extrinsic else None
 
 
 def at_time(seconds: float) -> str:
@@ -227,11 +218,9 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
     for tone, word, part, level in told:
         if part is None or part.level is not level or (part is checks and checks.age_s is None):
             continue
-        if word == MOVED:
-            return tone, word, f"{_sentence(part.text)} Check it. Then recalibrate, or acknowledge."
-        return tone, word, _sentence(part.text)
+        return tone, word, _sentence(part.text) + _ADVICE * (word == MOVED)
     if mount is not None:
-        tone, word = (Tone.BUSY, LEARNING) if mount.is_learning else (Tone.GOOD, "WATCHING")
+        tone, word = (Tone.BUSY, "LEARNING") if mount.is_learning else (Tone.GOOD, "WATCHING")
         return tone, word, _sentence(mount.text)
     if at is None:
         return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
@@ -251,9 +240,8 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
 
 def _of_done(state: NodeState, moved: str, sentence: str) -> str:
     """What has changed against what is installed, or how good it is; save, or where it is saved."""
-    if moved:
-        result = state.extrinsic.result if state.extrinsic else None
-        sentence = f"{result.child_frame if result else 'The sensor'} HAS MOVED: {moved}. Save."
+    if moved and (result := _result_of(state)):
+        sentence = f"{result.child_frame} HAS MOVED: {moved}. Save."
     if state.saved is None:
         return sentence
     told = sentence.removesuffix(" Save.").removesuffix(" Stop and save.")
@@ -277,8 +265,8 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
         when = at_time(state.saved.at_s)
         text = f"The node has ended. The result was saved at {when} in {state.saved.directory}."
         return Tone.GOOD, "ENDED", text
-    has_result = state.extrinsic is not None and state.extrinsic.result is not None
-    why = "is not saved: output_directory is not set" if has_result else "was not there yet"
+    is_lost = _result_of(state) is not None
+    why = "is not saved: output_directory is not set" if is_lost else "was not there yet"
     return Tone.ACT, "ENDED", f"The node has ended. A result {why}."
 
 
@@ -321,36 +309,31 @@ def _signed(axis: str, value: float) -> str:
 
 
 def _bar(axis: str, state: NodeState) -> Bar:
-    assert state.progress is not None
     at = state.progress
+    assert at is not None
     known = at.progress.axes[axis]
     share = min(1.0, (known.target / known.sigma) ** 2) if known.sigma > 0 else 1.0
-    tone, word = _state(known, is_behind=at.progress.limiting_axis == axis)
-    is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
+    left = "not with this motion"
+    if math.isfinite(known.seconds_left):
+        left = f"{duration(known.seconds_left)} left"
+    tone, word = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, left
     wanted = amount(axis, known.target)
-    against = f"wanted: {wanted}"
-    if math.isfinite(known.sigma):
-        own = amount(axis, known.sigma)
-        against = f"± {own.removesuffix(wanted[wanted.rfind(' ') :])} of {wanted}"
+    own = amount(axis, known.sigma).removesuffix(wanted[wanted.rfind(" ") :])
+    against = f"± {own} of {wanted}"
+    if not math.isfinite(known.sigma):
+        tone, word, against = Tone.UNKNOWN, "not seen yet", f"wanted: {wanted}"
+    elif known.seconds_left == 0:
+        tone, word = Tone.GOOD, "enough"
+    elif known.sigma <= known.target:
+        tone, word = Tone.BUSY, f"nearly: {left}"
     difference = ""
     if at.comparison is not None and at.comparison.differences:
         row = at.comparison.differences[0].axes[axis]
         difference = f"{_signed(axis, row.difference)} ± {amount(axis, row.sigma)}"
         difference = difference if math.isfinite(row.sigma) else "unknown"
+    is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
     meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""
     return Bar(_name(axis), meaning, share, tone, word, against, difference)
-
-
-def _state(known: AxisProgress, is_behind: bool) -> tuple[Tone, str]:
-    left_s = known.seconds_left
-    if not math.isfinite(known.sigma):
-        return Tone.UNKNOWN, "not seen yet"
-    if left_s == 0:
-        return Tone.GOOD, "enough"
-    left = f"{duration(left_s)} left" if math.isfinite(left_s) else "not with this motion"
-    if known.sigma <= known.target:
-        return Tone.BUSY, f"nearly: {left}"
-    return (Tone.ACT if is_behind else Tone.BUSY), left
 
 
 def _values(result: ResultState) -> Iterator[tuple[str, str]]:
@@ -403,7 +386,7 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
 
 
 def _result(state: NodeState) -> Iterator[Line]:
-    result = state.extrinsic.result if state.extrinsic else None
+    result = _result_of(state)
     verdict = result.verdict if result else "no result yet"
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
     found, tone = state.progress.comparison if state.progress else None, Tone.UNKNOWN

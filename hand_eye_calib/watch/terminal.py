@@ -6,7 +6,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.watch.board import COUNTING, MOVED, Line, Tone, View
+from hand_eye_calib.watch.board import MOVED, Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",
@@ -44,7 +44,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
     keys = KEYS if view.bars else WATCHING_KEYS
-    keys = f"c recalibrate   a acknowledge   {keys}" if view.word == MOVED else keys
+    keys = f"c recalibrate   a acknowledge   r reset   {keys}" if view.word == MOVED else keys
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
     body = Panel(Group(*parts), title=title, title_align="left")
     return Group(Text(f" {keys}   {footer}".rstrip(), style="dim"), body)
@@ -69,25 +69,9 @@ def _lines(lines: tuple[Line, ...]) -> Table:
     return table
 
 
-class LineLog:
-    """A view in lines: some whenever something new is said."""
-
-    def __init__(self) -> None:
-        self._said: tuple[object, ...] = ()
-        self._answer: Line | None = None
-
-    def lines(self, view: View, elapsed_s: float) -> list[str]:
-        """What is new since the last call, with the seconds since the start."""
-        sentence = "" if view.word in COUNTING else view.sentence
-        said = view.node, view.word, sentence, view.result
-        lines = []
-        if said != self._said:
-            lines.append(f"{elapsed_s:6.1f} s  {view.tone.value} {view.word}: {view.sentence}")
-            axes = "  ".join(f"{bar.name} {100 * bar.share:.0f} %" for bar in view.bars)
-            more = [axes, *(f"{line.name}: {line.text}" for line in view.result)]
-            lines += [f"{'':10}{'   '.join(more)}"] if view.bars else []
-        if view.answer is not None and view.answer != self._answer:
-            answer = view.answer
-            lines.append(f"{elapsed_s:6.1f} s  {answer.tone.value} {answer.name}: {answer.text}")
-        self._said, self._answer = said, view.answer
-        return lines
+def lines(view: View) -> list[str]:
+    """The headline, and the answer to a button: for a file or a pipe."""
+    told = [f"{view.tone.value} {view.word}: {view.sentence}"]
+    if view.answer is not None:
+        told.append(f"{view.answer.tone.value} {view.answer.name}: {view.answer.text}")
+    return told

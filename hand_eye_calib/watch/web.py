@@ -24,14 +24,8 @@ from hand_eye_calib.watch.board import Board
 from hand_eye_calib.watch.html import fragment
 
 PORT = 8765
-# Requests of the page. Those with := set a parameter of the node, the others call its services.
-BUTTONS = {
-    "solve": "solve",
-    "save": "save",
-    "reset": "reset",
-    "recalibrate": "monitor:=false",
-    "acknowledge": "",
-}
+# Requests of the page, beside that of an axis measured by hand.
+BUTTONS = ("solve", "save", "reset", "recalibrate", "acknowledge")
 
 # The view is looked at so often, and something is sent at least so often (s).
 _LOOK_S, _SEND_S = 0.25, 1.0
@@ -62,11 +56,11 @@ class WebServer(ThreadingHTTPServer):
     ----------
     board : Board
     ask : callable
-        Called in another thread with what the node is asked for: a service, or a parameter and its
-        value as in ``prior.z:=1.85m+/-0.02m``.
+        Called in another thread with one of BUTTONS, or with a parameter and its value as in
+        ``prior.z:=1.85m+/-0.02m``.
     address : (str, int)
-        Host and port to listen on; an empty host stands for all addresses of the computer, port 0
-        for any that is free.
+        Host and port; an empty host stands for all addresses of the computer, port 0 for any that
+        is free.
     key : str
         Empty for a new one.
 
@@ -108,8 +102,7 @@ class WebServer(ThreadingHTTPServer):
     def addresses(self) -> list[str]:
         """What to type into a browser, that for other computers first."""
         hosts = [self._host] if self._host else [own_address(), "localhost"]
-        hosts = [f"[{host}]" if ":" in host else host for host in hosts if host]
-        return [f"http://{host}:{self.port}/?key={self.key}" for host in hosts]
+        return [f"http://{host}:{self.port}/?key={self.key}" for host in hosts if host]
 
     def stop(self) -> None:
         """Close all connections."""
@@ -168,10 +161,8 @@ class _Handler(BaseHTTPRequestHandler):
         status, text = HTTPStatus.OK, ""
         if not self._has_key():
             status, text = HTTPStatus.FORBIDDEN, "the key is missing"
-        elif request == "acknowledge":
-            self.server.board.acknowledge()
         elif request in BUTTONS:
-            self.server.ask(BUTTONS[request])
+            self.server.ask(request)
         elif request == "prior":
             try:
                 self.server.ask(_prior(*map(self._given, ("axis", "value", "sigma"))))
