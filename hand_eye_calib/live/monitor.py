@@ -33,10 +33,9 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.state import AxisValues, Level, MountState
+from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.plain import plain
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
 from hand_eye_calib.text import amount, axes_in_words, listing
@@ -98,8 +97,7 @@ _UNKNOWN = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 @dataclass(frozen=True, kw_only=True)
 class Alarm:
     """The mount has moved since about a stamp of the parent's clock, which was clear at another.
-    The shift (6,) is along (m) and about (rad) the axes of the parent sensor: the child's pose now
-    minus installed.
+    The shift (6,), from the installed pose, is along (m) and about (rad) the parent sensor's axes.
     """
 
     since_ns: int
@@ -137,7 +135,8 @@ class MountMonitor:
     alarm : Alarm or None
         The shift that has been seen.
     seconds : int
-        Seconds of motion seen so far.
+        Seconds of motion seen so far; the noise is learned from the first, and nothing is judged
+        while ``is_learning``.
     """
 
     def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
@@ -147,6 +146,7 @@ class MountMonitor:
         self._to_parent = np.kron(np.eye(2), self._installed[:3, :3])
         self._noise: FloatArray | None = None
         self._learning: list[tuple[int, MotionPairs]] = []
+        self.is_learning = True
         self._tail = PosePairs.empty()
         # Of the newest seconds of motion, the newest first, and the sums of those before them.
         self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
@@ -158,11 +158,6 @@ class MountMonitor:
         self.alarm: Alarm | None = None
         self.seconds = 0
         self.long_run = _ASSUMED
-
-    @property
-    def is_learning(self) -> bool:
-        """Whether the noise is not known yet, so that nothing is judged."""
-        return self._noise is None
 
     def add(self, pose_pairs: PosePairs) -> Alarm | None:
         """Take the poses that follow those before.
@@ -187,8 +182,8 @@ class MountMonitor:
         return raised
 
     def restart(self) -> None:
-        """Forget the stretch before a gap of the streams; what was learned stays."""
-        self._tail = PosePairs.empty()
+        """Begin anew with stamps of any time; what was learned stays."""
+        self._tail, self._last_s = PosePairs.empty(), -1
 
     # ------------------------------------------------------------- the motions
 
@@ -196,31 +191,22 @@ class MountMonitor:
         """Motions over a second that end in these poses, by the second in which they begin."""
         if len(self._tail) and len(pose_pairs):
             late_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
-            if late_ns <= 0 or late_ns > _MOST_LATE * _LAG_NS:
+            if not 0 < late_ns <= _MOST_LATE * _LAG_NS:
                 self._tail = PosePairs.empty()
         poses = PosePairs.concatenate(self._tail, pose_pairs)
         poses = poses[np.unique(poses.stamps_ns // _STEP_NS, return_index=True)[1]]
-        stamps_ns = poses.stamps_ns
+        stamps_ns, seconds = poses.stamps_ns, poses.stamps_ns // _SECOND_NS
         j = np.searchsorted(stamps_ns, stamps_ns + _LAG_NS)
-        seconds = stamps_ns // _SECOND_NS
         # A second is complete once a motion of the next one has its end.
-        ended = j < len(stamps_ns)
-        if not ended.any():
-            self._tail = poses
-            return []
-        complete = ended & (seconds < seconds[ended][-1]) & (seconds > self._last_s)
-        self._tail = poses[seconds >= seconds[ended][-1]]
-        self._last_s = int(seconds[ended][-1]) - 1
-        i = np.flatnonzero(complete)
+        has_end = j < len(stamps_ns)
+        under_way = int(seconds[has_end][-1]) if has_end.any() else -1
+        self._tail = poses[seconds >= under_way]
+        i = np.flatnonzero(has_end & (seconds < under_way) & (seconds > self._last_s))
         i = i[stamps_ns[j[i]] - stamps_ns[i] <= _MOST_LATE * _LAG_NS]
-        if not len(i):
-            return []
-        pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
-        starts = np.flatnonzero(np.diff(seconds[i], prepend=-1))
-        ends = np.append(starts[1:], len(i))
+        self._last_s = max(self._last_s, under_way - 1)
+        pairs, of_pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i]), seconds[i]
         return [
-            (int(seconds[i[first]]) * _SECOND_NS, pairs[first:last])
-            for first, last in zip(starts, ends, strict=True)
+            (each * _SECOND_NS, pairs[of_pairs == each]) for each in np.unique(of_pairs).tolist()
         ]
 
     def _learn(self, stamp_ns: int, motions: MotionPairs) -> None:
@@ -231,6 +217,7 @@ class MountMonitor:
         learned, self._learning = self._learning, []
         found = [residuals_and_jacobians(each, self._installed) for _, each in learned]
         residuals, jacobians = (np.concatenate(part) for part in zip(*found, strict=True))
+        self.is_learning = False
         self._noise, _ = noise_covariance(residuals)
         for _ in range(2):
             H, S, _ = _information(residuals, jacobians, self._noise)
@@ -343,12 +330,11 @@ class MountMonitor:
 def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
     """Whether the sensors move: where they stand, noise would look like information."""
     parent = motions.Ts_parenti_parentj
-    rotation = float(np.median(se3.rotation_angle(parent[:, :3, :3])))
-    distance = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
-    least = _LEAST_ROTATION
-    if noise is not None:
-        least = max(least, _LEAST_OF_NOISE * float(np.sqrt(np.trace(noise[3:, 3:]) / 3)))
-    return rotation > least or distance > _LEAST_MOTION
+    rotation = np.median(se3.rotation_angle(parent[:, :3, :3]))
+    distance = np.median(np.linalg.norm(parent[:, :3, 3], axis=1))
+    of_noise = 0.0 if noise is None else np.sqrt(np.trace(noise[3:, 3:]) / 3)
+    least = max(_LEAST_ROTATION, _LEAST_OF_NOISE * float(of_noise))
+    return bool(rotation > least or distance > _LEAST_MOTION)
 
 
 def _information(
@@ -448,16 +434,12 @@ class MountWatch:
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift=_by_axis(alarm.shift) if alarm else {},
-            shift_sigma=_by_axis(alarm.sigmas) if alarm else {},
-            visible_10min=_by_axis(told),
+            shift=by_axis(alarm.shift) if alarm else {},
+            shift_sigma=by_axis(alarm.sigmas) if alarm else {},
+            visible_10min=by_axis(told),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,
         )
-
-
-def _by_axis(values: FloatArray) -> AxisValues:
-    return dict(zip(AXES, plain(values), strict=True))
 
 
 def _quiet(visible: FloatArray, is_watched: np.ndarray) -> str:

@@ -102,6 +102,11 @@ def test_standing_still_and_gaps_add_nothing():
     later = motion(200.0, 2, start_s=5000.0)
     monitor.add(PosePairs(later.stamps_ns, world @ later.Ts_pw_p, later.Ts_cw_c))
     assert monitor.alarm is None
+    # A clock that was reset.
+    before = monitor.seconds
+    monitor.restart()
+    monitor.add(motion(50.0, 3))
+    assert monitor.seconds >= before + 45
 
 
 def test_a_jump_of_one_trajectory_is_no_shift():
