@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import fail, note, waiting_for
-from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.results import save_text
 from hand_eye_calib.results.calibration import Calibration
 
@@ -95,8 +95,6 @@ def _session_rig(directory: Path, result: "SessionResult") -> None:
         child = child.scaled(config.scale)
     sensors = {result.snapshot.parent_frame: parent, result.snapshot.child_frame: child}
     for name, other in result.others.items():
-        if other.config.child_measures not in ("auto", "poses"):
-            raise InputError(f"{name} has {other.config.child_measures}: a rig takes poses")
         frame = other.child_frame
         sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]
     options = config.to_options()

@@ -27,7 +27,6 @@ from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.records import Comparison
 from hand_eye_calib.session.goal import Goal
-from hand_eye_calib.text import amount
 
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
@@ -188,7 +187,9 @@ class SolveCycle:
         if result is newest:
             self.snapshot = with_options(self._submitted, self._certain)
         else:
-            result = replace(result, warnings=(*result.warnings, _why_kept(result, newest)))
+            kept = f"kept is the result of {result.n_poses} poses, as the newest is worse"
+            told = (*result.warnings, f"{kept}: {describe(newest)}")
+            result = replace(result, warnings=told)
         self.result, self._solved_at_s = self._with_findings(result), time.monotonic()
         self._publish(self.result)
         if not progress.is_faulty and progress.sentence:
@@ -305,40 +306,16 @@ def _result_state(result: Calibration, age_s: float) -> ResultState:
     )
 
 
-def _why_kept(kept: Calibration, newest: Calibration) -> str:
-    """Which result is kept, and what speaks against the newest one."""
-    if newest.reasons:
-        why = f"of that is said: {newest.headline}"
-    else:
-        worst = int(np.argmax(newest.sigmas / kept.sigmas))
-        dof = newest.observability[worst].name
-        before, now = (amount(dof, float(each.sigmas[worst])) for each in (kept, newest))
-        why = f"that knows {dof} to {now} only, this one to {before}"
-    xyz, rpy = _pose_in_words(newest)
-    return (
-        f"kept is the result of {kept.n_poses} poses, not the newest (of {newest.n_poses} poses, "
-        f"xyz = ({xyz}) m, rpy = ({rpy}) deg): {why}"
-    )
-
-
 def describe(calibration: Calibration) -> str:
     """One line for a log: whose pose in whose frame, how good, from how much."""
-    xyz, rpy = _pose_in_words(calibration)
-    sigmas = calibration.sigmas_printed
+    T, sigmas = calibration.T_parent_child, calibration.sigmas_printed
+    angles = np.degrees(se3.rotation_to_rpy(T[:3, :3]))
+    xyz, rpy = (", ".join(f"{each:.{n}f}" for each in v) for v, n in ((T[:3, 3], 4), (angles, 3)))
     mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
     deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
     return (
         f"{calibration.headline}. {calibration.child_frame} in {calibration.parent_frame}: "
         f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
         f"status {calibration.status.value}; {calibration.method} {calibration.reference}: "
-        f"{calibration.n_poses} poses, {calibration.n_pairs} pairs, "
-        f"{calibration.n_inliers} inliers"
-    )
-
-
-def _pose_in_words(calibration: Calibration) -> tuple[str, str]:
-    angles = np.degrees(se3.rotation_to_rpy(calibration.T_parent_child[:3, :3]))
-    return (
-        ", ".join(f"{value:.4f}" for value in calibration.T_parent_child[:3, 3]),
-        ", ".join(f"{value:.3f}" for value in angles),
+        f"{calibration.n_poses} poses, {calibration.n_pairs} pairs, {calibration.n_inliers} inliers"
     )

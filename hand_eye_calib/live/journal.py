@@ -89,8 +89,8 @@ def lock_directory(directory: Path) -> int | None:
 
 
 class SessionJournal:
-    """Takes poses in the executor's thread, writes them in its own. What cannot be written ends
-    the journal until the next session.
+    """Takes poses in the executor's thread, writes them in its own, which writes to the log too.
+    What cannot be written ends the journal until the next session; ``error`` says why.
 
     Parameters
     ----------
@@ -98,14 +98,8 @@ class SessionJournal:
     about : callable
         Gives what is known of each stream: options, topic, frame, origin.
     log : NodeLog
-        Written to from that thread, too.
     resumed : Journal, optional
         The session in the directory goes on; otherwise it is kept aside.
-
-    Attributes
-    ----------
-    error : str
-        Why it cannot be written; empty if it can.
 
     Raises
     ------
@@ -122,11 +116,11 @@ class SessionJournal:
     ) -> None:
         self.directory, self.error, self._log = directory, "", log
         self._lock = lock_directory(directory.parent)
-        self._make_about, self._about = about, about()
+        self._about = about
         self._poses: list[_Pose] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
-        self._jobs.put(partial(self._open, self._about, resumed))
+        self._jobs.put(partial(self._open, about(), resumed))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
@@ -139,18 +133,17 @@ class SessionJournal:
     def flush(self) -> None:
         """Hand what is new to the thread; to be called often."""
         poses, self._poses = self._poses, []
-        before, self._about = self._about, self._make_about()
         if self._jobs.qsize() > _MOST_WAITING and not self.error:
             self._give_up("the disk does not answer")
-        elif not self.error and (poses or self._about != before):
-            self._jobs.put(partial(self._write, poses, self._about))
+        elif not self.error:
+            self._jobs.put(partial(self._write, poses, self._about()))
 
     def begin(self) -> None:
         """Start a new session without poses; the one so far is kept aside."""
-        self._jobs.put(partial(self._write, self._poses, self._about))
-        self._poses, self._about, self.error = [], self._make_about(), ""
+        self.flush()
+        self.error = ""
         self._jobs.put(self._close)
-        self._jobs.put(partial(self._open, self._about))
+        self._jobs.put(partial(self._open, self._about()))
 
     def stop(self, timeout_s: float) -> None:
         """Write what is left and end the thread, unless the disk keeps it busy."""

@@ -13,14 +13,9 @@ _NUMBERS = re.compile(r"[\d.,+-]+")
 
 
 class NodeLog:
-    """Writes to a ROS logger; rclpy's own throttle cannot tell two topics apart.
-
-    Each method takes the text, and how often it may be written: texts that differ in their numbers
-    only are the same, and so are all with the same ``key``.
-
-    Parameters
-    ----------
-    logger : rclpy logger
+    """Writes to a ROS logger, whose own throttle cannot tell two topics apart. The methods take a
+    text, and how often it may be written: texts that differ in their numbers only are the same, and
+    so are all with the same ``key``.
     """
 
     def __init__(self, logger: Any) -> None:
@@ -32,7 +27,6 @@ class NodeLog:
         self._written_at_s.clear()
 
     # rclpy ties a place in the code to its severity: each method writes by itself.
-
     def debug(self, text: str) -> None:
         """Write what somebody looks for who has asked for it."""
         self._logger.debug(_escaped(text))

@@ -97,12 +97,10 @@ class LiveSession:
         ConfigError
             If nothing can be calibrated with what the other stream measures.
         """
-        if stream not in STREAMS:
-            engine = self.engines[stream]
-            engine.reconfigure(replace(engine.config, child_measures=measures))
-            return
+        if stream not in STREAMS and measures != "poses":
+            raise ConfigError(f"a rig takes poses; {stream} has {measures}")
         name = f"{stream}_measures"
-        if self._measures.get(name, "poses") != measures:
+        if stream in STREAMS and self._measures.get(name, "poses") != measures:
             measured = self._measures | {name: measures}
             _ = replace(self.calibrator.config, **measured).measured  # or it raises
             self._measures = measured
@@ -116,7 +114,7 @@ class LiveSession:
         """Put other options in force; the poses stay, and are to be solved again."""
         for name, engine in self.engines.items():
             if name != "child":
-                engine.reconfigure(_of_other(config, engine.config.child_measures))
+                engine.reconfigure(_of_other(config))
         self.calibrator.reconfigure(replace(config, **self._measures))
         self.has_new_poses = self._n_poses() > 0 and self._is_solved
 
@@ -213,14 +211,13 @@ class LiveSession:
         return about
 
 
-def _of_other(config: CalibratorConfig, measures: str = "auto") -> CalibratorConfig:
+def _of_other(config: CalibratorConfig) -> CalibratorConfig:
     """The options for a further child sensor: what is set for the child in numbers is not its."""
     of_child = {each.name for each in fields(config) if each.name.startswith(("prior_", "child_"))}
     numbers = ("time_offset", "scale")
     of_child |= {name for name in numbers if not isinstance(getattr(config, name), str)}
-    of_child -= {"child_measures"}
     defaults = {name: getattr(CalibratorConfig, name) for name in of_child}
-    return replace(config, child_measures=measures, given=config.given - of_child, **defaults)
+    return replace(config, given=config.given - of_child, **defaults)
 
 
 def output_path(directory: str, base: Path | None = None) -> Path:

@@ -84,9 +84,10 @@ def test_what_is_kept_is_answered_published_and_saved_and_says_why_it_is_not_the
     assert f"{kept.n_poses} poses, {kept.n_pairs} pairs" in text
     (warning,) = cycle.result.warnings
     assert warning in text
-    assert warning.startswith("kept is the result of 100 poses, not the newest (of 120 poses, xyz")
+    assert warning.startswith("kept is the result of 100 poses, as the newest is worse: ")
     assert f"{moved[0, 3]:.4f}" in warning
-    assert warning.endswith("that knows y to 1 cm only, this one to 5 mm")
+    assert "(5.0, 10.0, 5.0) mm" in warning
+    assert "120 poses" in warning
     assert cycle.published[-1] is cycle.result
     np.testing.assert_array_equal(cycle.result.T_parent_child, kept.T_parent_child)
     assert cycle.goal.progress.done
