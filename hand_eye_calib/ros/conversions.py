@@ -1,29 +1,18 @@
 """Between ROS messages and the poses of the engine."""
 
-from typing import Any, TypeVar
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import (
-    Point,
-    PointStamped,
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    Quaternion,
-    TransformStamped,
-    Vector3,
-)
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.results.calibration import Calibration
-
-_Triple = TypeVar("_Triple", Point, Vector3)
 
 # Of a publisher: who comes later gets the last message. Of a subscription: every publisher's last
 # message fits.
@@ -36,16 +25,11 @@ LATCHED, LISTENING = (
     for depth in (1, 1000)
 )
 
-# Messages that are read, the likeliest first.
-MESSAGES: dict[str, type[Any]] = {
-    "nav_msgs/msg/Odometry": Odometry,
-    "geometry_msgs/msg/PoseStamped": PoseStamped,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped,
-    "geometry_msgs/msg/TransformStamped": TransformStamped,
-    "sensor_msgs/msg/Imu": Imu,
-    "sensor_msgs/msg/NavSatFix": NavSatFix,
-    "geometry_msgs/msg/PointStamped": PointStamped,
-}
+
+def message_class(type_name: str) -> type[Any]:
+    """The class of messages of a type such as "nav_msgs/msg/Odometry"."""
+    package, _, name = type_name.split("/")
+    return getattr(import_module(f"{package}.msg"), name)
 
 
 def to_ns(stamp: Time) -> int:
@@ -81,8 +65,7 @@ def to_transform(calibration: Calibration, is_mounting: bool = False) -> Transfo
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = frame
     message.child_frame_id = calibration.child_frame
-    message.transform.translation = _xyz(Vector3, T)
-    message.transform.rotation = _quaternion(T)
+    _put(T, message.transform.translation, message.transform.rotation)
     return message
 
 
@@ -93,9 +76,9 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message = PoseWithCovarianceStamped()
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = calibration.parent_frame
-    message.pose.pose.position = _xyz(Point, calibration.T_parent_child)
-    message.pose.pose.orientation = _quaternion(calibration.T_parent_child)
-    covariance = covariance_about_parent_axes(calibration.T_parent_child, calibration.covariance)
+    T, pose = calibration.T_parent_child, message.pose.pose
+    _put(T, pose.position, pose.orientation)
+    covariance = covariance_about_parent_axes(T, calibration.covariance)
     message.pose.covariance = covariance.ravel().tolist()
     return message
 
@@ -114,11 +97,6 @@ def covariance_about_parent_axes(
     return np.asarray(to_parent @ cov_parent_child_in_child @ to_parent.T)
 
 
-def _xyz(kind: type[_Triple], T_target_source: FloatArray) -> _Triple:
-    x, y, z = T_target_source[:3, 3].tolist()
-    return kind(x=x, y=y, z=z)
-
-
-def _quaternion(T_target_source: FloatArray) -> Quaternion:
-    x, y, z, w = se3.to_quat_xyzw(T_target_source).tolist()
-    return Quaternion(x=x, y=y, z=z, w=w)
+def _put(T_target_source: FloatArray, place: Any, turn: Any) -> None:
+    place.x, place.y, place.z = T_target_source[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = se3.to_quat_xyzw(T_target_source).tolist()

@@ -11,18 +11,20 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from hand_eye_calib.config import CalibratorConfig, other_names
+from hand_eye_calib.config import POSE_TYPES, CalibratorConfig, other_names
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, unpack_stamp_ns
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.live.input import PoseInput, with_stamp
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.ros.conversions import LISTENING, MESSAGES, from_transform
+from hand_eye_calib.ros.conversions import LISTENING, from_transform, message_class
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
 from hand_eye_calib.text import counted
 
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+
+_TYPES = POSE_TYPES[1:]  # without auto
 
 # Messages taken in one callback beyond the first; services and timers have their turn then.
 _MOST_AT_ONCE = 50
@@ -68,9 +70,7 @@ class TopicInput(PoseInput):
         self.problem, self._n_publishers = self._why_deaf(publishers), len(publishers)
         is_wanted = self._wanted_type != "auto"
         offered = {each.topic_type for each in publishers}
-        usable = (
-            [self._wanted_type] if is_wanted else [each for each in MESSAGES if each in offered]
-        )
+        usable = [self._wanted_type] if is_wanted else [each for each in _TYPES if each in offered]
         if self._subscription is not None:
             return
         try:
@@ -84,7 +84,7 @@ class TopicInput(PoseInput):
         if offered and not usable:
             self._log.warning(
                 f"{self.topic} has type {', '.join(sorted(offered))}; expected "
-                f"{', '.join(MESSAGES)}: remap {self._relative_topic} to a topic with poses"
+                f"{', '.join(_TYPES)}: remap {self._relative_topic} to a topic with poses"
             )
 
     def describe_silence(self) -> str:
@@ -114,7 +114,7 @@ class TopicInput(PoseInput):
         callback: Any = on_message
         try:
             self._subscription = self._node.create_subscription(
-                MESSAGES[type_name],
+                message_class(type_name),
                 self._relative_topic,
                 callback,
                 _quick(),

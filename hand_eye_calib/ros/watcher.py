@@ -16,10 +16,11 @@ from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from hand_eye_calib.config import POSE_TYPES
 from hand_eye_calib.errors import printable
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.plain import from_plain
-from hand_eye_calib.ros.conversions import LATCHED, MESSAGES
+from hand_eye_calib.ros.conversions import LATCHED
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.text import counted
 from hand_eye_calib.watch.board import Board
@@ -88,7 +89,7 @@ class Watcher:
         with poses, for a person whose input has none.
         """
         found = self._node.get_topic_names_and_types()
-        poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in MESSAGES]
+        poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in POSE_TYPES]
         told = tuple(self._told(*each) for each in poses[:_MOST_TOPICS])
         self._board.topics = told or ("none is published here",)
         for topic, types in found:

@@ -16,6 +16,7 @@ from hand_eye_calib.live.state import (
     MountState,
     NodeState,
     ResultState,
+    SavedState,
 )
 from hand_eye_calib.results.records import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
@@ -192,11 +193,9 @@ def _result_of(state: NodeState) -> ResultState | None:
     return state.extrinsic.result if state.extrinsic else None
 
 
-def at_time(seconds: float) -> str:
-    """A time (seconds since 1970) as the clock on the wall has it, with the date if not today."""
-    then = datetime.fromtimestamp(seconds)
-    is_today = then.date() == datetime.now().date()
-    return then.strftime("%H:%M" if is_today else "%Y-%m-%d %H:%M")
+def _where(saved: SavedState) -> str:
+    """When, by the clock on the wall, and where the result was saved."""
+    return f"at {datetime.fromtimestamp(saved.at_s):%H:%M} in {saved.directory}"
 
 
 # -------------------------------------------------------------------- headline
@@ -216,26 +215,25 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
         (Tone.ACT, "NOT WATCHING", mount, Level.WARN),
     ]
     for tone, word, part, level in told:
-        if part is None or part.level is not level or (part is checks and checks.age_s is None):
-            continue
-        return tone, word, _sentence(part.text) + _ADVICE * (word == MOVED)
+        is_open = part is checks and checks is not None and checks.age_s is None
+        if part is not None and part.level is level and not is_open:
+            return tone, word, _sentence(part.text) + _ADVICE * (word == MOVED)
     if mount is not None:
         tone, word = (Tone.BUSY, "LEARNING") if mount.is_learning else (Tone.GOOD, "WATCHING")
         return tone, word, _sentence(mount.text)
     if at is None:
         return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
-    tone, word, sentence = Tone.BUSY, "GO ON", _sentence(at.text)
+    sentence = _sentence(at.text)
     if at.progress.is_faulty:  # the result was good, the streams no longer are
-        tone, word = Tone.ACT, "CHECK THE STREAMS"
-    elif at.progress.done:
+        return Tone.ACT, "CHECK THE STREAMS", sentence
+    if at.progress.done:
         moved = _moved(at.comparison)
-        tone, word = Tone.ACT if moved else Tone.GOOD, "DONE"
-        sentence = _of_done(state, moved, sentence)
-    elif not at.has_result:
-        word = "START"
-    elif at.level >= Level.WARN:
-        tone, word = Tone.ACT, "CHANGE THE MOTION"
-    return tone, word, sentence
+        return Tone.ACT if moved else Tone.GOOD, "DONE", _of_done(state, moved, sentence)
+    if not at.has_result:
+        return Tone.BUSY, "START", sentence
+    if at.level >= Level.WARN:
+        return Tone.ACT, "CHANGE THE MOTION", sentence
+    return Tone.BUSY, "GO ON", sentence
 
 
 def _of_done(state: NodeState, moved: str, sentence: str) -> str:
@@ -245,7 +243,7 @@ def _of_done(state: NodeState, moved: str, sentence: str) -> str:
     if state.saved is None:
         return sentence
     told = sentence.removesuffix(" Save.").removesuffix(" Stop and save.")
-    return f"{told} Saved at {at_time(state.saved.at_s)} in {state.saved.directory}."
+    return f"{told} Saved {_where(state.saved)}."
 
 
 def _moved(comparison: Comparison | None) -> str:
@@ -262,8 +260,7 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
     if state.mount is not None:
         return Tone.ACT, "ENDED", "The node has ended: nobody watches the mount."
     if state.saved is not None:
-        when = at_time(state.saved.at_s)
-        text = f"The node has ended. The result was saved at {when} in {state.saved.directory}."
+        text = f"The node has ended. The result was saved {_where(state.saved)}."
         return Tone.GOOD, "ENDED", text
     is_lost = _result_of(state) is not None
     why = "is not saved: output_directory is not set" if is_lost else "was not there yet"
@@ -398,5 +395,4 @@ def _result(state: NodeState) -> Iterator[Line]:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
         yield Line(_TONES[broadcast], "on /tf_static", text)
     if state.saved is not None:
-        where = f"at {at_time(state.saved.at_s)} in {state.saved.directory}: {state.saved.text}"
-        yield Line(Tone.GOOD, "saved", where)
+        yield Line(Tone.GOOD, "saved", f"{_where(state.saved)}: {state.saved.text}")

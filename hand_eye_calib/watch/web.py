@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -101,8 +102,12 @@ class WebServer(ThreadingHTTPServer):
 
     def addresses(self) -> list[str]:
         """What to type into a browser, that for other computers first."""
-        hosts = [self._host] if self._host else [own_address(), "localhost"]
-        return [f"http://{host}:{self.port}/?key={self.key}" for host in hosts if host]
+        hosts = [self._host or "localhost"]
+        probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        with probe, contextlib.suppress(OSError):  # of a computer without a network
+            probe.connect(("192.0.2.1", 9))  # sends nothing; asks which way it would go
+            hosts[:0] = [] if self._host else [str(probe.getsockname()[0])]
+        return [f"http://{host}:{self.port}/?key={self.key}" for host in hosts]
 
     def stop(self) -> None:
         """Close all connections."""
@@ -112,16 +117,6 @@ class WebServer(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of browsers that have gone."""
-
-
-def own_address() -> str:
-    """Address of this computer on its network; empty if it has none."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing; only asks which way it would go
-        except OSError:
-            return ""
-        return str(probe.getsockname()[0])
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -148,12 +143,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _saved(self, name: str) -> bytes:
         """A file of the saved result, if it is on this computer; links are not followed."""
         directory = self.server.board.view(time.monotonic()).saved_in
-        try:
-            file = os.open(os.path.join(directory, name), os.O_RDONLY | os.O_NOFOLLOW)
-        except OSError:
-            return b""
-        with os.fdopen(file, "rb") as opened:
-            return opened.read() if directory else b""
+        file = Path(directory, name)
+        return file.read_bytes() if directory and file.is_file() and not file.is_symlink() else b""
 
     def do_POST(self) -> None:
         self.close_connection = True  # a body, if there is one, is not read
@@ -210,19 +201,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _events(self) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""
-        sent, sent_s, board = "", -_SEND_S, self.server.board
+        sent, sent_s, board = "", 0.0, self.server.board
         while not self.server.stopping.wait(_LOOK_S if sent else 0.0):
             now_s = time.monotonic()
             view = board.view(now_s)
             there = [name for name in SAVED if os.path.isfile(os.path.join(view.saved_in, name))]
-            made = fragment(view, there if view.saved_in else ())
-            if made != sent:
-                one_line = made.replace("\r", " ").replace("\n", " ")
-                yield f"data: {one_line}\n\n".encode()
+            made = " ".join(fragment(view, there if view.saved_in else ()).splitlines())
+            if made != sent or now_s - sent_s >= _SEND_S:
+                yield f"data: {made if made != sent else ''}\n\n".encode()
                 sent, sent_s = made, now_s
-            elif now_s - sent_s >= _SEND_S:
-                yield b"data:\n\n"
-                sent_s = now_s
 
 
 def _prior(axis: str, value: str, sigma: str) -> str:
