@@ -17,11 +17,8 @@ from hand_eye_calib.ros import conversions
 FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
 
 
-@pytest.mark.parametrize(
-    "use_sim_time", ["false", "true"]
-)  # true, and no /clock: as with a bag that is paused
-def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer, use_sim_time):
-    node = start_node("-p solve_period:=0.2", f"-p use_sim_time:={use_sim_time}", *RELIABLE_INPUTS)
+def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
+    node = start_node("-p solve_period:=0.2", *RELIABLE_INPUTS)
     extrinsics = peer.listen(TransformStamped, "extrinsic")
     poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
     peer.feed(peer.publishers(), *drive())

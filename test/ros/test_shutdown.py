@@ -18,10 +18,10 @@ SOON_S = 5.0
 COMMAND = "import sys"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+# Busy, and waiting for nothing but messages.
 @pytest.mark.parametrize(
-    "solve_period", [0.1, 1000.0]
-)  # busy, and waiting for nothing but messages
+    ("number", "solve_period"), [(signal.SIGINT, 0.1), (signal.SIGTERM, 1000.0)]
+)
 def test_signal_ends_the_node_cleanly(start_node, peer, number, solve_period):
     start = time.monotonic()
     node = start_node(f"-p solve_period:={solve_period}", before=COMMAND)
@@ -82,7 +82,7 @@ def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(start_node
     node = start_node(
         "-p solve_period:=1000.0",
         *RELIABLE_INPUTS,
-        before="from hand_eye_calib.live import processes as p; p.HANGS_AFTER_S = 5.0",
+        before="from hand_eye_calib.live import solving as s; s.HANGS_AFTER_S = 5.0",
     )
     assert peer.trigger("reset").success
     pid = node.process.pid
@@ -90,6 +90,6 @@ def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(start_node
     answer = peer.trigger("solve")
     what = "the solving process had no answer after 5 s and was killed"
     assert (answer.success, what in answer.message) == (False, True)
-    node.wait_for_log(f"{what}; it was started again")
+    node.wait_for_log(what, "it was started again")
     answer, _ = peer.solve(peer.publishers(), *drive())
     assert answer.success
