@@ -35,7 +35,7 @@ _MAX_ROUNDS, _SETTLED_S = 8, 2e-5
 
 # A rate of the clock is known to this beforehand (75 ppm are usual for USB devices); one beyond so
 # many standard deviations is there. Over this many blocks of time it is a line.
-_RATE_PRIOR, PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
+_RATE_PRIOR, _PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
 
 # Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
 # stream if those are longer.
@@ -225,7 +225,7 @@ def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRa
     variance = float(weights @ residuals_s**2) / (len(offsets_s) - 2) / spread
     total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
     sigma = float(np.sqrt(variance))
-    is_used = abs(total) > PLAIN_RATE * sigma
+    is_used = abs(total) > _PLAIN_RATE * sigma
     return replace(before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used)
 
 

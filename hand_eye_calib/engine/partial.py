@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.time_offset import PLAIN_RATE
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import assess_lever_arm, assess_rotation
 from hand_eye_calib.assessment.prior import Fused, fuse
@@ -31,11 +30,10 @@ from hand_eye_calib.gls.increments import (
     without_rate_bias,
 )
 from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
-from hand_eye_calib.gls.windows import unexplained_share
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
-from hand_eye_calib.results.records import ClockRate, RateBias
+from hand_eye_calib.results.records import RateBias
 
 # Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
 # at most, of two 0.5 and more.
@@ -128,7 +126,6 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
     offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
-    middle_ns = int(stamps_ns[0] + (stamps_ns[-1] - stamps_ns[0]) // 2)
     return _calibration(
         solution,
         fused,
@@ -138,12 +135,6 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         T_method=T,
         floor=2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
         time_offset_s=offset_s,
-        clock_rate=ClockRate(
-            ppm=1e6 * sign * solution.clock_rate,
-            sigma_ppm=1e6 * solution.clock_rate_sigma,
-            at_ns=middle_ns - round(offset_s * 1e9),
-            is_used=abs(solution.clock_rate) > PLAIN_RATE * solution.clock_rate_sigma,
-        ),
         scale=given * scale,
         scale_sigma=solution.scale_sigma * scale**2,
         findings=findings,
@@ -159,7 +150,7 @@ def _of_path(
     is_child: bool,
 ) -> tuple[Finding, ...]:
     """A finding if the path of the positions is not that of the odometry, or in other units."""
-    share = unexplained_share(poses, positions, solution.lever_arm, solution.scale)
+    share = of_positions.unexplained_share(poses, positions, solution.lever_arm, solution.scale)
     if share < _SUSPECT_PATH:
         return ()
     axes = fused.assessment.observability[:3]
@@ -170,7 +161,7 @@ def _of_path(
     else:
         with contextlib.suppress(np.linalg.LinAlgError):
             scaled = of_positions.solve(stamps_ns, poses, positions, True)
-            left = unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
+            left = of_positions.unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
             scale = scaled.scale if is_child else 1.0 / scaled.scale
             found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
             if left < _UNRELATED_PATH and found:

@@ -6,13 +6,14 @@ world of the positions: a latent rotation of each pose that may be anything, but
 to pose as the odometry says, up to its drift. So this is the state space of the adaptive estimator
 (:mod:`~hand_eye_calib.gls.state_space`) with a white rotation error without bounds; the
 rotations are updated from what the positions say of them, until they stay. The sensor's frame has
-the axes of the other one by convention: ``X = (I, l)``.
+the axes of the other one by convention: ``X = (I, l)``. The search starts where windows of the
+recording, each aligned by itself, fit best.
 
 Errors that act like a lever arm are parameters beside it, known beforehand to what sensors have: a
-scale and a direction of the odometry's path, a time offset and its rate. What the positions answer
-to acceleration is in the covariance alone: on recorded drones even its sign depends on the
-frequency. A drone tilts to accelerate, so that positions which answer by kappa (s^2), as smoothed
-ones do, move the vertical lever arm by kappa g.
+scale and a direction of the odometry's path, and a time offset. What the positions answer to
+acceleration is in the covariance alone: on recorded drones even its sign depends on the frequency.
+A drone tilts to accelerate, so that positions which answer by kappa (s^2), as smoothed ones do,
+move the vertical lever arm by kappa g.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.increments import (
-    BIAS,
     N_SYSTEMATIC,
     SCALE,
     TIME,
@@ -41,7 +41,6 @@ from hand_eye_calib.gls.noise_model import (
     LOWEST_VARIANCE,
     N_FAST,
     ROTATION,
-    TRANSLATION,
     WALK_ROTATION,
     WALK_TRANSLATION,
     Extent,
@@ -54,36 +53,29 @@ from hand_eye_calib.gls.problem import known_products, sample
 from hand_eye_calib.gls.solution import LeverArmSolution
 from hand_eye_calib.gls.stages import rough_levels
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
-from hand_eye_calib.gls.windows import aligned, first_lever_arm
 
-# Parameters that poses do not have: a rate of the clock, and what the positions less the odometry
-# are per m/s^2 of acceleration (s^2). Those in the model.
-CLOCK, RESPONSE = N_SYSTEMATIC, N_SYSTEMATIC + 1
+# A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
+# acceleration (s^2). Those in the model, and the columns of the lever arm and of those that it is
+# solved with: all but the last.
+RESPONSE = N_SYSTEMATIC
 _SHARED = [SCALE, 1, 2, 3, TIME]
-_COLUMNS = [*_SHARED, CLOCK, RESPONSE]
-# Columns of the lever arm and of the parameters that it is solved with: all but the last.
-_SOLVED = list(range(2 + len(_COLUMNS)))
+_SOLVED = list(range(3 + len(_SHARED)))
 
 # Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
 _ANY_ROTATION = float(np.log(100.0))
-_LEAST_WALK, _MOST_WALK, _FIRST_WALK = np.log(1e-12), np.log(0.1), np.log(1e-6)
-_LEAST_WHITE_SHARE, _LEAST_WALK_SHARE = -14.0, -12.0
+_LEAST_WALK, _FIRST_WALK, _MOST_WALK = np.log([1e-12, 1e-6, 0.1])
 
-# Rounds of updating the orientations; those after which noise levels are fitted, errors that last
-# are looked for, and outliers; X moves by less than this share of its sigma in the last.
-_ROUNDS, _FITS, _LASTING, _OUTLIERS, _QUALITY = 10, (1, 2, 4, 6), 2, (3, 5), (2, 4, 5)
-_SETTLED = 0.1
+# Rounds of updating the orientations, and those before which noise levels are fitted; X moves by
+# less than this share of its sigma in the last. An axis that is not known to this (m) need not
+# settle: noise moves it on and on.
+_ROUNDS, _FITS, _SETTLED, _UNKNOWN_M = 10, (1, 3, 5), 0.1, 0.2
 
-# Standard deviations beforehand: of the lever arm (m), of the time offset (s) and its rate, of the
-# scale of the odometry, known or not, of its direction (rad), and of what the positions answer to
-# acceleration (s^2). Accelerations are those over this time (s).
-_LONG_M, _TIME_SIGMA_S, _CLOCK_SIGMA = 10.0, 1.0, 1e-4
-_SCALE_SIGMA, _ANY_SCALE = 0.01, 1.0
+# Standard deviations beforehand: of the lever arm (m), of the time offset (s), of the scale of the
+# odometry, known or not, of its direction (rad), and of what the positions answer to acceleration
+# (s^2). Accelerations are those over this time (s).
+_LONG_M, _TIME_SIGMA_S, _SCALE_SIGMA, _ANY_SCALE = 10.0, 1.0, 0.01, 1.0
 _DIRECTION_SIGMA, _RESPONSE_SIGMA = float(np.radians(0.15)), 0.002
 _ACCELERATING_S, _NEAR = 0.2, 2.5
-
-# An axis that is not known to this (m) need not settle: noise moves it on and on.
-_UNKNOWN_M = 0.2
 
 # An error that lasts is part of the model if the loss is so much lower with it.
 _LEAST_GAIN = 4.0
@@ -95,7 +87,14 @@ _MOST_POSES, _JUMP_FACTOR = 300, 10.0
 # The quality of a solution is that of so many positions around; those whose squared errors exceed
 # that of the best quarter of the recording by this factor are left out: they would hardly count,
 # and their errors last.
-_NEIGHBOURS, _USUAL, _WORSE = 11, 0.25, 16.0
+_NEIGHBOURS, _WORSE = 11, 16.0
+
+# Poses of the windows that are aligned by themselves for the start. The first lever arm is drawn to
+# zero by so much where the motion does not tell it.
+_WINDOW, _START_STEPS, _DRAWN = 200, 50, 1e-6
+
+# Parts of a recording whose paths are compared by themselves.
+_PARTS = 10
 
 
 def solve(
@@ -113,22 +112,20 @@ def solve(
     with_scale : bool
         Whether to estimate the scale between both worlds.
     """
-    lever_arm, scale = first_lever_arm(Ts_pw_p, positions, with_scale)
+    lever_arm, scale, rotations = _start(Ts_pw_p, positions, with_scale)
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
-    Ts = aligned(Ts_pw_p, scale * positions, lever_arm)
+    Ts = se3.from_rotation_translation(rotations, scale * positions)
     state = _State.first(Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
     for number in range(_ROUNDS):
-        state = state.fitted() if number in _FITS else state
-        state = state.with_lasting_error() if number == _LASTING else state
-        posterior = state.posterior()
-        if number in _OUTLIERS:
+        if number in _FITS:
+            state = state.fitted(("body", "world") if number == _FITS[0] else ())
+        posterior = Posterior(state.space(), state.levels)
+        if number + 1 in _FITS[1:]:
             state = state.with_outliers(posterior)
-        if number in _QUALITY:
-            state = state.with_quality(posterior)
         normal = NormalEquations(selected(posterior.products, _SOLVED))
         step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
         is_settled = (np.abs(step[:3]) < _SETTLED * sigmas) | (sigmas > _UNKNOWN_M)
-        converged = number > max(_FITS) and bool(is_settled.all())
+        converged = number > _FITS[-1] and bool(is_settled.all())
         if converged:
             break
         state = state.moved(posterior, step)
@@ -138,8 +135,8 @@ def solve(
 @dataclass(frozen=True, kw_only=True)
 class _State:
     """Where the search stands. The child's poses are its ``positions`` (N, 3), bridged where they
-    are left out, with the orientations known so far. ``parameters`` are (10,), of which the scale
-    is known to ``scale_sigma`` beforehand. ``boost`` (n,) are factors of the walk's variance, above
+    are left out, with the orientations known so far. ``parameters`` are (9,), of which the scale is
+    known to ``scale_sigma`` beforehand. ``boost`` (n,) are factors of the walk's variance, above
     1 at jumps; those around positions that are ``worse`` (N,) are far less precise than the best.
     """
 
@@ -207,34 +204,21 @@ class _State:
 
     def linearised(self) -> Linearisation:
         """Increments between poses, with the columns of the lever arm and of the parameters."""
-        streams, course = self.streams, self.course
-        away_s = streams.stamps_s - 0.5 * self.model.extent.duration_s
-        drifting = away_s[:, None] * course.twists
-        answering = _accelerations(streams, self.X)
-        moved = streams.Ts_cw_c @ se3.exp(self.parameters[CLOCK] * drifting)
-        poses = replace(streams, Ts_cw_c=moved)
-        found = linearise(poses, course, self.X, self.parameters[:CLOCK], _SHARED)
-        more = [_by_motion(found, each) for each in (drifting, answering)]
-        found = found.with_columns(np.concatenate(more, axis=2))
+        course, moving = self.course, _accelerations(self.streams, self.X)
+        found = linearise(self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED)
+        answering = turned(found.adjoints, moving[:-1]) - moving[1:]
+        found = found.with_columns(answering[:, :, None])
         return replace(found, columns=np.delete(found.columns, [3, 4, 5], axis=2))
-
-    def _known(self) -> FloatArray:
-        """Products (p + 1, p + 1) that say how large lever arm and parameters may be."""
-        sigmas = np.empty(RESPONSE + 1)
-        sigmas[SCALE], sigmas[BIAS], sigmas[TIME] = (
-            self.scale_sigma,
-            _DIRECTION_SIGMA,
-            _TIME_SIGMA_S,
-        )
-        sigmas[CLOCK], sigmas[RESPONSE] = _CLOCK_SIGMA, _RESPONSE_SIGMA
-        values = np.r_[self.lever_arm, self.parameters[_COLUMNS]]
-        weights = np.r_[np.full(3, _LONG_M), sigmas[_COLUMNS]] ** -2.0
-        return known_products(range(len(values)), values, weights, len(values) + 1)
 
     def space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of all poses: without a rotation to estimate, with orientations that may be
         anything, and with a walk that is the odometry's.
         """
+        sigmas = [_LONG_M] * 3 + [self.scale_sigma] + [_DIRECTION_SIGMA] * 3
+        sigmas += [_TIME_SIGMA_S, _RESPONSE_SIGMA]
+        values = np.r_[self.lever_arm, self.parameters[[*_SHARED, RESPONSE]]]
+        n = len(values)
+        known = known_products(range(n), values, np.array(sigmas) ** -2.0, n + 1)
         space = (model or self.model).state_space(
             self.streams,
             self.linearised(),
@@ -242,7 +226,7 @@ class _State:
             self.X,
             np.where(self.left_out, 0.0, 1.0),
             np.zeros(len(self.boost), dtype=bool),
-            self._known(),
+            known,
         )
         to_child = se3.adjoint(se3.inverse(self.X))
         translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
@@ -267,39 +251,26 @@ class _State:
             worse=self.worse[kept],
         ).space(model)
 
-    def posterior(self) -> Posterior:
-        """Of all poses."""
-        return Posterior(self.space(), self.levels)
-
-    def fitted(self) -> _State:
-        """With noise levels fitted."""
-        space, prior = self.sampled_space(), _prior(self.model, self.levels)
-        return replace(self, levels=reml.fit(space, self.levels, prior)[0].levels)
-
-    def with_lasting_error(self) -> _State:
-        """With an error of the positions that lasts, fixed to the body or to the world, if the data
-        ask for it.
+    def fitted(self, kinds: tuple[str, ...] = ()) -> _State:
+        """With noise levels fitted, and with an error of the positions that lasts, of one of these
+        kinds, if the data ask for it.
         """
-        fits = []
-        for kind in ("body", "world"):
-            model, levels = self.model.with_lasting([Slow(kind, "translation")], self.levels)
-            found, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
-            fits.append((model, found))
-        model, fit = min(fits, key=lambda each: each[1].loss)
-        before = Posterior(self.sampled_space(), self.levels).loss
-        if before - fit.loss < _LEAST_GAIN:
-            return self
-        return replace(self, model=model, levels=fit.levels)
+        fit, _ = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
+        best, loss = replace(self, levels=fit.levels), fit.loss - _LEAST_GAIN
+        for kind in kinds:
+            model, levels = self.model.with_lasting([Slow(kind, "translation")], fit.levels)
+            rival, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
+            if rival.loss < loss:
+                best, loss = replace(self, model=model, levels=rival.levels), rival.loss
+        return best
 
     def with_outliers(self, posterior: Posterior) -> _State:
-        """With jumps, which are large steps of the walk, and positions wrong by themselves."""
+        """With jumps, which are large steps of the walk, positions wrong by themselves, and
+        positions left out if those around are clearly worse than the rest.
+        """
         of_walk, of_white = surprises(posterior, self.left_out)
         found = judged(self.outliers, of_walk, of_white, with_spikes=True)
         boost = np.where(found.jumps, np.maximum(_JUMP_FACTOR * of_walk, self.boost), 1.0)
-        return replace(self, outliers=found, boost=boost)
-
-    def with_quality(self, posterior: Posterior) -> _State:
-        """With positions left out if those around are clearly worse than the rest."""
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
@@ -307,7 +278,8 @@ class _State:
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
-        return replace(self, streams=replace(self.streams, Ts_cw_c=Ts_cw_c), worse=worse)
+        streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
+        return replace(self, outliers=found, boost=boost, streams=streams, worse=worse)
 
     def moved(self, posterior: Posterior, step: FloatArray) -> _State:
         """After a step, with the orientations that the positions ask for."""
@@ -315,7 +287,7 @@ class _State:
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
         parameters = self.parameters.copy()
-        parameters[_COLUMNS[:-1]] += step[3:]
+        parameters[_SHARED] += step[3:]
         return replace(
             self,
             streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
@@ -331,26 +303,16 @@ def _worse(squares: FloatArray, least: float = LOWEST_VARIANCE) -> BoolArray:
     window = np.ones(min(_NEIGHBOURS, len(squares)))
     around = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
-    usual = max(float(np.quantile(around / counts, _USUAL)), least)
+    usual = max(float(np.quantile(around / counts, 0.25)), least)
     return np.asarray(around > _WORSE * usual * counts)
-
-
-def _by_motion(linearisation: Linearisation, moving: FloatArray) -> FloatArray:
-    """Column (n, 6, 1) of an error that moves poses by ``exp(-moving)``, (N, 6)."""
-    return (turned(linearisation.adjoints, moving[:-1]) - moving[1:])[:, :, None]
 
 
 def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
     """What is known of log levels beforehand, for a search from these."""
     prior = model.prior(levels)
-    lower, upper = prior.lower.copy(), prior.upper.copy()
-    total = np.logaddexp(levels[WALK_TRANSLATION], levels[TRANSLATION] + np.log(2.0))
-    least = np.log(LOWEST_VARIANCE)
-    lower[TRANSLATION] = max(least, total + _LEAST_WHITE_SHARE)
-    lower[WALK_TRANSLATION] = max(least, total + _LEAST_WALK_SHARE)
-    lower[ROTATION] = upper[ROTATION] = _ANY_ROTATION
-    lower[WALK_ROTATION], upper[WALK_ROTATION] = _LEAST_WALK, _MOST_WALK
-    return replace(prior, lower=lower, upper=upper)
+    prior.lower[ROTATION] = prior.upper[ROTATION] = _ANY_ROTATION
+    prior.lower[WALK_ROTATION], prior.upper[WALK_ROTATION] = _LEAST_WALK, _MOST_WALK
+    return prior
 
 
 def _solution(
@@ -362,12 +324,11 @@ def _solution(
     # With the answer to acceleration, and by what it would move the lever arm.
     whole = posterior.normal
     covariance, shift = max(misfit, 1.0) * whole.covariance, (whole.step[:-1] - normal.step)[:3]
-    sigmas = np.zeros(RESPONSE + 1)
-    sigmas[_COLUMNS] = np.sqrt(np.diag(covariance)[3:])
+    sigmas, parameters = np.zeros(RESPONSE + 1), state.parameters.copy()
+    sigmas[[*_SHARED, RESPONSE]] = np.sqrt(np.diag(covariance)[3:])
+    parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], whole.step[-1]]
     # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
     lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
-    parameters = state.parameters.copy()
-    parameters[_COLUMNS] += np.r_[normal.step[3:], whole.step[-1]]
     return LeverArmSolution(
         lever_arm=state.lever_arm + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
@@ -375,8 +336,6 @@ def _solution(
         parameters=parameters,
         parameter_sigmas=sigmas,
         unit=first_scale,
-        clock_rate=-float(parameters[CLOCK]),
-        clock_rate_sigma=float(sigmas[CLOCK]),
         model=state.model,
         levels=state.levels,
         worse=state.worse,
@@ -394,19 +353,71 @@ def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:
     either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
     """
     path, stamps_s = (streams.Ts_pw_p @ X)[:, :3, 3], streams.stamps_s
-    found = np.zeros((len(path), 6))
-    interval_s = float(np.median(np.diff(stamps_s)))
-    span = max(round(_ACCELERATING_S / interval_s), 1)
-    at = np.arange(2 * span, len(path) - 2 * span)
-    times_s, places = (
-        np.stack([each[at + step * span] for step in (-2, -1, 1, 2)]) for each in (stamps_s, path)
-    )
-    before, after = (
-        (places[k + 1] - places[k]) / (times_s[k + 1] - times_s[k])[:, None] for k in (0, 2)
-    )
-    apart_s = 0.5 * (times_s[3] + times_s[2] - times_s[1] - times_s[0])
-    is_near = apart_s < _NEAR * 3 * span * interval_s
-    back = np.swapaxes(streams.Ts_pw_p[at, :3, :3], 1, 2)
-    of_body = turned(back, (after - before) / apart_s[:, None])
-    found[at, :3] = np.where(is_near[:, None], of_body, 0.0)
+    found, interval_s = np.zeros((len(path), 6)), float(np.median(np.diff(stamps_s)))
+    k = max(round(_ACCELERATING_S / interval_s), 1)
+    if len(path) <= 4 * k:
+        return found
+    velocities = (path[k:] - path[:-k]) / (stamps_s[k:] - stamps_s[:-k])[:, None]
+    spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
+    changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
+    back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
+    is_near = spans_s < _NEAR * 4 * k * interval_s
+    found[2 * k : -2 * k, :3] = np.where(is_near, turned(back, changes), 0.0)
     return found
+
+
+def _start(
+    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool
+) -> tuple[FloatArray, float, FloatArray]:
+    """The lever arm (3,) and the scale, if it is asked for, that fit windows best, of which bad
+    ones count less; and the rotations (N, 3, 3) of the other sensor in the world of the positions,
+    window by window.
+    """
+    lever_arm, scale = np.zeros(3), 1.0
+    whole = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
+    size = min(_WINDOW, len(positions))
+    axes, path, measured = (_windows(values, size) for values in whole)
+    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
+    for _ in range(_START_STEPS):
+        predicted = axes @ lever_arm + path
+        turns = _rotations(measured, predicted)
+        rotated = measured @ turns
+        if with_scale:
+            shares = (rotated * predicted).sum(axis=(1, 2)) / (rotated**2).sum(axis=(1, 2))
+            scale = float(np.median(shares))
+        residuals = scale * rotated - path
+        errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
+        weights = 1.0 / (1.0 + (errors / (np.median(errors) + 1e-12)) ** 2)
+        pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
+        before = lever_arm
+        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
+        if np.abs(lever_arm - before).max() < 1e-6:
+            break
+    of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
+    return lever_arm, scale, turns[of_pose] @ Ts_pw_p[:, :3, :3]
+
+
+def unexplained_share(
+    Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray, scale: float
+) -> float:
+    """Share of the path of positions (N, 3) that the poses (N, 4, 4) and a lever arm do not
+    explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
+    """
+    predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
+    size = max(len(positions) // _PARTS, min(_PARTS, len(positions)))
+    expected, measured = (_windows(path, size) for path in (predicted, scale * positions))
+    residuals = measured @ _rotations(measured, expected) - expected
+    left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))
+    return float(np.sqrt(np.median(left) / np.median(whole))) if np.median(whole) else 1.0
+
+
+def _windows(values: FloatArray, size: int) -> FloatArray:
+    """Values (N, ...) of windows of a size, (n, size, ...), each less its mean."""
+    whole = len(values) // size * size
+    windows = values[:whole].reshape(-1, size, *values.shape[1:])
+    return windows - windows.mean(axis=1, keepdims=True)
+
+
+def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of windows, centred."""
+    return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))

@@ -273,8 +273,6 @@ class LeverArmSolution(ModelSolution):
         Under the model, misfit accounted for.
     response : (float, float)
         What positions less odometry are per m/s^2 of acceleration, s^2, and its sigma.
-    clock_rate, clock_rate_sigma : float
-        By how much the time offset grows each second.
     worse : (N,) bool array
         Positions that are left out, for those around are far less precise than the best.
     """
@@ -282,8 +280,6 @@ class LeverArmSolution(ModelSolution):
     lever_arm: FloatArray
     covariance: FloatArray
     response: tuple[float, float]
-    clock_rate: float
-    clock_rate_sigma: float
     worse: BoolArray
 
     @property

@@ -38,19 +38,6 @@ def recorded(n_poses=300, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
     return Trajectory(stamps_ns, np.array(odometry), "lidar", "odom"), child
 
 
-def swaying_poses(count, seed):
-    """Poses of a body that sways slowly about all axes, many per period."""
-    random = np.random.default_rng(seed)
-    phases, hertz = random.uniform(0, 6, (6, 1, 3)), random.uniform(0.1, 0.5, (6, 1, 3))
-    sizes = random.normal(size=(6, 1, 3)) * np.repeat([0.004, 0.01], 3)[:, None, None]
-    waves = sizes * np.sin(0.2094 * hertz * np.arange(count)[:, None] + phases)
-    twists = np.concatenate([waves[:3].sum(axis=0), waves[3:].sum(axis=0)], axis=1)
-    poses = [np.eye(4)]
-    for motion in se3.exp(twists[1:]):
-        poses.append(poses[-1] @ motion)
-    return np.array(poses)
-
-
 @pytest.fixture(scope="module")
 def streams():
     return recorded()
@@ -100,13 +87,6 @@ class TestLeverArm:
         assert "solved with time_offset estimate" in found.warnings[0]
         assert found.time_offset_s == pytest.approx(7.31, abs=0.01)
         assert np.abs(distances(found)).max() < 4.0
-
-    def test_the_rate_of_a_clock_is_found_with_its_sigma(self):
-        parent, child = recorded(noise_m=0.002, poses=swaying_poses(1500, seed=4))
-        slow = child.shifted(0.02, -2e-4, int(child.stamps_ns[750]))
-        rate = hec.calibrate(parent, slow).clock_rate
-        assert abs(rate.ppm - 200.0) < 4.0 * rate.sigma_ppm
-        assert rate.sigma_ppm < 40.0
 
     def test_a_drone_whose_positions_are_smoothed_knows_its_height_no_better(self):
         """It tilts to accelerate, so that 5 mm per m/s^2 look like 49 mm of height."""
