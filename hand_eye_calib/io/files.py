@@ -10,20 +10,14 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.limits import LARGEST_TEXT
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)
-
-
 def open_regular(path: str | Path) -> BufferedReader:
-    """Open a file for reading.
-
-    Raises
-    ------
-    InputError
-        If it cannot be opened, or is a pipe or a device, for which reading may wait for ever.
+    """Open a file for reading; an InputError if that is not possible, or it is a pipe or a device,
+    for which reading may wait for ever.
     """
     try:
-        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
+        file = open(  # noqa: SIM115
+            path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)
+        )
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -33,12 +27,8 @@ def open_regular(path: str | Path) -> BufferedReader:
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
-    """Read a whole file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is larger than ``largest`` bytes; one line that names the file.
+    """Read a whole file; an InputError if that is not possible, or it is larger than ``largest``
+    bytes.
     """
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > largest:
@@ -57,20 +47,12 @@ def read_text(path: str | Path, expected: str, largest: int = LARGEST_TEXT) -> s
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
-    """Write files, each in one step, once all of them are on the disk under other names.
+    """Write files, each in one step, once all of them are on the disk under other names. Text is
+    written in UTF-8.
 
     A reader sees the old file or the new one, never half of it. A symbolic link is replaced by the
-    file; what it led to stays as it is.
-
-    Parameters
-    ----------
-    contents : mapping of pathlib.Path to str or bytes
-        Text is written in UTF-8.
-
-    Raises
-    ------
-    OSError
-        If one cannot be written, with its name; what was there stays.
+    file; what it led to stays as it is. If one cannot be written, what was there stays; the OSError
+    has its name.
     """
     temporaries = {
         path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}") for path in contents

@@ -16,12 +16,8 @@ _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
 
 
 class LocalOrigin:
-    """The first position of a stream, from which the others count.
-
-    Attributes
-    ----------
-    geodetic : tuple of 3 floats or None
-        Its latitude and longitude (rad) and height (m), if it is known.
+    """The first position of a stream, from which the others count: ``geodetic`` is its latitude
+    and longitude (rad) and height (m), if it is known.
     """
 
     def __init__(self) -> None:

@@ -50,7 +50,14 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     """
     path = Path(text)
     if not os.path.exists(text):
-        T = _of_numbers(text)
+        try:
+            values = parse_pose("installed", text)
+        except ConfigError as error:
+            raise ConfigError(
+                "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or six "
+                f"numbers in m and rad: {error}"
+            ) from None
+        T = se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
         return lambda parent_frame, child_frame: Extrinsic(T, text)
     if (path / FILE_NAME).exists():
         path = path / FILE_NAME
@@ -69,12 +76,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
 def stated(
     find: Callable[[str, str], FloatArray], origin: str, parent_frame: str, child_frame: str
 ) -> Extrinsic:
-    """The installed pose that a source finds by the names of both frames.
-
-    Raises
-    ------
-    InputError
-        If it does not; the message begins with the origin.
+    """The installed pose that a source finds by the names of both frames; if it does not, an
+    InputError that begins with the origin.
     """
     try:
         return Extrinsic(find(parent_frame, child_frame), origin)
@@ -88,17 +91,6 @@ def frames_of_bag(path: str | Path) -> FrameTree:
 
     with PoseBag(path) as bag:
         return bag.static_frames
-
-
-def _of_numbers(text: str) -> FloatArray:
-    try:
-        values = parse_pose("installed", text)
-    except ConfigError as error:
-        raise ConfigError(
-            "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or six "
-            f"numbers in m and rad: {error}"
-        ) from None
-    return se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
 
 
 def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
@@ -132,18 +124,12 @@ def _document(path: Path) -> Any:
 
 
 def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
-    """The pose of the child sensor in the parent sensor's frame, in a document of any format.
-
-    Raises
-    ------
-    InputError
-        If it does not have it.
+    """The pose of the child sensor in the parent sensor's frame, in a document of any format; an
+    InputError if it is not there.
     """
     nodes, frames = [*_nodes(document, ())], FrameTree("the file")
-    for above, node in nodes:
-        if named := _named(above, node):
-            parent, child = (str(name).lstrip("/") for name in named[:2])
-            frames.add(parent, child, pose_of(*named[2:]))
+    for parent, child, *pose in filter(None, (_named(*each) for each in nodes)):
+        frames.add(str(parent).lstrip("/"), str(child).lstrip("/"), pose_of(*pose))
     if frames.edges:
         return frames.pose(parent_frame, child_frame)
     for layouts in FORMATS.values():

@@ -32,6 +32,7 @@ from hand_eye_calib.io.trajectory_files.writing import tum_line
 _FORMAT, _VERSION = "hand_eye_calib/journal", 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
+_ADVICE = "move it away to start anew"
 # What a line may raise that is none of a journal.
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
@@ -40,22 +41,11 @@ About = Mapping[str, Mapping[str, Any]]
 
 
 class JournalWriter:
-    """Writes one session into a directory.
+    """Writes one session into a directory, which is made if it does not exist. All methods raise
+    OSError if it cannot be written.
 
-    Parameters
-    ----------
-    directory : path
-        Made if it does not exist.
-    about : mapping of str to mappings
-        What is known of each stream.
-    resumed : Journal, optional
-        The session in the directory, if that goes on: what cannot be read at the end of its files
-        is cut off.
-
-    Raises
-    ------
-    OSError
-        Here and in all methods, if it cannot be written.
+    ``about`` is what is known of each stream, ``resumed`` the session in the directory if that goes
+    on: what cannot be read at the end of its files is cut off.
     """
 
     def __init__(
@@ -63,17 +53,15 @@ class JournalWriter:
     ) -> None:
         self._directory = Path(directory)
         self._directory.mkdir(parents=True, exist_ok=True)
-        before, whole_bytes, self._parent_poses = dict[str, Any](), dict[str, int](), 0
-        if resumed is not None:
-            before, whole_bytes = resumed.about, resumed.whole_bytes
-            self._parent_poses = int((resumed.streams == "parent").sum())
-        self._about: dict[str, Mapping[str, Any]] = {**before}
-        self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before}}
+        before = resumed or Journal({}, np.array([]), np.array([]), np.array([]), {})
+        self._parent_poses = int((before.streams == "parent").sum())
+        self._about: dict[str, Mapping[str, Any]] = {**before.about}
+        self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before.about}}
         self._files: dict[str, BinaryIO] = {}
         for stream in self._pending:
             # Unbuffered: what is flushed is with the operating system and survives this process.
             self._files[stream] = open(self._path(stream), "ab", buffering=0)  # noqa: SIM115
-            self._files[stream].truncate(whole_bytes.get(stream, 0))
+            self._files[stream].truncate(before.whole_bytes.get(stream, 0))
         head = {"format": _FORMAT, "version": _VERSION}
         self.describe({stream: head | {"stream": stream} | {**about[stream]} for stream in about})
 
@@ -124,15 +112,10 @@ class JournalWriter:
 class Journal:
     """The session that a directory holds; its poses are in the order in which they arrived.
 
-    Attributes
-    ----------
-    about : dict of str to dict
-        By stream: "options", "topic", "frame", "origin" and what else was noted.
-    streams, stamps_ns : (N,) str and int64 arrays
-    poses : (N, 7) array
-        x y z (m), qx qy qz qw.
-    whole_bytes : dict of str to int
-        Bytes of each stream's file up to the end of the last line that could be read.
+    ``about`` has "options", "topic", "frame", "origin" and what else was noted of each stream;
+    ``streams`` (N,) and ``stamps_ns`` (N,) belong to ``poses`` (N, 7) of x y z (m), qx qy qz qw;
+    ``whole_bytes`` are those of each stream's file up to the end of the last line that could be
+    read.
     """
 
     about: dict[str, dict[str, Any]]
@@ -143,12 +126,8 @@ class Journal:
 
 
 def read_journal(directory: str | Path) -> Journal:
-    """Read the session that a directory holds.
-
-    Raises
-    ------
-    InputError
-        If there is no journal, or it cannot be read.
+    """Read the session that a directory holds; an InputError if there is none, or it cannot be
+    read.
     """
     if not has_session(directory):
         raise InputError(f"no session journal in {directory}")
@@ -180,13 +159,12 @@ class _File:
         found = [self.about.get(key) for key in ("format", "version")]
         if found[0] != _FORMAT:
             raise InputError(
-                f"the session journal {path} is damaged from its first byte; move it away to start "
-                "anew"
+                f"the session journal {path} is damaged from its first byte; {_ADVICE}"
             )
         if found[1] != _VERSION:
             raise InputError(
                 f"the session journal {path} is of format version {found[1]}, this program reads "
-                f"{_VERSION}: use the version that wrote it, or move it away to start anew"
+                f"{_VERSION}: use the version that wrote it, or {_ADVICE}"
             )
 
     def _add(self, line: bytes) -> None:

@@ -26,10 +26,7 @@ def is_url(path: object) -> bool:
 
 
 def public(url: str) -> str:
-    """A URL without what gives access: user and password, and a signature in its query.
-
-    Paths stay as they are.
-    """
+    """A URL without what gives access: user, password and query; a path stays as it is."""
     if not is_url(url):
         return url
     protocol, mark, rest = url.partition("?")[0].partition("://")
@@ -45,14 +42,9 @@ def expanded(pattern: str) -> list[str]:
 
 @contextmanager
 def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
-    """Paths of the same bags on this machine; what is remote is copied for as long as the block
-    lasts. Errors raised in the block name the URLs.
-
-    Yields
-    ------
-    paths : list
-    as_given : callable
-        Puts the URLs back into plain values that name the copies.
+    """Paths of the same bags on this machine, and what puts the URLs back into plain values that
+    name the copies; what is remote is copied for as long as the block lasts. Errors raised in the
+    block name the URLs.
 
     Raises
     ------

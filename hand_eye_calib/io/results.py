@@ -32,8 +32,7 @@ def save_result(
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
     If the verdict is DO NOT USE, only the first, and files of an earlier result with the other two
-    names are removed. Each is written in one step: a reader sees the old file or the new one, never
-    half of it. If one cannot be written, none changes.
+    names are removed. If one cannot be written, none changes.
 
     Parameters
     ----------
@@ -60,11 +59,10 @@ def save_result(
     PosixPath('saved/extrinsic.yaml')
     """
     is_usable = calibration.verdict is not Verdict.DO_NOT_USE
-    document = calibration.to_dict() | {"provenance": provenance(inputs or {})}
     texts = {
         XACRO_NAME: _xacro_text(calibration) if is_usable else None,
         LAUNCH_NAME: _launch_text([calibration]) if is_usable else None,
-        FILE_NAME: yaml_text(document),
+        FILE_NAME: _yaml_text(calibration.to_dict(), inputs),
     }
     return _written(Path(directory), texts)
 
@@ -90,8 +88,8 @@ def save_rig(
         folders.add(name)
         save_result(calibration, Path(directory, name), inputs)
     usable = [each for each in calibrations if each.verdict is not Verdict.DO_NOT_USE]
-    whole = {**document, "provenance": provenance(inputs or {})}
-    texts = {LAUNCH_NAME: _launch_text(usable) if usable else None, RIG_NAME: yaml_text(whole)}
+    launch = _launch_text(usable) if usable else None
+    texts = {LAUNCH_NAME: launch, RIG_NAME: _yaml_text(document, inputs)}
     return _written(Path(directory), texts)
 
 
@@ -121,27 +119,24 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     return [*kept][-1]
 
 
-def provenance(inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Where a result came from, in plain values."""
-    return {
+def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) -> str:
+    """A document with where it came from."""
+    inputs = {**(inputs or {})}
+    provenance = {
         "package": "hand_eye_calib",
         "package_version": package_version(),
         "versions": {"python": platform.python_version()}
         | {name: metadata.version(name) for name in ("numpy", "scipy")},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "parameters": inputs.get("options", {}),
-        "inputs": {name: value for name, value in inputs.items() if name != "options"},
+        "parameters": inputs.pop("options", {}),
+        "inputs": inputs,
     }
+    return yaml_text({**document, "provenance": provenance})
 
 
 def keep_earlier_results(directory: str | Path) -> None:
-    """Copy the result files of a directory into its folder ``previous``, as they are, before they
-    are replaced.
-
-    Raises
-    ------
-    InputError
-        If they cannot be copied.
+    """Copy the result files of a directory into its folder ``previous`` before they are replaced;
+    an InputError if that is not possible.
     """
     previous = Path(directory, "previous")
     found = [path for name in _NAMES if (path := Path(directory, name)).exists()]
@@ -154,13 +149,7 @@ def keep_earlier_results(directory: str | Path) -> None:
 
 
 def fingerprint(path: str | Path) -> dict[str, Any]:
-    """Name, size and SHA-256 of an input file, for the provenance; read piece by piece.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+    """Name, size and SHA-256 of an input file, for the provenance; read piece by piece."""
     with open_regular(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         return {"file": str(path), "bytes": file.tell(), "sha256": digest}

@@ -1,11 +1,10 @@
 """Samples of a robot arm: at each stop the pose of the hand, and that of a target before a camera.
 
 Read are the samples of MoveIt's calibration (YAML of ``effector_wrt_world``,
-``object_wrt_sensor``, or JSON of pairs of matrices), of easy_handeye and easy_handeye2, pairs
-``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV, and two stacks in an ``.npz``.
+``object_wrt_sensor``, or JSON of pairs of matrices), of easy_handeye and easy_handeye2, and
+pairs ``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV.
 """
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +16,13 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of
+from hand_eye_calib.io.yaml_files import read_yaml
 
 # Names of both poses of a sample, the robot's first.
 _NAMES = (
     ("effector_wrt_world", "object_wrt_sensor"),
     ("robot", "tracking"),
     ("robot", "optical"),
-    ("hand", "camera"),
-    ("parent", "child"),
-    ("A", "B"),
 )
 
 # Frames in files of easy_handeye and easy_handeye2.
@@ -44,14 +41,8 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class ArmSamples:
-    """Samples of an arm.
-
-    Attributes
-    ----------
-    robot, tracking : (N, 4, 4) arrays
-        Of the hand in the robot's base, and of the target in the camera.
-    frames : mapping of str to str
-        Names of base, hand, camera and target, as far as the file has them.
+    """Samples of an arm: poses (N, 4, 4) of the hand in the robot's base and of the target in the
+    camera, and the names of base, hand, camera and target, as far as the file has them.
     """
 
     robot: FloatArray
@@ -72,7 +63,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     >>> hec.read_arm_samples("samples.yaml").robot.shape
     (40, 4, 4)
     """
-    document: Any = _document(path)
+    document: Any = read_yaml(path, _EXPECTED)
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
@@ -94,19 +85,6 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
             raise InputError(f"{path}, sample {number}: {error}") from None
     robot, tracking = np.swapaxes(poses, 0, 1)
     return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
-
-
-def _document(path: str | Path) -> Any:
-    """What a file has, of an ``.npz`` the pairs of rows of its two stacks."""
-    if Path(path).suffix != ".npz":
-        from hand_eye_calib.io.yaml_files import read_yaml
-
-        return read_yaml(path, _EXPECTED)
-    try:
-        with np.load(path, allow_pickle=False) as stacks:
-            return [*zip(*_pair({name: stacks[name] for name in stacks.files}), strict=True)]
-    except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
 
 
 def _pair(sample: Any) -> Sequence[Any]:

@@ -56,12 +56,8 @@ class Target:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``charuco:5x7:0.04:0.03:4X4_50`` or ``aprilgrid:6x6:0.088:0.0264``.
-
-        Raises
-        ------
-        ConfigError
-            If it is no target.
+        """Read ``charuco:5x7:0.04:0.03:4X4_50`` or ``aprilgrid:6x6:0.088:0.0264``; a ConfigError
+        if it is no target.
         """
         kind, *parts = text.split(":")
         names = {"charuco": (*parts[3:], "4X4_50"), "aprilgrid": ("APRILTAG_36h11", *parts[3:])}
@@ -86,13 +82,7 @@ class Camera:
 
 
 def read_camera(path: str | Path) -> Camera:
-    """Read intrinsics from YAML of ROS, Kalibr or OpenCV.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or has none.
-    """
+    """Read intrinsics from YAML of ROS, Kalibr or OpenCV; an InputError if there are none."""
     document: Any = read_yaml(path, _EXPECTED_CAMERA)
     try:
         document = document.get("cam0", document)
@@ -154,7 +144,13 @@ def poses_of_target(images: Iterable[Any], target: Target, camera: Camera) -> Ta
         If OpenCV is not installed.
     """
     cv2 = _opencv()
-    detect = _board_detector(cv2, target) if target.kind == "charuco" else _tags(cv2, target)
+    markers = getattr(cv2.aruco, f"DICT_{target.dictionary}", None)
+    if markers is None:
+        raise ConfigError(
+            f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(markers)
+    detect = (_board if target.kind == "charuco" else _tags)(cv2, target, dictionary)
     found: list[tuple[FloatArray, int, float]] = []
     number = -1
     for number, image in enumerate(images):
@@ -180,12 +176,11 @@ def _pose(
     """
     undistort = cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
     rays = undistort(pixels.reshape(-1, 1, 2), camera.matrix, camera.distortion).reshape(-1, 2)
-    _, turns, shifts, _ = cv2.solvePnPGeneric(
-        corners, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
+    ideal = np.eye(3), None
+    _, turns, shifts, _ = cv2.solvePnPGeneric(corners, rays, *ideal, flags=cv2.SOLVEPNP_IPPE)
     found = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        turn, shift = cv2.solvePnPRefineLM(corners, rays, np.eye(3), None, turn, shift)
+    for start in zip(turns, shifts, strict=True):
+        turn, shift = cv2.solvePnPRefineLM(corners, rays, *ideal, *start)
         T = se3.from_rotation_translation(cv2.Rodrigues(turn)[0], shift.ravel())
         seen = corners @ T[:3, :3].T + T[:3, 3]
         off = (seen[:, :2] / seen[:, 2:] - rays) * camera.matrix[[0, 1], [0, 1]]
@@ -193,10 +188,10 @@ def _pose(
     return min(found, key=lambda each: each[1])
 
 
-def _board_detector(cv2: Any, target: Target) -> _Detector:
+def _board(cv2: Any, target: Target, dictionary: Any) -> _Detector:
     """Finds the corners of a ChArUco board."""
     size = (target.columns, target.rows)
-    board = cv2.aruco.CharucoBoard(size, target.size, target.marker, _dictionary(cv2, target))
+    board = cv2.aruco.CharucoBoard(size, target.size, target.marker, dictionary)
     charuco = cv2.aruco.CharucoDetector(board)
     places = np.asarray(board.getChessboardCorners(), dtype=float)
 
@@ -209,12 +204,12 @@ def _board_detector(cv2: Any, target: Target) -> _Detector:
     return detect
 
 
-def _tags(cv2: Any, target: Target) -> _Detector:
+def _tags(cv2: Any, target: Target, dictionary: Any) -> _Detector:
     """Finds the corners of the tags of an AprilGrid."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = 2  # Kalibr's tags have a border of two bits
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    markers = cv2.aruco.ArucoDetector(_dictionary(cv2, target), parameters)
+    markers = cv2.aruco.ArucoDetector(dictionary, parameters)
     # From the lower left tag on, rows upward. OpenCV has the tags of this family upside down: their
     # corners come from the lower right one on, clockwise.
     step = target.size + target.marker
@@ -231,15 +226,6 @@ def _tags(cv2: Any, target: Target) -> _Detector:
         return np.concatenate(places), np.concatenate(pixels)
 
     return detect
-
-
-def _dictionary(cv2: Any, target: Target) -> Any:
-    number = getattr(cv2.aruco, f"DICT_{target.dictionary}", None)
-    if number is None:
-        raise ConfigError(
-            f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
-        )
-    return cv2.aruco.getPredefinedDictionary(number)
 
 
 def _opencv() -> Any:

@@ -37,29 +37,13 @@ class TfSource(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "TfSource":
-        """From ``world:sensor``.
-
-        Raises
-        ------
-        ConfigError
-            If these are not two different frames.
-        """
+        """From ``world:sensor``; a ConfigError if these are not two different frames."""
         return cls(*split_frames("a transform", text))
 
 
 class PoseFields(NamedTuple):
-    """What is unpacked of a message: a stamped pose or transform.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    world_frame : str
-        Of a transform, the parent.
-    sensor_frame : str or None
-        Of a transform, the child; None if the type has no place for it.
-    position : sequence of 3 floats
-        m.
-    quat_xyzw : sequence of 4 floats
+    """What is unpacked of a message: a stamped pose or transform, in m. Its frames are the parent
+    and child of a transform; the sensor's is None if the type has no place for it.
     """
 
     stamp_ns: int
@@ -74,15 +58,8 @@ class TfStream:
 
     There is one pose for each transform of the moving edge with the lowest rate. The other moving
     edges are interpolated there, never extrapolated and never across more than ``max_gap_s``. Of
-    repeated transforms of an edge the first counts, and those that are late are left out.
-
-    Parameters
-    ----------
-    source : TfSource
-    max_gap_s : float
-        May be changed.
-    tree : FrameTree, optional
-        Edges that are known before.
+    repeated transforms of an edge the first counts, and those that are late are left out. ``tree``
+    has edges that are known before; ``max_gap_s`` may be changed.
     """
 
     def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
@@ -103,12 +80,8 @@ class TfStream:
         self, transform: PoseFields, is_static: bool
     ) -> Iterator[tuple[int, dict[str, _Row]]]:
         """Take a transform; yields stamps (ns) at which the pose is known with it, and the poses
-        x y z qx qy qz qw of the moving edges there.
-
-        Raises
-        ------
-        InputError
-            If it is no pose, or its frame has another parent already.
+        x y z qx qy qz qw of the moving edges there. An InputError if it is no pose, or its frame
+        has another parent already.
         """
         parent, frame, edges = transform.world_frame, transform.sensor_frame or "", self._tree.edges
         before = edges[frame].is_static if frame in edges else None

@@ -47,16 +47,6 @@ class _Loader(_Base):
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
 
-    def construct_yaml_int(self, node: Any) -> int:
-        value = int(super().construct_yaml_int(node))
-        if not -(2**63) <= value < 2**63:
-            line = node.start_mark.line + 1
-            raise ValueError(f"an integer does not fit into 64 bits, line {line}")
-        return value
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
-
 
 def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     """Read a YAML file; ``expected`` is what an error says that it should be.

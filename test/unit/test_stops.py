@@ -94,9 +94,10 @@ def test_samples_of_others(file, parent, position, within_m):
 class TestCommand:
     def test_samples_are_the_only_path(self, random, tmp_path, capsys):
         robot, tracking, X, _ = arm(random)
-        np.savez(tmp_path / "samples.npz", robot=robot, tracking=tracking)
+        pairs = [[a.tolist(), b.tolist()] for a, b in zip(robot, tracking, strict=True)]
+        (tmp_path / "samples.json").write_text(json.dumps(pairs))
         out = tmp_path / "out"
-        assert main(["calibrate", str(tmp_path / "samples.npz"), "--out", str(out)]) == 0
+        assert main(["calibrate", str(tmp_path / "samples.json"), "--out", str(out)]) == 0
         assert "camera in hand: maps coordinates" in (told := capsys.readouterr().out)
         assert "target in base" in told
         np.testing.assert_allclose(hec.load(out).T_parent_child, X, atol=5e-3)

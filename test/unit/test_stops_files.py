@@ -68,17 +68,6 @@ def test_files_of_other_tools(written, poses, tmp_path):
     assert read.frames == frames
 
 
-@pytest.mark.parametrize("as_rows", [False, True])
-def test_two_stacks_in_an_npz(as_rows, poses, tmp_path):
-    stacks = poses
-    if as_rows:
-        stacks = [np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)] for Ts in poses]
-    np.savez(tmp_path / "arm.npz", A=stacks[0], B=stacks[1])
-    read = read_arm_samples(tmp_path / "arm.npz")
-    np.testing.assert_allclose(read.robot, poses[0], atol=1e-12)
-    np.testing.assert_allclose(read.tracking, poses[1], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -100,12 +89,3 @@ def test_what_is_wrong_is_said_in_one_line(text, said, tmp_path):
         read_arm_samples(path)
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
-
-
-def test_a_damaged_npz(tmp_path):
-    (tmp_path / "arm.npz").write_bytes(b"PK\x03\x04 and no more")
-    with pytest.raises(InputError, match=r"cannot read .*arm\.npz"):
-        read_arm_samples(tmp_path / "arm.npz")
-    np.savez(tmp_path / "arm.npz", first=np.eye(4))
-    with pytest.raises(InputError, match="found first"):
-        read_arm_samples(tmp_path / "arm.npz")
