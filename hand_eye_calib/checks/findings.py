@@ -7,7 +7,7 @@ from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.results.finding import Finding, Severity, gravest_first
+from hand_eye_calib.results.records import Finding, Severity, gravest_first
 
 __all__ = ["Finding", "Severity", "answered", "finding", "gravest_first"]
 

@@ -165,41 +165,27 @@ class AdaptiveSolution(ModelSolution):
             )
             for process, at in zip(self.model.slow, range(N_FAST, len(sigmas), 2), strict=True)
         )
-        # A random walk is so many times larger after a metre than from pose to pose.
-        after_a_metre = float((1.0 / max(self.metres_per_pose, 1e-9)) ** 0.5)
         return Noise(
             in_words=(),
             rotation_white_rad=float(sigmas[ROTATION]),
             translation_white_m=float(sigmas[TRANSLATION]),
             rotation_drift_rad_per_pose=float(sigmas[WALK_ROTATION]),
             translation_drift_m_per_pose=float(sigmas[WALK_TRANSLATION]),
-            rotation_drift_rad_after_a_metre=float(sigmas[WALK_ROTATION]) * after_a_metre,
-            translation_drift_m_after_a_metre=float(sigmas[WALK_TRANSLATION]) * after_a_metre,
             stamp_jitter_s=float(sigmas[JITTER]),
             lasting=lasting,
             rotation_turns_about=self.model.centre,
             heavy_tails=self.heavy_tails,
             systematic=self.systematic,
-            systematic_parameters=tuple(self.parameters.tolist()),
-            scale=self.scale,
-            scale_sigma=self.scale_sigma,
-            time_offset_s=self.time_offset_s,
-            time_offset_sigma_s=self.time_offset_sigma_s,
             misfit=self.misfit,
         )
 
     def describe(self, stamps_ns: IntArray) -> Noise:
-        """The noise in plain numbers and in words, with the stamps (ns) of jumps and outliers."""
+        """The noise in plain numbers and in words, with the times of jumps and outliers."""
         jumps, spikes = stamps_ns[1:][self.jumps], stamps_ns[self.spikes]
         said = [*self._noise_in_words(), *self._systematic_in_words()]
         said += _when("jump", "jumps", "of a trajectory, just before", jumps)
         said += _when("pose", "poses", "wrong by {} and left out, at", spikes)
-        return replace(
-            self.noise,
-            jumps_before_stamp_ns=tuple(jumps.tolist()),
-            spikes_at_stamp_ns=tuple(spikes.tolist()),
-            in_words=tuple(said),
-        )
+        return replace(self.noise, in_words=tuple(said))
 
     def _noise_in_words(self) -> list[str]:
         sigmas = np.exp(0.5 * self.levels)
@@ -315,8 +301,6 @@ class LeverArmSolution(ModelSolution):
             translation_drift_m_per_pose=walk,
             rotation_drift_rad_per_pose=turned,
             share_of_worse_positions=worse,
-            jumps_before_stamp_ns=tuple(stamps_ns[1:][self.jumps].tolist()),
-            spikes_at_stamp_ns=tuple(stamps_ns[self.spikes].tolist()),
             misfit=self.misfit,
             in_words=tuple(said),
         )

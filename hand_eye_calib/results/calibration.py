@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import (
@@ -17,11 +17,9 @@ from hand_eye_calib.geometry.extrinsic import (
     sigmas_rpy,
     sigmas_translation,
 )
-from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.document import MATRICES, NOT_IN_FILES, values_of
-from hand_eye_calib.results.finding import Finding
-from hand_eye_calib.results.records import Residuals
+from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import (
     AXES,
@@ -124,16 +122,11 @@ class Calibration(Result):
         ``verdict``.
         """
         sigmas = [*self.sigmas[:3].tolist(), *self.sigmas_rpy.tolist()]
+        units = 3 * ["m"] + 3 * ["rad"]
+        columns = zip(self.observability, self._printed(), sigmas, units, strict=True)
         return {
-            dof.name: {
-                "value": value,
-                "sigma": sigma,
-                "unit": unit,
-                "verdict": dof.verdict.value,
-            }
-            for dof, value, sigma, unit in zip(
-                self.observability, self._printed(), sigmas, 3 * ["m"] + 3 * ["rad"], strict=True
-            )
+            dof.name: {"value": value, "sigma": sigma, "unit": unit, "verdict": dof.verdict.value}
+            for dof, value, sigma, unit in columns
         }
 
     def inverse(self) -> "Calibration":
@@ -147,12 +140,10 @@ class Calibration(Result):
         variances = np.diag(to_child @ covariance @ to_child.T)
         sigmas = np.sqrt(np.maximum(variances, 0.0))
         unknown = bool(self.unobservable()) & (sigmas > _UNKNOWN_M)
-        axes = tuple(
-            DofObservability(name, DofVerdict.UNOBSERVABLE, np.inf)
-            if is_unknown
-            else DofObservability(name, DofVerdict.OBSERVED, float(sigma))
-            for name, sigma, is_unknown in zip(AXES, sigmas, unknown, strict=True)
-        )
+        sigmas = np.where(unknown, np.inf, sigmas)
+        kinds = DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE
+        verdicts = [kinds[is_unknown] for is_unknown in unknown.astype(int).tolist()]
+        axes = tuple(map(DofObservability, AXES, verdicts, sigmas.tolist()))
         worlds: dict[str, Any] = {}
         if self.T_world_world is not None and self.cov_world_world is not None:
             worlds = {
@@ -211,29 +202,6 @@ class Calibration(Result):
         frames = f"--frame-id {parent} --child-frame-id {child}"
         return told and f"ros2 run tf2_ros static_transform_publisher {told}{frames}"
 
-    def child_as_parent(self, child: Trajectory) -> Trajectory:
-        """The trajectory that the parent sensor has according to the child's: with the time offset
-        and the scale of this result, each pose moved by ``T_child_parent``.
-
-        It and the parent's own trajectory are of one body, so that tools that compare trajectories
-        (evo: ``evo_ape tum parent.tum moved.tum --align``) see their errors rather than the mount.
-
-        Parameters
-        ----------
-        child : Trajectory
-            Poses of the child sensor in its own world.
-
-        Returns
-        -------
-        Trajectory
-            Poses of the parent sensor in the child's world, at the child's stamps on the parent's
-            clock.
-        """
-        rate = (self.clock_rate.used, self.clock_rate.at_ns) if self.clock_rate else ()
-        scaled = child.scaled(self.scale).shifted(self.time_offset_s, *rate)
-        poses = scaled.poses @ self.T_child_parent
-        return Trajectory(scaled.stamps_ns, poses, self.parent_frame, child.world_frame)
-
     def export(self, format: str) -> str:
         """The extrinsic as a file of another program.
 
@@ -256,8 +224,7 @@ class Calibration(Result):
         ConfigError
             For an unknown format.
         InputError
-            Under DO NOT USE, and if an axis is not known that the other numbers depend on. One that
-            stands alone is a text such as MEASURE_Z_BY_HAND.
+            Under DO NOT USE, and if an axis is not known that the format has.
 
         Examples
         --------
@@ -265,9 +232,8 @@ class Calibration(Result):
         """
         from hand_eye_calib.results.exports import export_text
 
-        numbers = self.usable_numbers()
-        usable = numbers | self.usable_angles() if numbers else {}
-        return export_text(self, format, self.headline, usable)
+        is_usable = self.verdict is not Verdict.DO_NOT_USE
+        return export_text(self, format, self.headline, is_usable)
 
     def _printed(self) -> list[float]:
         angles = se3.rotation_to_rpy(self.T_parent_child[:3, :3])
@@ -302,14 +268,16 @@ class Calibration(Result):
         """
         if self.verdict is Verdict.DO_NOT_USE:
             return {}
-        T = self.mounting[1]
+        T, unknown = self.mounting[1], {*self.unobservable()}
+        hidden = np.array([axis in unknown for axis in TRANSLATIONS])
+        if self.T_base_parent is not None:  # axes that share a direction that the motion hides
+            of_base = np.abs(self.T_base_parent[:3, :3][:, hidden])
+            hidden = of_base.max(axis=1, initial=0.0) > _SHARED
         numbers: dict[str, float | str] = {
-            axis: by_hand(axis) if is_unknown else float(value)
-            for axis, value, is_unknown in zip(
-                TRANSLATIONS, T[:3, 3], self._unknown_translations(), strict=True
-            )
+            axis: by_hand(axis) if is_hidden else float(value)
+            for axis, value, is_hidden in zip(TRANSLATIONS, T[:3, 3], hidden, strict=True)
         }
-        if set(self.unobservable()).intersection(ROTATIONS):
+        if unknown.intersection(ROTATIONS):
             return numbers | self.usable_angles()
         return numbers | dict(zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True))
 
@@ -326,15 +294,6 @@ class Calibration(Result):
             name: angle if is_known else by_hand(name)
             for name, angle, is_known in zip(ROTATIONS, angles, known, strict=True)
         }
-
-    def _unknown_translations(self) -> BoolArray:
-        """Which axes (3,) of the mounting's frame share a direction that the motion hides."""
-        hidden = np.array(
-            [dof.verdict is DofVerdict.UNOBSERVABLE for dof in self.observability[:3]]
-        )
-        if self.T_base_parent is None:
-            return hidden
-        return np.abs(self.T_base_parent[:3, :3][:, hidden]).max(axis=1, initial=0.0) > _SHARED
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the residuals as plain numbers, strings, lists and mappings, ready for

@@ -7,7 +7,7 @@ directions come from is in docs/exports.md.
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.status import AXES, TRANSLATIONS
 from hand_eye_calib.text import axes_in_words
 from hand_eye_calib.version import package_version
 
@@ -50,8 +50,10 @@ class Layout(NamedTuple):
         The file, with ``%(name)s`` where numbers and names go.
     clock : int
         ``t_target = t_source + clock * shift``; 0 if the file has no shift.
-    by_axis : tuple of str
-        Axes that stand alone, so that one which is not known can be left to measure by hand.
+    axes : tuple of str
+        Axes that must be known.
+    axes_said : str
+        What the file says of its axes.
     """
 
     target: str
@@ -59,7 +61,8 @@ class Layout(NamedTuple):
     keys: tuple[str, ...]
     text: str
     clock: int
-    by_axis: tuple[str, ...]
+    axes: tuple[str, ...]
+    axes_said: str
 
 
 _YAML_ROWS = "%(about)s\ncam0:\n  {key}:\n%(rows)s\n  timeshift_cam_imu: %(shift)s\n"
@@ -84,10 +87,16 @@ _PARENT, _CHILD = ":parent", ":child"
 FORMATS: dict[str, list[Layout]] = {}
 
 
-def _layout(words: str, text: str, clock: int = 0, by_axis: tuple[str, ...] = ()) -> None:
+def _layout(
+    words: str,
+    text: str,
+    clock: int = 0,
+    axes: tuple[str, ...] = AXES,
+    axes_said: str = "",
+) -> None:
     """Add a row to the table; the words are format, target, source and keys."""
     name, target, source, *keys = words.split()
-    layout = Layout(target, source, tuple(keys), text, clock, by_axis)
+    layout = Layout(target, source, tuple(keys), text, clock, axes, axes_said)
     FORMATS.setdefault(name, []).append(layout)
 
 
@@ -95,7 +104,6 @@ _layout(
     "autoware :parent :child",
     "%(about)s\n%(target)s:\n  %(source)s:\n    x: %(x)s\n    y: %(y)s\n    z: %(z)s\n"
     "    roll: %(roll)s\n    pitch: %(pitch)s\n    yaw: %(yaw)s\n",
-    by_axis=AXES,
 )
 _layout(
     "fast_lio imu lidar extrinsic_T extrinsic_R",
@@ -155,8 +163,14 @@ _layout(
     "%(about)s\n%(source)s:\n  parent: %(target)s\n  child: %(source)s\n"
     "  value: [ %(t)s, %(xyzw)s ]\n",
 )
-_layout("px4 :parent gnss:child", _PX4.format(kind="GPS"), by_axis=TRANSLATIONS)
-_layout("px4 :parent :child", _PX4.format(kind="EV") + "%(ev_delay)s\n", by_axis=TRANSLATIONS)
+_FRD = "x forward, y right, z down, from axes of %(target)s forward, left, up."
+_layout("px4 :parent gnss:child", _PX4.format(kind="GPS"), axes=TRANSLATIONS, axes_said=_FRD)
+_layout(
+    "px4 :parent :child",
+    _PX4.format(kind="EV") + "%(ev_delay)s\n",
+    axes=TRANSLATIONS,
+    axes_said=_FRD,
+)
 _layout("kitti camera lidar T R", _KITTI)
 _layout("kitti lidar imu T R", _KITTI)
 _layout(
@@ -177,6 +191,7 @@ _layout(
     '        "name": %(source)s,\n        "nominalSensor2Rig_FLU": {\n'
     '          "roll-pitch-yaw": [ %(rpy_deg)s ],\n          "t": [ %(t)s ]\n'
     "        }\n      }\n    ]\n  }\n}\n",
+    axes_said="The axes of %(source)s must be x forward, y left, z up.",
 )
 _layout(
     "easy_handeye2 :parent :child",
@@ -221,39 +236,26 @@ def arranged(
     return max(found, key=lambda each: each[:4])[4]
 
 
-def export_text(result: Result, name: str, headline: str, usable: Mapping[str, float | str]) -> str:
-    """A calibration in the format of another program; see
-    :meth:`~hand_eye_calib.results.calibration.Calibration.export`.
-
-    Parameters
-    ----------
-    result : Result
-    name : str
-        One of :data:`FORMATS`.
-    headline : str
-        Its verdict.
-    usable : mapping
-        The numbers by axis of what is mounted, a text for one that is not known; empty under DO NOT
-        USE.
+def export_text(result: Result, name: str, headline: str, is_usable: bool) -> str:
+    """A calibration in the format of another program, unless it is not usable; ``headline`` is its
+    verdict. See :meth:`~hand_eye_calib.results.calibration.Calibration.export`.
     """
     if name not in FORMATS:
         raise ConfigError(f"unknown format {name!r}; known are {', '.join(FORMATS)}")
-    if not usable:
+    if not is_usable:
         raise InputError(f"nothing is written: {headline}")
     frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
     layout, is_inverted, is_certain = arranged(FORMATS[name], *frames)
     if layout.target == _PARENT:
         frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
-    unknown = [axis for axis in result.unobservable() if axis not in layout.by_axis]
-    if unknown and not (layout.by_axis == TRANSLATIONS and set(unknown) <= {*ROTATIONS}):
+    if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
         raise InputError(
-            f"nothing is written: this recording does not determine {axes_in_words(unknown)}, and "
-            f"the numbers of format {name} depend on each other; measure it by hand and calibrate "
-            "again with --prior"
+            f"nothing is written: this recording does not determine {axes_in_words(unknown)}; "
+            "measure it by hand and calibrate again with --prior"
         )
-    texts = _numbers(se3.inverse(T) if is_inverted else T, usable if result.unobservable() else {})
     target, source = frames[::-1] if is_inverted else frames
     shift_s = layout.clock * (-1 if is_inverted else 1) * result.time_offset_s
+    texts = _numbers(se3.inverse(T) if is_inverted else T)
     texts |= {"target": json.dumps(target), "source": json.dumps(source), "shift": _number(shift_s)}
     is_fixed = "base" in target.lower()  # a camera beside the robot, not on its hand
     texts |= {"eye": "eye_on_base" if is_fixed else "eye_in_hand", "robot": '"base"'}
@@ -264,11 +266,19 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
     lines = [
         f"{name}, by hand_eye_calib {package_version()}. {headline}",
-        *_directions(name, target, source, layout, is_inverted, is_certain),
+        f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
         f"Clocks: t({result.parent_frame}) = t({result.child_frame}) + "
         f"{_number(result.time_offset_s)} s, "
         + ("estimated." if result.time_offset_sigma_s else "given, not estimated."),
     ]
+    if is_inverted:
+        lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
+    if not is_certain:
+        roles = zip((each.partition(":")[0] for each in layout[:2]), (target, source), strict=True)
+        said = ", ".join(f"{frame} is the {role}" for role, frame in roles if role)
+        lines.append(f"Assumed, as the names of the frames do not say it: {said}.")
+    if layout.axes_said:
+        lines.append(layout.axes_said % {"target": target, "source": source})
     lines = [printable(" ".join(line.split())) for line in lines]
     texts["about"] = "\n".join(f"# {line}" for line in lines)
     if name == "kitti" or layout.text.startswith(("{", "[")):  # a value, not a comment
@@ -276,37 +286,14 @@ def export_text(result: Result, name: str, headline: str, usable: Mapping[str, f
     return layout.text % texts
 
 
-def _directions(
-    name: str, target: str, source: str, layout: Layout, is_inverted: bool, is_certain: bool
-) -> list[str]:
-    """What the numbers of a file map, in lines."""
-    lines = [f"Maps coordinates of {source} into {target}: the pose of {source} in {target}."]
-    if is_inverted:
-        lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
-    if not is_certain:
-        roles = [each.partition(":")[0] for each in layout[:2]]
-        pairs = zip(roles, (target, source), strict=True)
-        said = [f"{frame} is the {role}" for role, frame in pairs if role]
-        lines.append(f"Assumed, as the names of the frames do not say it: {', '.join(said)}.")
-    if name == "driveworks":
-        lines.append(f"The axes of {source} must be x forward, y left, z up.")
-    if name == "px4":
-        lines.append(f"x forward, y right, z down, from axes of {target} forward, left, up.")
-    return lines
-
-
-def _numbers(T: FloatArray, by_hand: Mapping[str, float | str]) -> dict[str, str]:
-    """The texts of a pose (4, 4) that layouts need; axes by themselves may be known by hand."""
+def _numbers(T: FloatArray) -> dict[str, str]:
+    """The texts of a pose (4, 4) that layouts need."""
     t, R, rpy = T[:3, 3], T[:3, :3], se3.rotation_to_rpy(T[:3, :3])
     qx, qy, qz, qw = quat_xyzw = se3.to_quat_xyzw(T)
     numbers = dict(zip(AXES, [*t, *rpy], strict=True)) | {"y_frd": -t[1], "z_frd": -t[2]}
     numbers |= {"qx": qx, "qy": qy, "qz": qz, "qw": qw}
-    texts = {axis: _number(value) for axis, value in numbers.items()}
-    for axis, value in by_hand.items():
-        if isinstance(value, str):
-            texts |= dict.fromkeys({axis, f"{axis}_frd"} & {*texts}, value)
     rows = [_listed(row) for row in T]
-    return texts | {
+    return {axis: _number(value) for axis, value in numbers.items()} | {
         "t": _listed(t),
         "t_plain": _listed(t, " "),
         "R": _listed(R.ravel()),

@@ -1,10 +1,11 @@
-"""Parts of a calibration: what it says of noise, other answers, the goal, what is installed.
+"""Parts of a calibration: findings, noise, other answers, the goal, what is installed.
 
 All are plain values under names, so that :mod:`hand_eye_calib.plain` reads and writes them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TypeAlias
 
 import numpy as np
@@ -66,6 +67,66 @@ class Residuals:
         return self.weights > INLIER_WEIGHT
 
 
+class Severity(str, Enum):
+    """How much a finding matters.
+
+    With an error, a result from these streams as they are is unusable. With a warning it may be
+    used with care. A note is good to know.
+    """
+
+    NOTE = "note"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something about the streams that a person should know.
+
+    Attributes
+    ----------
+    code : str
+        Short name, stable over versions.
+    stream : str
+        "parent", "child" or "both".
+    severity : Severity
+    what : str
+        What was found, with its values.
+    advice : str
+        What to do.
+    cause : str
+        Usual cause, if ``what`` does not name it.
+    evidence : mapping of str to float
+        The numbers in ``what``, by name.
+    options : mapping
+        Options that do it, by their names in :mod:`hand_eye_calib.config`; empty if none can.
+    """
+
+    code: str
+    severity: Severity
+    what: str
+    advice: str
+    stream: str = "both"
+    cause: str = ""
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    options: Mapping[str, float | str] = field(default_factory=dict)
+
+    @property
+    def makes_unusable(self) -> bool:
+        """Whether a result from these streams as they are is unusable."""
+        return self.severity is Severity.ERROR
+
+    def __str__(self) -> str:
+        cause = f" ({self.cause})" if self.cause else ""
+        return f"{self.what.rstrip('.')}{cause}; {self.advice}"
+
+
+def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The findings by severity, errors first, otherwise in their order."""
+    order = list(Severity)
+    return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
+
+
 @dataclass(frozen=True, kw_only=True)
 class CorrelatedError:
     """A time-correlated error: what it is fixed to (``kind``: body, world, or scale), its part of
@@ -83,7 +144,7 @@ class Noise:
     """Noise of the trajectories as the adaptive estimator found it.
 
     Standard deviations are per axis, of both sensors together: of a single pose (``white``), and
-    of the drift from pose to pose, or after a metre of path.
+    of the drift from pose to pose.
     """
 
     in_words: tuple[str, ...]
@@ -92,21 +153,12 @@ class Noise:
     rotation_white_rad: float | None = None
     translation_drift_m_per_pose: float | None = None
     rotation_drift_rad_per_pose: float | None = None
-    translation_drift_m_after_a_metre: float | None = None
-    rotation_drift_rad_after_a_metre: float | None = None
     stamp_jitter_s: float | None = None
     lasting: tuple[CorrelatedError, ...] = ()
     rotation_turns_about: str | None = None
     heavy_tails: bool | None = None
     share_of_worse_positions: float | None = None
     systematic: str = ""
-    systematic_parameters: tuple[float, ...] = ()
-    scale: float | None = None
-    scale_sigma: float | None = None
-    time_offset_s: float | None = None
-    time_offset_sigma_s: float | None = None
-    jumps_before_stamp_ns: tuple[int, ...] = ()
-    spikes_at_stamp_ns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

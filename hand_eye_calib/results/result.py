@@ -11,11 +11,11 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import sigmas_rpy
-from hand_eye_calib.results.finding import Finding
 from hand_eye_calib.results.records import (
     ClockRate,
     Comparison,
     CrossCheck,
+    Finding,
     Noise,
     Progress,
     RateBias,
@@ -269,11 +269,6 @@ class Result:
     def sigmas_with_floor(self) -> FloatArray:
         """(6,) array: :attr:`sigmas` and the common-mode uncertainty together."""
         return np.hypot(self.sigmas, self.sigmas_of_floor)
-
-    @property
-    def weights(self) -> FloatArray:
-        """(K,) array: weight of each motion pair in the solution, 0 to 1; see :meth:`residuals`."""
-        return self.residuals().weights
 
     def residuals(self) -> Residuals:
         """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.

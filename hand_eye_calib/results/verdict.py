@@ -11,7 +11,7 @@ from enum import Enum
 from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.results.finding import Severity
+from hand_eye_calib.results.records import Severity
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS, DofVerdict, SolveStatus
 from hand_eye_calib.text import amount, axes_in_words, listing
@@ -72,19 +72,12 @@ class Reason:
         return self.rule in ("error_finding", "warning_finding")
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A row of the table of rules.
+_Found: TypeAlias = tuple[str, str, tuple[str, ...], Mapping[str, float | str]]
 
-    Attributes
-    ----------
-    name : str
-    verdict : Verdict
-        What its reasons lead to.
-    when : str
-        The condition in words.
-    find : callable
-        ``find(result)`` gives sentence, what to do, axes and options of each reason.
+
+class Rule(NamedTuple):
+    """A row of the table of rules: what its reasons lead to, the condition in words, and
+    ``find(result)``, which gives sentence, what to do, axes and options of each reason.
     """
 
     name: str
@@ -92,13 +85,6 @@ class Rule:
     when: str
     find: "Callable[[Result], Iterator[_Found]]"
 
-    @property
-    def kind(self) -> str:
-        """What its reasons are, "physics" or "suspicion"."""
-        return "physics" if self.name in _PHYSICS else "suspicion"
-
-
-_Found: TypeAlias = tuple[str, str, tuple[str, ...], Mapping[str, float | str]]
 
 # Other answers contradict a result if they lie farther away than so many joint standard deviations
 # and than this share of the target; other references that are about as certain also if they scatter
@@ -115,61 +101,61 @@ FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
 _PHYSICS = frozenset({"nothing_known", "unobservable", "target", "floor"})
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
+# Other answers, and what to do if they disagree.
 _OTHERS = {
-    "halves": "the two halves of the recording",
-    "methods": "other methods and references",
-}
-_WHAT_TO_DO = {
-    "halves": "check that both mounts are tight and record again; what the halves agree on holds",
-    "methods": "use their scatter as the standard deviation, or record longer with more varied "
-    "motion",
+    "halves": (
+        "the two halves of the recording",
+        "check that both mounts are tight and record again; what the halves agree on holds",
+    ),
+    "methods": (
+        "other methods and references",
+        "use their scatter as the standard deviation, or record longer with more varied motion",
+    ),
 }
 
 
 def reasons(result: Result) -> tuple[Reason, ...]:
-    """Why a result may not be used as it is, the gravest first; empty if nothing speaks against it.
-
-    Parameters
-    ----------
-    result : Calibration
+    """Why a result may not be used as it is, the gravest first; empty if nothing speaks against
+    it.
     """
     return tuple(
-        Reason(rule.name, rule.verdict, sentence, what_to_do, rule.kind, axes, options)
+        Reason(
+            rule.name,
+            rule.verdict,
+            sentence,
+            what_to_do,
+            "physics" if rule.name in _PHYSICS else "suspicion",
+            axes,
+            options,
+        )
         for rule in RULES
         for sentence, what_to_do, axes, options in rule.find(result)
     )
 
 
 def verdict_of(found: Sequence[Reason]) -> Verdict:
-    """The verdict that reasons lead to."""
-    for graver in (Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE):
-        if any(reason.verdict is graver for reason in found):
-            return graver
-    return Verdict.USE
+    """The verdict that reasons lead to: the gravest comes first."""
+    return found[0].verdict if found else Verdict.USE
 
 
 def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
     """The reasons that a person has to read: under DO NOT USE those that lead to it, because the
     others may be its consequences; otherwise all.
     """
-    if verdict_of(found) is not Verdict.DO_NOT_USE:
-        return tuple(found)
-    return tuple(reason for reason in found if reason.verdict is Verdict.DO_NOT_USE)
+    return tuple(each for each in found if each.verdict is verdict_of(found))
 
 
 def headline(result: Result, found: Sequence[Reason]) -> str:
     """The verdict with its gravest reason, or with what is known, in one line."""
-    decided = verdict_of(found)
+    decided, gravest = verdict_of(found), shown(found)
     if not found:
         return f"{decided.value}: {_known(result)}"
-    gravest = [reason for reason in found if reason.verdict is decided]
-    note = "" if any(reason.kind == "suspicion" for reason in found) else _NO_FAULT
-    if decided is Verdict.USE_WITH_CARE and gravest[0].rule == "unobservable":
+    if gravest[0].rule == "unobservable":
         hidden = listing(gravest[0].axes)
         it = hidden if len(gravest[0].axes) == 1 else "them"
-        texts = [f"all but {hidden}; measure {it} by hand"]
-        texts += [reason.sentence for reason in gravest[1:2]]
-        return f"{decided.value}: {'; '.join(texts)}"
+        also = "".join(f"; {each.sentence}" for each in gravest[1:2])
+        return f"{decided.value}: all but {hidden}; measure {it} by hand{also}"
+    note = "" if any(reason.kind == "suspicion" for reason in found) else _NO_FAULT
     more = len(gravest) - 1
     rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
     return f"{decided.value}: {gravest[0].sentence}{rest}{note}"
@@ -190,21 +176,17 @@ def _not_converged(result: Result) -> Iterator[_Found]:
 
 
 def _contradicted(result: Result) -> Iterator[_Found]:
-    if result.status is not SolveStatus.CONTRADICTED:
-        return
-    axes = tuple(result.contradictions)
-    apart = [
-        f"on {axis} is {far:.1f} standard deviations from"
-        for axis, far in result.contradictions.items()
-    ]
-    which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
-    names = listing([f"prior.{axis}" for axis in axes]) or "the prior"
-    yield (
-        f"{which} the estimate from the motion",
-        f"check value, unit and sign of {names}",
-        axes,
-        {},
-    )
+    if result.status is SolveStatus.CONTRADICTED:
+        apart = listing(
+            [
+                f"on {axis} is {far:.1f} standard deviations from"
+                for axis, far in result.contradictions.items()
+            ]
+        )
+        which = f"the prior {apart}" if apart else "a prior contradicts"
+        names = listing([f"prior.{axis}" for axis in result.contradictions]) or "the prior"
+        advice = f"check value, unit and sign of {names}"
+        yield f"{which} the estimate from the motion", advice, tuple(result.contradictions), {}
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
@@ -226,40 +208,28 @@ def _contradiction(kind: str) -> Callable[[Result], Iterator[_Found]]:
     """Other answers (``kind``: halves or methods) that lie farther away than they may."""
 
     def find(result: Result) -> Iterator[_Found]:
-        if far := _far(result, kind):
-            told = [
-                f"about {axes_in_words([axis])} by {amount(axis, scatter)}"
-                for axis, scatter in far.items()
-            ]
-            sigmas = [
-                f"+/- {amount(dof.name, dof.sigma)}"
-                for dof in result.observability
-                if dof.name in far
-            ]
-            text = f"{_OTHERS[kind]} disagree {listing(told)}; this result claims {listing(sigmas)}"
-            yield text, _WHAT_TO_DO[kind], tuple(far), {}
+        told, sigmas = {}, []
+        for axis in _axes(result):
+            row = (result.cross_check or {}).get(axis.name)
+            scatter, excess = (getattr(row, f"{what}of_{kind}", None) for what in ("", "excess_"))
+            if row is None or scatter is None or not math.isfinite(axis.sigma):
+                continue
+            of_target = scatter / axis.target
+            if excess is None:  # in a file of version 0.1
+                excess = scatter / max(axis.sigma, 1e-12)
+            is_far = excess > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
+            if kind == "methods" and (row.excess_over_own or 0.0) > CONTRADICTED_SIGMAS:
+                is_far |= of_target > CONTRADICTED_TARGETS
+            if is_far:
+                told[axis.name] = f"about {axes_in_words([axis.name])} by "
+                told[axis.name] += amount(axis.name, scatter)
+                sigmas.append(f"+/- {amount(axis.name, axis.sigma)}")
+        if told:
+            who, advice = _OTHERS[kind]
+            differ = f"{who} disagree {listing([*told.values()])}"
+            yield f"{differ}; this result claims {listing(sigmas)}", advice, tuple(told), {}
 
     return find
-
-
-def _far(result: Result, kind: str) -> dict[str, float]:
-    """Axis to the scatter of other answers about the result, if it is larger than allowed."""
-    far = {}
-    sigmas = {dof.name: dof.sigma for dof in result.observability}
-    for axis, row in (result.cross_check or {}).items():
-        scatter = getattr(row, f"of_{kind}")
-        if scatter is None or not math.isfinite(sigmas[axis]):
-            continue
-        excess = getattr(row, f"excess_of_{kind}")
-        if excess is None:  # in a file of version 0.1
-            excess = scatter / max(sigmas[axis], 1e-12)
-        of_target = scatter / target_of(axis, result)
-        is_beyond_all = kind == "methods" and (row.excess_over_own or 0.0) > CONTRADICTED_SIGMAS
-        if (excess > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE) or (
-            is_beyond_all and of_target > CONTRADICTED_TARGETS
-        ):
-            far[axis] = scatter
-    return far
 
 
 def _hidden(result: Result) -> Iterator[_Found]:
@@ -282,29 +252,28 @@ def _few_inliers(result: Result) -> Iterator[_Found]:
 def _worse_than_target(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
     if rough:
-        told = listing([f"{axis.name} {amount(axis.name, axis.total)}" for axis in rough])
         names = tuple(axis.name for axis in rough)
-        text = f"standard deviations above the target of {_targets_of(rough)}: {told}"
+        told = listing([f"{axis.name} {amount(axis.name, axis.total)}" for axis in rough])
+        targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
         more = "more rotation about other axes" if {*names} & {*TRANSLATIONS} else "more rotation"
+        text = f"standard deviations above the target of {targets}: {told}"
         yield text, f"record longer, with {more}", names, {}
 
 
 def _floor(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
     if rough:
+        names = tuple(axis.name for axis in rough)
         told = [
             f"{axes_in_words([each.name])} to {amount(each.name, each.total)}" for each in rough
         ]
+        targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
         text = (
             "constant odometry errors, which no recording can show, limit the knowledge of "
-            f"{listing(told)}: more than the target of {_targets_of(rough)}"
+            f"{listing(told)}: more than the target of {targets}"
         )
         advice = "compare several recordings; give parent_kind or child_kind exact if one is"
-        yield text, advice, tuple(axis.name for axis in rough), {}
-
-
-def _targets_of(axes: "Sequence[_Axis]") -> str:
-    return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
+        yield text, advice, names, {}
 
 
 _OF_RECORDINGS = {
@@ -367,7 +336,7 @@ def _known(result: Result) -> str:
 
 def _condition(kind: str) -> str:
     text = (
-        f"{_OTHERS[kind]} differ by more than {CONTRADICTED_SIGMAS:g} joint "
+        f"{_OTHERS[kind][0]} differ by more than {CONTRADICTED_SIGMAS:g} joint "
         f"standard deviations and {CONTRADICTED_SHARE:g} of the target"
     )
     if kind == "methods":

@@ -32,7 +32,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.results.calibration import SolveStatus
-from hand_eye_calib.results.finding import Finding, Severity
+from hand_eye_calib.results.records import Finding, Severity
 from hand_eye_calib.text import told_apart
 
 pytestmark = pytest.mark.usefixtures("no_figures")

@@ -192,12 +192,10 @@ def test_px4_has_its_own_axes_and_a_delay():
     assert f"param set EKF2_GPS_POS_Y {-y:.12f}" in antenna.export("px4")
 
 
-def test_an_axis_that_is_not_known_is_measured_by_hand_or_refused():
+def test_an_axis_that_is_not_known_is_refused():
     flat = result("base_link", "lidar", **unknown("z"))
-    assert "z: MEASURE_Z_BY_HAND\n" in flat.export("autoware")
-    assert "EKF2_EV_POS_Z MEASURE_Z_BY_HAND\n" in flat.export("px4")
-    for name in {*FORMATS} - {"autoware", "px4"}:
-        with pytest.raises(InputError, match="does not determine z, and .* --prior"):
+    for name in FORMATS:
+        with pytest.raises(InputError, match="does not determine z; .* --prior"):
             flat.export(name)
     with pytest.raises(ConfigError, match="unknown format 'kalbir'; known are autoware"):
         flat.export("kalbir")

@@ -97,7 +97,6 @@ def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
         in_words=("words",),
         misfit=1.0,
         lasting=(CorrelatedError(kind="body", part="rotation", sigma=1e-3, tau_s=20.0),),
-        jumps_before_stamp_ns=(1317375625661736123,),
     )
     axis = AxisProgress(sigma=np.inf, target=0.02, seconds_left=9.0)
     written = calibration(

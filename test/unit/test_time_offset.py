@@ -131,8 +131,6 @@ class TestClockRate:
         assert np.abs(away / np.sqrt(np.diag(plain.covariance))).max() < 0.3
         again = type(found).from_dict(found.to_dict())
         assert again.clock_rate == found.clock_rate
-        moved = found.child_as_parent(slow)
-        np.testing.assert_allclose(moved.stamps_ns, child.stamps_ns, atol=2_000_000)
 
     def test_one_that_is_not_there_is_stated_and_not_used(self):
         found = estimate_time_offset(*drive(shift_s=0.3, noise=0.001))

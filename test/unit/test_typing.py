@@ -49,8 +49,7 @@ hec.calibrate(parent, child, progress="done")  # wrong
 hec.calibrate(parent, child, checks=False)
 rig: hec.RigCalibration = hec.calibrate_rig({"a": parent, "b": child}, time_offset="estimate")
 hec.calibrate_rig([parent, child])  # wrong
-moved: hec.Trajectory = result.child_as_parent(child)
-hec.write_trajectory("moved.tum", moved)
+hec.write_trajectory("moved.tum", parent)
 hec.plot(result).savefig("result.png")
 hec.calibrate("lidar.tum", np.zeros((3, 8)), method="dnl", scale=1.0)
 hec.calibrate(parent, child, method="dnlp")  # wrong

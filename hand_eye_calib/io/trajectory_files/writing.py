@@ -37,7 +37,7 @@ def write_trajectory(
 
     Examples
     --------
-    >>> hec.write_trajectory("moved.tum", result.child_as_parent(child))
+    >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
     """
     if format != "tum":
         from hand_eye_calib.io.bags import STORAGES, write_bag
