@@ -54,8 +54,8 @@ SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
 def test_the_layout_is_recognised(tmp_path, text, format, is_named):
     path = tmp_path / "poses"
     path.write_text(text + "\n")
-    found, names = Head.of(path).layout()
-    assert (found, "q1" not in names) == (format, is_named)
+    head = Head.of(path)
+    assert (head.format, "q1" not in head.header) == (format, is_named)
 
 
 # ---- the order of quaternions

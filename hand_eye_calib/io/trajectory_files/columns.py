@@ -20,22 +20,19 @@ UNNAMED = ("q1", "q2", "q3", "q4")
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 RATES = ("wx", "wy", "wz")
 TWIST = ("vx", "vy", "vz", *RATES)
-Groups = Sequence[tuple[str, ...]]
 # Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
 # plane, fewer.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
 _ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"), UNNAMED)
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
 _ALL_POSITIONS = (*_POSITIONS, ("x", "y"), ("lat", "lon"))
-_ALL_ORIENTATIONS = (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS)
 
-
-def _ends(quantity: str, beginnings: str) -> dict[str, tuple[str, ...]]:
-    """Names of a quantity along each axis."""
-    axes = "xyzw" if quantity == "q" else "xyz"
-    return {f"{quantity}{a}": tuple(f"{name}{a}" for name in beginnings.split()) for a in axes}
-
-
+# What stands before the axis in names of angular rates, velocities and quaternions.
+_BEGINNINGS = {
+    "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_ w_rs_s_",
+    "v": "v",
+    "q": "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_",
+}
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
 _ALIASES = {
@@ -55,11 +52,11 @@ _ALIASES = {
         *("header_stamp_nsecs", "header_stamp_nanosec", "stamp_nsecs", "stamp_nanosec"),
         *("nsecs", "nanosec"),
     ),
-    **_ends(
-        "w", "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_ w_rs_s_"
-    ),
-    **_ends("v", "v"),
-    **_ends("q", "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_"),
+    **{
+        f"{kind}{axis}": tuple(f"{name}{axis}" for name in names.split())
+        for kind, names in _BEGINNINGS.items()
+        for axis in "xyzw"
+    },
     **{name: (name,) for name in (*MATRIX, *UNNAMED)},
 }
 # Names that stand for a part of an orientation, even if it is not known which.
@@ -99,9 +96,7 @@ def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -
     found = _matches(names)
     # The stamp of the message's header rather than the time of its arrival.
     stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",) * ("t" in found)
-    if measures == "auto":
-        measures = _what_is_there(found, names)
-    measured = _quantities(found, measures)
+    measures, measured = _measured(found, names, measures)
     if missing := [name for name in measured if name not in found]:
         raise InputError(
             f"{path}: no column for {', '.join(missing)} among {listed(names)}; name all columns "
@@ -119,40 +114,38 @@ def choose_columns(path: object, names: Sequence[str], measures: str = "auto") -
     return Columns([found[name][0] for name in stamp], at, measures, unit, units)
 
 
-def _quantities(found: dict[str, list[int]], measures: str) -> tuple[str, ...]:
-    """The quantities to read: of poses, or of the part of them that is measured; of "twists",
-    velocities. The preferred ones if none are complete.
+def _measured(
+    found: dict[str, list[int]], names: Sequence[str], measures: str
+) -> tuple[str, tuple[str, ...]]:
+    """What the columns measure, "twists" being velocities, and the quantities to read for that:
+    poses and the preferred quantities in doubt, so that what is missing is named.
     """
-    whole = {"rates": RATES, "twists": TWIST} | ({"poses": MATRIX} if MATRIX[0] in found else {})
-    if measures in whole:
-        return whole[measures]
-    orientation = (_complete(_ALL_ORIENTATIONS, found) or _ORIENTATIONS)[0]
+
+    def best(*groups: tuple[str, ...]) -> tuple[str, ...] | None:
+        return next((group for group in groups if {*group} <= found.keys()), None)
+
+    turn, heading = best(*_ORIENTATIONS), best(*_PLANAR_ORIENTATIONS)
+    flat = best(*_ALL_POSITIONS)
+    if measures == "auto":
+        oriented = {*chain(*_ORIENTATIONS, *_PLANAR_ORIENTATIONS)}
+        measures = "poses"
+        if flat and not (found.keys() & oriented or any(map(_ORIENTED, names))):
+            measures = "positions"
+        elif not found.keys() & {*chain(*_POSITIONS)}:
+            measures = "rates" if best(RATES) else "rotations" if turn else "poses"
+    if measures == "poses" and MATRIX[0] in found:
+        return measures, MATRIX
+    orientation = turn or heading or QUATERNION
     is_planar = measures == "positions" or orientation in _PLANAR_ORIENTATIONS
-    position = (_complete(_ALL_POSITIONS if is_planar else _POSITIONS, found) or _POSITIONS)[0]
-    parts = {"positions": position, "rotations": orientation}
-    return parts.get(measures, (*position, *orientation))
-
-
-def _what_is_there(found: dict[str, list[int]], names: Sequence[str]) -> str:
-    """What the columns measure; poses in doubt, so that what is missing is named."""
-    if _complete(_ALL_POSITIONS, found):
-        is_oriented = found.keys() & {*chain(*_ALL_ORIENTATIONS)} or any(map(_ORIENTED, names))
-        return "poses" if is_oriented else "positions"
-    if found.keys() & {*chain(*_POSITIONS)}:
-        return "poses"
-    if _complete((RATES,), found):
-        return "rates"
-    return "rotations" if _complete(_ORIENTATIONS, found) else "poses"
-
-
-def _complete(groups: Groups, found: dict[str, list[int]]) -> Groups:
-    """The groups of which every quantity has a column."""
-    return [group for group in groups if set(group) <= found.keys()]
+    position = (flat if is_planar else best(*_POSITIONS)) or POSITION
+    parts = {"rates": RATES, "twists": TWIST, "positions": position, "rotations": orientation}
+    return measures, parts.get(measures, (*position, *orientation))
 
 
 def are_columns(names: Sequence[str]) -> bool:
     """Whether these are names of columns, or some other text."""
-    return bool(_complete((*_ALL_POSITIONS, RATES), _matches(names)))
+    found = _matches(names).keys()
+    return any({*group} <= found for group in (*_ALL_POSITIONS, RATES))
 
 
 def _matches(names: Sequence[str]) -> dict[str, list[int]]:

@@ -21,7 +21,7 @@ from hand_eye_calib.geometry.trajectory import (
     far_position,
 )
 from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
-from hand_eye_calib.io.trajectory_files.columns import MATRIX, QUATERNION, UNNAMED
+from hand_eye_calib.io.trajectory_files.columns import MATRIX, QUATERNION, RATES, UNNAMED
 from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.stats import median
 
@@ -127,16 +127,22 @@ def seconds(stamp_ns: int) -> str:
 # ---- poses and rates
 
 
-def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, FloatArray]:
-    """Positions (N, 3), m, and quaternions (N, 4), scalar last, of a table; what had to be guessed
-    is added to its ``guesses``. A ``convention`` of its angles goes before what the motion says.
+def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
+    """Positions (N, 3), m, and quaternions (N, 4), scalar last, of a table, or its angular rates
+    (N, 3), rad/s; what had to be guessed is added to its ``guesses``. A ``convention`` of its
+    angles goes before what the motion says.
 
     Raises
     ------
     InputError
         For values that cannot be; the message names the line.
     """
-    _check_finite(table)
+    table.refuse(
+        np.asarray(~np.isfinite(table.values).all(axis=1)),
+        lambda _: "found a value that is not finite; remove the line or repair its source",
+    )
+    if table.columns.measures == "rates":
+        return (_in_si(table, RATES, _RATES),)
     quantities, positions, to_first = table.columns.quantities, np.zeros((len(table), 3)), None
     up = next((name for name in ("z", "height") if name in quantities), None)
     if "lat" in quantities:
@@ -171,26 +177,6 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, FloatArray
         in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
         quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
     return positions, quats_xyzw
-
-
-def rates_of(table: Table) -> FloatArray:
-    """The angular rates (N, 3), rad/s, of a table of rates; a unit that had to be guessed is added
-    to its ``guesses``.
-
-    Raises
-    ------
-    InputError
-        For values that cannot be; the message names the line.
-    """
-    _check_finite(table)
-    return _in_si(table, [*table.columns.quantities], _RATES)
-
-
-def _check_finite(table: Table) -> None:
-    table.refuse(
-        np.asarray(~np.isfinite(table.values).all(axis=1)),
-        lambda _: "found a value that is not finite; remove the line or repair its source",
-    )
 
 
 def _in_si(

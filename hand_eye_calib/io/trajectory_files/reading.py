@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
-from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, rates_of, stamps_in_ns
+from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
 from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.text import told_apart
@@ -235,7 +235,7 @@ def _read(
         )
     stamps_ns = stamps_in_ns(table, options.stamp_unit) if rows is None else np.array([])
     kind = table.columns.measures
-    values = (rates_of(table),) if kind == "rates" else poses_of(table, convention)
+    values = poses_of(table, convention)
     if rows is None:
         rows, repairs = in_order(table, stamps_ns, options.repair)
         stamps_ns = stamps_ns[rows]

@@ -94,9 +94,16 @@ class FileOptions:
 # ---- lines
 
 
-def lines_of(path: _Path, expected: str = "a trajectory") -> Iterator[Line]:
-    """The lines of a text file that are not blank, with their numbers; an InputError if it cannot
-    be read. They are read anew each time: a list would take many times the memory of the text.
+def lines_of(
+    path: _Path, expected: str = "a trajectory", after: int | None = None
+) -> Iterator[Line]:
+    """The lines of a text file that are not blank, with their numbers; those after one that are no
+    comments. They are read anew each time: a list would take many times the memory of the text.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
     """
     try:
         with TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
@@ -107,19 +114,11 @@ def lines_of(path: _Path, expected: str = "a trajectory") -> Iterator[Line]:
                     raise InputError(
                         f"{path}, line {number}: longer than {LONGEST_LINE} characters"
                     )
-                if stripped := text.strip():
-                    yield number, stripped
+                text = text.strip()
+                if text and (after is None or (number > after and not text.startswith("#"))):
+                    yield number, text
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected lines of {expected}") from None
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
-
-
-def _data(path: _Path, expected: str = "a trajectory", after: int = 0) -> Iterator[Line]:
-    """The lines after one that are no comments."""
-    return (
-        line for line in lines_of(path, expected) if line[0] > after and not line[1].startswith("#")
-    )
 
 
 def _cells_of(text: str) -> list[str]:
@@ -142,46 +141,59 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 class Head(NamedTuple):
-    """The first line of a file that is no comment, its number and cells (0 and none if there is no
-    such line), and the names of the columns, if the file has any: that line, unless it is a row of
-    numbers; otherwise the last comment above it that has as many cells.
+    """What the beginning of a file tells.
+
+    Attributes
+    ----------
+    number : int
+        That of the first line that is no comment; 0 if there is none.
+    cells : list of str
+        The cells of that line.
+    names : list of str or None
+        Those of the columns: that line, unless it is a row of numbers; otherwise the last comment
+        above it that has as many cells; None if there is none.
+    format : str
+        One of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum in doubt, so that its reader
+        says what is wrong.
+    header : sequence of str or None
+        The columns of that format, if they are known.
     """
 
     number: int
-    text: str
     cells: list[str]
-    names: list[str] | None
+    names: Sequence[str] | None
+    format: str
+    header: Sequence[str] | None
 
     @classmethod
     def of(cls, path: _Path) -> Self:
-        """Read it."""
+        """Look at a file."""
         comments: dict[int, list[str]] = {}
-        for number, text in lines_of(path):
-            cells = _cells_of(text.lstrip("#").strip())
-            if not text.startswith("#"):
-                return cls(
-                    number, text, cells, comments.get(len(cells)) if _is_row(cells) else cells
-                )
+        for line in lines_of(path):
+            cells = _cells_of(line[1].lstrip("#").strip())
+            if not line[1].startswith("#"):
+                break
             if not _is_row(cells):
                 comments[len(cells)] = cells
-        return cls(0, "", [], None)
-
-    def layout(self) -> tuple[str, Sequence[str] | None]:
-        """The format that a file has, one of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum
-        in doubt, so that its reader says what is wrong; and the names of its columns, if they are
-        known.
-        """
-        is_separated, n_cells = "," in self.text or ";" in self.text, len(self.cells)
-        if self.names and (self.names is self.cells or are_columns(self.names)):
-            is_tum = " ".join(self.names).lower().endswith(TUM_COLUMNS[10:])
-            return (
-                ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", self.names)
-            )
+        else:
+            line, cells = (0, ""), []
+        number, text = line
+        names = comments.get(len(cells)) if _is_row(cells) or not cells else cells
+        start, is_separated, n_cells = (
+            (number, cells, names),
+            "," in text or ";" in text,
+            len(cells),
+        )
+        if names and (names is cells or are_columns(names)):
+            if not is_separated and " ".join(names).lower().endswith(TUM_COLUMNS[10:]):
+                return cls(*start, "tum", _FORMATS["tum"][0])
+            return cls(*start, "csv", names)
         if not is_separated and n_cells != 4:
-            return ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
-        if n_cells >= 8 and self.cells[0].isdecimal() and len(self.cells[0]) >= _DIGITS_OF_NS:
-            return "euroc", _FORMATS["euroc"][0]
-        return "csv", _UNNAMED if n_cells == 8 else None
+            found = ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
+            return cls(*start, *found)
+        if n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS:
+            return cls(*start, "euroc", _FORMATS["euroc"][0])
+        return cls(*start, "csv", _UNNAMED if n_cells == 8 else None)
 
 
 # ---- tables
@@ -333,7 +345,7 @@ def read_table(path: _Path, options: FileOptions) -> Table:
         format = format if format != AUTO else "csv" if columns else "kitti"
         header = _FORMATS[format][0] if format != "csv" else head.names
     else:
-        format, header = head.layout()
+        format, header = head.format, head.header
         header = header or _OF_FOUR.get(options.measures) if len(head.cells) == 4 else header
         if format != "tum":
             guesses = [f"{path} looks like format {format}; to change that, give `format`"]
@@ -351,12 +363,12 @@ def read_table(path: _Path, options: FileOptions) -> Table:
             f"{len(head.cells)} with `columns`, such as t,x,y,z,qx,qy,qz,qw or t,wx,wy,wz"
         )
     _, expected, cells_of = _FORMATS.get(format, ((), "", _cells_of))
-    lines = _data(path, after=after if format == "csv" else 0)
+    lines = lines_of(path, after=after if format == "csv" else 0)
     measures = options.measures if format == "csv" else AUTO
     table = table_of(path, header or _UNNAMED, lines, cells_of, measures, expected)
     if format == "kitti" and times is not None:
         stamps = Table(times, "a stamp", Columns([0], {}))
-        lines = _data(times, "stamps")
+        lines = lines_of(times, "stamps", after=0)
         table.stamps = stamps.fill(lines, lambda text: text.split()[:1], 1).stamps
         if len(table.stamps) != len(table):
             raise InputError(
