@@ -46,7 +46,7 @@ class PoseInput:
     is_enabled : bool
         Whether poses are taken.
     problem : str
-        Why the topic is not used; empty if it is.
+        Why there is none; empty if that is not known.
     """
 
     def __init__(
@@ -62,13 +62,13 @@ class PoseInput:
         self._guard, self._refused = StampGuard(), Counter[str]()
         self._session, self._log, self._on_jump_back = session, log, on_jump_back
         self._wanted, self._is_watching = "auto", False
-        self._arrived = self._lost = 0
+        self._arrived, self._lost = 0, 0
         self._next_number: int | None = None
         self._arrived_s: float | None = None
         self._bad, self._bad_at_s = "", -np.inf
         self._counts = deque([(time.monotonic(), 0, 0)], maxlen=_REPORTS + 1)
         self._last_stamp_ns: int | None = None
-        self._longest_gap_ns = 0
+        self._longest_gap_ns, self._is_new = 0, True
 
     @property
     def has_poses(self) -> bool:
@@ -84,6 +84,7 @@ class PoseInput:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
         self._last_stamp_ns, self._longest_gap_ns = None, 0
+        self._is_new = because_of is None
         if because_of is None:
             self._guard.restart()
         elif because_of is not self:
@@ -139,12 +140,11 @@ class PoseInput:
                 "reset?): new session, earlier poses forgotten"
             )
             self._on_jump_back(self)
-        self._use(judgement, is_first=last_ns is None)
+        self._use(judgement)
 
     def flush(self) -> None:
         """Take messages that waited for others, if none came; to be called often."""
-        is_first = not self.has_poses
-        self._use(self._guard.flush(time.monotonic()), is_first)
+        self._use(self._guard.flush(time.monotonic()))
 
     def refuse(self, which: str, reason: str, text: str) -> None:
         """Count a message that cannot be used, and say why."""
@@ -153,7 +153,7 @@ class PoseInput:
         self._log.warning(f"{self.topic}: a message is refused: {text}")
         self._log.debug(f"{self.topic}: message {which} refused: {text}")
 
-    def _use(self, judgement: Judgement, is_first: bool) -> None:
+    def _use(self, judgement: Judgement) -> None:
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
             self.refuse(with_stamp(stamp_ns), "corrupt stamp", text)
@@ -169,8 +169,8 @@ class PoseInput:
                     self._log.debug(f"{self.topic}: message {which} is repeated or too late")
             except HandEyeCalibError as error:
                 self.refuse(with_stamp(stamp_ns), "unusable", str(error))
-        if is_first and judgement.taken:
-            first_s = judgement.taken[0][0] * 1e-9
+        if judgement.taken and self._is_new:
+            self._is_new, first_s = False, judgement.taken[0][0] * 1e-9
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
     # ----------------------------------------------------------------- state

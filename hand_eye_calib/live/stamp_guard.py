@@ -22,8 +22,8 @@ WITNESSES = 6
 # those at the end of a stream follow it, within the longest pause (ns).
 _NEAR_NS, _NEAR_PERIODS, _LONGEST_PAUSE_NS = 1_000_000_000, 5, 60_000_000_000
 
-# A stream is silent after so long (s, periods); at the start of a session, after so long (s).
-_SILENCE_S, _SILENCE_PERIODS, _START_SILENCE_S = 0.5, 5, 2.0
+# A stream is silent after so long (s, periods).
+_SILENCE_S, _SILENCE_PERIODS = 2.0, 5
 
 # After one stream has jumped back, the others' messages of before are left out for so long (s).
 _OTHERS_FOLLOW_S = 2.0
@@ -75,8 +75,6 @@ class StampGuard:
     def flush(self, now_s: float) -> Judgement:
         """Judge the messages that wait if the stream is silent; to be called often."""
         silence_s = max(_SILENCE_S, _SILENCE_PERIODS * self._period_ns() * 1e-9)
-        if self.last_ns is None:
-            silence_s = max(silence_s, _START_SILENCE_S)
         if not self._held or now_s - self._arrived_s < silence_s:
             return Judgement()
         # A short stream, or the last ones after a pause: as good as it gets.
@@ -88,8 +86,8 @@ class StampGuard:
         if now_s is None:
             self._begin()
         elif self.last_ns is not None:
-            follow_s = _OTHERS_FOLLOW_S + 2 * WITNESSES * self._period_ns() * 1e-9
-            self._outdated_until_s = now_s + follow_s
+            self._outdated_until_s = now_s + _OTHERS_FOLLOW_S
+            self._outdated_until_s += 2 * WITNESSES * self._period_ns() * 1e-9
 
     def resume(self, last_ns: int | None) -> None:
         """Go on with a session whose newest stamp this is."""
