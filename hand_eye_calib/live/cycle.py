@@ -357,16 +357,18 @@ class SolveCycle:
 def _result_state(result: Calibration, age_s: float) -> ResultState:
     T, sigmas = result.T_parent_child, result.sigmas_printed
     pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
-    same = ("parent_frame", "child_frame", "warnings", "n_poses", "time_offset_s",
-            "time_offset_sigma_s", "scale", "scale_sigma")  # fmt: skip
     return ResultState(
-        **{name: getattr(result, name) for name in same},
+        parent_frame=result.parent_frame,
+        child_frame=result.child_frame,
         verdict=result.verdict.value,
         status=result.status.value,
         reasons=tuple(f"{each.sentence}: {each.what_to_do}" for each in result.reasons),
         pose=by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
         pose_sigma=by_axis(sigmas),
-        inlier_share=result.n_inliers / max(result.n_pairs, 1),
+        warnings=result.warnings,
+        n_poses=result.n_poses,
+        time_offset_s=result.time_offset_s,
+        scale=result.scale,
         age_s=age_s,
     )
 

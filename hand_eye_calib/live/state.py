@@ -64,11 +64,8 @@ class ResultState:
     pose: AxisValues
     pose_sigma: AxisValues
     n_poses: int
-    inlier_share: float
     time_offset_s: float
-    time_offset_sigma_s: float
     scale: float
-    scale_sigma: float
     age_s: float
 
 

@@ -40,9 +40,6 @@ _STATE_PERIOD_S = 1.0
 # Inputs that have not delivered anything yet are named in the log so often.
 _SILENT_EVERY_S = 30.0
 
-# Requests that come while the node is busy wait here.
-_SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-
 
 class CalibratorNode(Node):
     """Estimates the pose of the child sensor in the parent sensor's frame from two live streams of
@@ -94,7 +91,6 @@ class CalibratorNode(Node):
         self._cycle = SolveCycle(self._session, self._log, *hooks, config.targets)
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
-        self._start_timers()
         self._discover()
         self._say_start()
 
@@ -153,17 +149,16 @@ class CalibratorNode(Node):
         return made
 
     def _serve(self) -> None:
+        # A long queue: requests come while the node is busy, too.
+        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+        serve = partial(self.create_service, qos_profile=qos)
         # A group of its own: while it awaits a solve, it would hold up every other callback of its
         # group.
-        group, qos = ReentrantCallbackGroup(), _SERVICE_QOS
-        serve = partial(self.create_service, qos_profile=qos)
-        serve(Trigger, "~/solve", self._on_solve, callback_group=group)
+        serve(Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup())
         save = lambda request: self._saver.save(self._options.node)  # noqa: E731
         serve(Trigger, "~/save", partial(_answer, save))
         serve(Trigger, "~/reset", partial(_answer, self._reset))
         serve(SetBool, "~/set_enabled", partial(_answer, self._set_enabled))
-
-    def _start_timers(self) -> None:
         # Steady time: these go on while a bag, and with it simulated time, is paused.
         make = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._solve_timer = make(self._options.node.solve_period, self._on_solve_timer)

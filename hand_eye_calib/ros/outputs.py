@@ -24,7 +24,6 @@ from hand_eye_calib.text import in_words
 PROGRESS_TOPIC = "progress"
 # How long the end of the node waits for those who listen.
 _LAST_WORD = Duration(seconds=0.2)
-HARDWARE_ID = "hand_eye_calib"
 
 # Parts of the state that the names of values on /diagnostics leave out.
 _UNNAMED = ("progress", "axes", "result", "differences")
@@ -88,7 +87,7 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
             level=bytes([part.level]),
             name=f"{state.node}: {name}",
             message=part.text,
-            hardware_id=HARDWARE_ID,
+            hardware_id="hand_eye_calib",
             values=[KeyValue(key=key, value=text) for key, text in values.items()],
         )
         message.status.append(status)

@@ -46,7 +46,7 @@ PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 RESULT = ResultState(
     parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
     reasons=("a: b", "c: d"), warnings=(), n_poses=9,
-    inlier_share=1.0, time_offset_s=0.0, time_offset_sigma_s=0.0, scale=1.0, scale_sigma=0.0,
+    time_offset_s=0.0, scale=1.0,
     age_s=1.0,
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
     pose_sigma={"x": 0.004, "y": 0.004, "z": None, "roll": 0.01, "pitch": 0.01, "yaw": 0.01},
