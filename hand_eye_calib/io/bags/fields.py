@@ -112,8 +112,9 @@ class FieldReader:
         stamps_ns = stamps_in_ns(table, None)
         if measures == "twists":
             return stamps_ns, _integrated(stamps_ns, table.values), []
-        positions, quats_xyzw = poses_of(table)
-        return stamps_ns, np.c_[positions, quats_xyzw], table.guesses
+        if table.columns.measures == "rates":
+            raise InputError(f"{self._topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
+        return stamps_ns, np.c_[poses_of(table)], table.guesses
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:

@@ -141,22 +141,10 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 class Head(NamedTuple):
-    """What the beginning of a file tells.
-
-    Attributes
-    ----------
-    number : int
-        That of the first line that is no comment; 0 if there is none.
-    cells : list of str
-        The cells of that line.
-    names : list of str or None
-        Those of the columns: that line, unless it is a row of numbers; otherwise the last comment
-        above it that has as many cells; None if there is none.
-    format : str
-        One of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`, tum in doubt, so that its reader
-        says what is wrong.
-    header : sequence of str or None
-        The columns of that format, if they are known.
+    """What the beginning of a file tells: number and cells of the first line that is no comment (0
+    and none without one); the names of the columns, which are that line, unless it is a row of
+    numbers, otherwise the last comment above it that has as many cells; the format, tum in doubt,
+    so that its reader says what is wrong; and the columns of that format, if they are known.
     """
 
     number: int
@@ -177,23 +165,17 @@ class Head(NamedTuple):
                 comments[len(cells)] = cells
         else:
             line, cells = (0, ""), []
-        number, text = line
         names = comments.get(len(cells)) if _is_row(cells) or not cells else cells
-        start, is_separated, n_cells = (
-            (number, cells, names),
-            "," in text or ";" in text,
-            len(cells),
-        )
+        is_separated, n_cells = "," in line[1] or ";" in line[1], len(cells)
+        found: tuple[str, Sequence[str] | None] = "csv", _UNNAMED if n_cells == 8 else None
         if names and (names is cells or are_columns(names)):
-            if not is_separated and " ".join(names).lower().endswith(TUM_COLUMNS[10:]):
-                return cls(*start, "tum", _FORMATS["tum"][0])
-            return cls(*start, "csv", names)
-        if not is_separated and n_cells != 4:
+            is_tum = " ".join(names).lower().endswith(TUM_COLUMNS[10:])
+            found = ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", names)
+        elif not is_separated and n_cells != 4:
             found = ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
-            return cls(*start, *found)
-        if n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS:
-            return cls(*start, "euroc", _FORMATS["euroc"][0])
-        return cls(*start, "csv", _UNNAMED if n_cells == 8 else None)
+        elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS:
+            found = "euroc", _FORMATS["euroc"][0]
+        return cls(line[0], cells, names, *found)
 
 
 # ---- tables
