@@ -6,6 +6,7 @@ import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
+from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -78,8 +79,12 @@ def from_plain(kind: Any, value: Any) -> Any:
     return _of_type(kind, value)
 
 
+# Finding them takes longer than all else.
+_hints = cache(get_type_hints)
+
+
 def _record(kind: Any, value: Mapping[str, Any]) -> Any:
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     given = {}
     for each in fields(kind):
         if each.name in value:

@@ -2,6 +2,7 @@
 with time, and a row for each recording with a link to its report.
 """
 
+import json
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
@@ -38,8 +39,9 @@ _TO_SHOWN = np.repeat([1000.0, np.degrees(1.0)], 3)
 # A band of the common value in its own standard deviations.
 _BAND = 2.0
 _GRAVITY = ("bad", "warn", "good")
-# More would make the page too large for a browser.
-_MOST_VEHICLES, _MOST_FIGURES = 40, 12
+# More vehicles and figures, and figures that make the page larger than so many characters, are left
+# out.
+_MOST_VEHICLES, _MOST_FIGURES, _LARGEST_PAGE = 40, 12, 1_900_000
 
 
 def render_batch(
@@ -72,6 +74,13 @@ def render_batch(
     )
     counts = Counter(cell[2] for cell in cells)
     ordered = sorted(vehicles.items(), key=lambda one: _GRAVITY.index(TONES[one[1].verdict.value]))
+    figures, left = [], _LARGEST_PAGE - len(json.dumps(cells))
+    for number, (_, result) in enumerate(ordered[:_MOST_FIGURES], start=1):
+        figures.append(_trend(result, number))
+        left -= len(figures[-1].svg)
+        if left < 0:
+            figures.pop()
+            break
     return page(
         "batch.html",
         TONES.get(cells[0][2], "bad"),
@@ -83,7 +92,7 @@ def render_batch(
             (name, result, _values(row_of_result(result.to_dict())))
             for name, result in ordered[:_MOST_VEHICLES]
         ],
-        figures=[_trend(each, n) for n, (_, each) in enumerate(ordered[:_MOST_FIGURES], start=1)],
+        figures=figures,
         rows=cells,
         tones=TONES,
         headings=[f"{name} {unit}" for name, unit in _AXES.items()],

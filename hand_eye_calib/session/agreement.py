@@ -20,7 +20,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
+from typing import Literal
 
 import numpy as np
 
@@ -39,15 +39,8 @@ _LEVEL = 0.01
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
 
-class Kind(str, Enum):
-    """How the results of a rig belong together."""
-
-    SINGLE = "single"  # there is nothing to compare with
-    AGREE = "agree"
-    SCATTER = "scatter"  # more than usual, but none stands out
-    ONE_OFF = "one off"
-    MOVED = "moved"
-    DIFFER = "differ"  # two recordings: nobody knows which
+# How the results of a rig belong together: see Together.kind.
+Kind = Literal["single", "agree", "scatter", "one off", "moved", "differ"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,18 +86,18 @@ class Agreement:
     def sentence(self, names: Sequence[str]) -> str:
         """What the comparison of results with these names found."""
         match self.kind:
-            case Kind.SINGLE:
+            case "single":
                 return "One recording: nothing to compare with"
-            case Kind.AGREE:
+            case "agree":
                 found = f"The {len(names)} recordings agree within their standard deviations"
-            case Kind.DIFFER:
+            case "differ":
                 found = f"{names[0]} and {names[1]} differ; a third recording shows which is off"
-            case Kind.SCATTER:
+            case "scatter":
                 found = f"The {len(names)} recordings scatter {self.excess:.1f} times as much as "
                 found += "recordings of one rig do; none stands out"
-            case Kind.ONE_OFF:
+            case "one off":
                 found = f"{names[self.apart[0]]} differs from the others: {self._moves()}"
-            case Kind.MOVED:
+            case "moved":
                 found = f"The mount has moved before {names[self.apart[0]]}: {self._moves()}"
         return (
             f"{found} (chi-square {self.chi2:.1f} with {self.dof} degrees of freedom, "
@@ -242,9 +235,10 @@ def _explanation(
     each = np.swapaxes(design, 1, 2) @ weights @ design, _ranks(weights)
     all_chi2, all_dof = _left(*(one.sum(axis=0) for one in each))
     p_value = float(chdtrc(all_dof, all_chi2)) if all_dof else 1.0
-    kind, apart = Kind.DIFFER if p_value < _LEVEL else Kind.AGREE, number < 0
+    kind: Kind
+    kind, apart = "differ" if p_value < _LEVEL else "agree", number < 0
     if len(number) < 3:
-        kind = kind if len(number) == 2 else Kind.SINGLE
+        kind = kind if len(number) == 2 else "single"
         return kind, apart, float(all_chi2), int(all_dof), p_value
     alone_since = [np.concatenate([one, np.cumsum(one[::-1], axis=0)[::-1][2:-1]]) for one in each]
     others = [one.sum(axis=0) - some for one, some in zip(each, alone_since, strict=True)]
@@ -258,10 +252,10 @@ def _explanation(
     best = int(np.argmin(p_values))
     if len(p_values) * p_values[best] < level:
         is_one = best < len(number)
-        kind = Kind.ONE_OFF if is_one else Kind.MOVED
+        kind = "one off" if is_one else "moved"
         apart = number == best if is_one else number >= best - len(number) + 2
-    elif kind is Kind.DIFFER:
-        kind = Kind.SCATTER
+    elif kind == "differ":
+        kind = "scatter"
     return kind, apart, float(all_chi2), int(all_dof), p_value
 
 

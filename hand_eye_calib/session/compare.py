@@ -15,7 +15,6 @@ from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.records import AxisDifference, Comparison, Difference
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.results.verdict import target_of
-from hand_eye_calib.session.agreement import Kind
 from hand_eye_calib.session.together import agreement_of_results, require_same_frames
 from hand_eye_calib.text import listing
 
@@ -84,7 +83,7 @@ def compare(
         found = agreement_of_results(results, level=0.05)
         pairs = listing([f"{each.first} and {each.second}" for each in apart])
         who, told = (), f"{pairs} differ; which of them has moved, they do not tell"
-        if found.kind in (Kind.ONE_OFF, Kind.MOVED):
+        if found.kind in ("one off", "moved"):
             who, told = tuple(called[index] for index in found.apart), found.sentence(called)
         sentence = f"moved: {told}"
     return Comparison(sentence=sentence, verdict=verdict, moved=who, differences=differences)

@@ -181,7 +181,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     evidence = {name: getattr(found, name) for name in ("chi2", "dof", "p_value")}
     record = Together(
         **evidence,
-        kind=found.kind.value,
+        kind=found.kind,
         sentence=found.sentence(names),
         scatter=_by_axis(found.scatter),
         recordings=records,

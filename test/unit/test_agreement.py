@@ -6,7 +6,7 @@ from fleet_making import recordings_of
 
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.session.agreement import Kind, agreement_of
+from hand_eye_calib.session.agreement import agreement_of
 
 
 def results(seed, count, unknown_z=False, apart=(), factor=1.0):
@@ -23,7 +23,7 @@ def results(seed, count, unknown_z=False, apart=(), factor=1.0):
 def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
     seeds = range(40 if count < 10 else 15)
     found = [agreement_of(*results(seed, count, unknown_z)) for seed in seeds]
-    alarms = sum(one.kind is not Kind.AGREE for one in found)
+    alarms = sum(one.kind != "agree" for one in found)
     assert alarms <= 4  # 0.8 expected, 5 or more once in 800
     p_values = np.array([one.p_value for one in found])
     assert 0.35 < p_values.mean() < 0.65
@@ -43,7 +43,7 @@ def test_the_common_extrinsic_is_better_than_each_and_says_how_good():
 @pytest.mark.parametrize("unknown_z", [False, True])
 @pytest.mark.parametrize(
     ("apart", "kind"),
-    [([4], Kind.ONE_OFF), ([0], Kind.ONE_OFF), ([7], Kind.ONE_OFF), ([5, 6, 7], Kind.MOVED)],
+    [([4], "one off"), ([0], "one off"), ([7], "one off"), ([5, 6, 7], "moved")],
 )
 def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
     for seed in range(10):
@@ -57,24 +57,24 @@ def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
 
 def test_results_that_all_scatter_more_than_stated_accuse_none():
     found = [agreement_of(*results(seed, 12, factor=0.25)) for seed in range(20)]
-    scattered = [one for one in found if one.kind is Kind.SCATTER]
+    scattered = [one for one in found if one.kind == "scatter"]
     assert len(scattered) >= 19
     assert all(1.5 < one.excess < 2.5 for one in scattered)
 
 
 def test_of_two_that_differ_none_is_accused():
     found = agreement_of(*results(3, 2, apart=[1]))
-    assert (found.kind, found.apart) == (Kind.DIFFER, ())
+    assert (found.kind, found.apart) == ("differ", ())
     assert found.sentence("ab").startswith("a and b differ; a third recording shows which is off")
 
 
 def test_a_single_result_and_one_that_knows_nothing():
     Ts, covariances = results(3, 2)
     found = agreement_of(Ts[:1], covariances[:1])
-    assert (found.kind, found.dof, found.p_value) == (Kind.SINGLE, 0, 1.0)
+    assert (found.kind, found.dof, found.p_value) == ("single", 0, 1.0)
     np.testing.assert_allclose(found.T_parent_child, Ts[0])
     covariances[1] = np.diag([np.inf] * 6)
     found = agreement_of(Ts, covariances)
-    assert (found.kind, found.dof) == (Kind.AGREE, 0)
+    assert (found.kind, found.dof) == ("agree", 0)
     np.testing.assert_allclose(found.T_parent_child, Ts[0], atol=1e-9)
     assert np.isnan(found.deviations[1]).all()
