@@ -132,14 +132,12 @@ def test_json_is_one_document_on_stdout(run, new_bag):
     assert document["inputs"]["options"]["method"] == "dnl"
 
 
-@pytest.mark.parametrize(("parent", "child"), [("/base_link/odom", "/a"), ("/a", "/b")])
-def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path, parent, child):
+def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path):
     first, second = drive()
-    bag = tmp_path / "named"
-    write_bag(bag, {child: (second, ODOMETRY), parent: (first, ODOMETRY)}, "mcap")
-    code, out, err = run("check", bag)
+    write_bag(tmp_path / "named", {"/a": (second, ODOMETRY), "/base_link/odom": (first, ODOMETRY)})
+    code, out, err = run("check", tmp_path / "named")
     assert code == 0
-    assert f"parent is {parent}\nchild is {child}\n" in out
+    assert "parent is /base_link/odom\nchild is /a\n" in out
 
 
 def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
@@ -238,19 +236,14 @@ def test_static_transform_command_carries_the_extrinsic():
     )
 
 
-def test_a_result_that_did_not_converge_and_warnings_are_spelled_out():
-    text = as_text(some_calibration(status=SolveStatus.NOT_CONVERGED, warnings=("look here",)))
-    assert text.startswith(
-        "DO NOT USE: the solver did not converge\n  -> record more varied motion\nNote: look here\n"
-    )
-    assert "static_transform_publisher" not in text
-    assert "unobservable" not in text
-
-
 def test_a_solve_that_did_not_converge_fails(run, new_bag, monkeypatch):
     from hand_eye_calib.engine.snapshot import Snapshot
 
-    calibration = some_calibration(status=SolveStatus.NOT_CONVERGED)
+    calibration = some_calibration(status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
+    assert as_text(calibration).startswith(
+        "DO NOT USE: the solver did not converge\n  -> record more varied motion\nNote: look here\n"
+    )
+    assert "static_transform_publisher" not in as_text(calibration)
     monkeypatch.setattr(Snapshot, "estimate", lambda self, **_: calibration)
     code, out, err = run("replay", new_bag(), *TOPICS, "--json")
     assert (code, json.loads(out)["status"]) == (1, "not_converged")
@@ -305,6 +298,8 @@ def test_nan_is_named_with_topic_message_and_stamp(refused, new_bag):
 def test_help_lists_every_option_with_its_default(run):
     code, out, _ = run("calibrate", "--help")
     assert code == 0
+    assert out.startswith("usage: hand_eye_calib calibrate [OPTION ...] PATH ...\n")
+    assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")
     words = " ".join(out.partition("\nexamples:")[0].split())
     for field in dataclasses.fields(CalibratorConfig):
         name = f"--{option_name(field).replace('.', '-').replace('_', '-')}"
@@ -449,17 +444,6 @@ def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
     assert "this needs ROS 2's Python packages (rclpy is missing): source the setup file" in line
 
 
-def test_a_defect_keeps_its_traceback(new_bag, monkeypatch):
-    from hand_eye_calib.engine.snapshot import Snapshot
-
-    def defect(self, **_):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(Snapshot, "estimate", defect)
-    with pytest.raises(ZeroDivisionError):
-        main(["replay", new_bag(), *TOPICS])
-
-
 def start(*arguments, stdout=subprocess.PIPE):
     return subprocess.Popen(
         [sys.executable, "-m", "hand_eye_calib", *map(str, arguments)],
@@ -470,12 +454,11 @@ def start(*arguments, stdout=subprocess.PIPE):
     )
 
 
-def test_process_exit_codes_and_streams(tmp_path):
-    for arguments, code in ((["replay", tmp_path / "absent"], 1), (["replay"], 2)):
-        process = start(*arguments)
-        out, err = process.communicate()
-        assert (process.returncode, out) == (code, "")
-        assert "Traceback" not in err
+def test_a_process_ends_with_the_code(tmp_path):
+    process = start("replay", tmp_path / "absent")
+    out, err = process.communicate()
+    assert (process.returncode, out) == (1, "")
+    assert "Traceback" not in err
 
 
 def test_interrupt_ends_quietly(tmp_path):
@@ -551,13 +534,3 @@ def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     assert "\ncam\\x1b[2Jera\\nStatus: ok in lidar" in text
     fail(hostile, 1)
     assert capsys.readouterr().err == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
-
-
-def test_help_shows_common_options_before_rare_ones_and_a_short_usage(run):
-    out = run("replay", "--help")[1]
-    assert out.startswith("usage: hand_eye_calib replay [OPTION ...] PATH ...\n")
-    assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")
-    assert "\nexamples:\n  hand_eye_calib calibrate " in out
-    assert run("simulate", "--help")[1].startswith(
-        "usage: hand_eye_calib simulate [OPTION ...] --out DIR\n"
-    )

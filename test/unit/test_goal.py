@@ -155,15 +155,6 @@ def test_the_newest_of_equally_good_results_is_kept():
     assert goal.best is newest
 
 
-def test_once_done_a_newer_result_need_not_have_moved_long_enough_again():
-    """What lasts may show late; without this an old result would be kept for ever."""
-    goal = Goal(TARGETS)
-    told(goal, result(), result())
-    newest = result(noise=lasting(20.0))
-    assert goal.add(newest, seen(44.0)).done
-    assert goal.best is newest
-
-
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
     hec.save(dataclasses.replace(made(), goal=progress), tmp_path)
