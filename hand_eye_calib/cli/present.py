@@ -124,15 +124,7 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
     """
     parent, child = calibration.parent_frame, calibration.child_frame
     document = calibration.to_dict()
-    lines = [calibration.headline]
-    for number, reason in enumerate(shown(calibration.reasons)):
-        # What to do about the first one may follow the headline, which says why, at once.
-        if number or not calibration.headline.endswith(reason.sentence):
-            lines += wrapped(reason.sentence, "- ", "  ")
-        options = typed_options(reason.options.items())
-        lines += wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")
-    for warning in calibration.warnings:
-        lines += wrapped(f"Note: {warning}", "", "  ")
+    lines = [*verdict_lines(calibration)]
     for source, target, name in (
         (child, parent, "T_parent_child"),
         (parent, child, "T_child_parent"),
@@ -152,6 +144,19 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
     lines += ["Details"] * bool(details)
     lines += [line for detail in details for line in wrapped(detail, "  ", "    ")]
     return "\n".join(printable(line) for line in lines)
+
+
+def verdict_lines(calibration: Calibration) -> Iterator[str]:
+    """Headline, reasons with what to do, and notes."""
+    yield calibration.headline
+    for number, reason in enumerate(shown(calibration.reasons)):
+        # What to do about the first one may follow the headline, which says why, at once.
+        if number or not calibration.headline.endswith(reason.sentence):
+            yield from wrapped(reason.sentence, "- ", "  ")
+        options = typed_options(reason.options.items())
+        yield from wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")
+    for warning in calibration.warnings:
+        yield from wrapped(f"Note: {warning}", "", "  ")
 
 
 def wrapped(text: str, first: str, others: str) -> list[str]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
 from hand_eye_calib.cli.options import options_from
-from hand_eye_calib.cli.present import exit_code, transform_lines, wrapped
+from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
 from hand_eye_calib.cli.reading import read_files, read_sources, refuse_recordings, source_of
 from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError, printable
@@ -71,11 +71,8 @@ def as_lines(rig: "RigCalibration") -> list[str]:
     """What a person needs to see of a rig: tree, extrinsics, closure."""
     lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", "", *rig.tree(), ""]
     for each in rig.calibrations:
-        lines += [f"{each.child_frame} in {each.parent_frame}: {each.headline}"]
-        for reason in each.reasons:
-            lines += wrapped(f"{reason.sentence}: {reason.what_to_do}", "- ", "  ")
-        for text in each.warnings:
-            lines += wrapped(f"Note: {text}", "", "  ")
+        first, *others = verdict_lines(each)
+        lines += [f"{each.child_frame} in {each.parent_frame}: {first}", *others]
         lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]
     lines += ["Results for two sensors at a time"]
     for one in rig.closures:

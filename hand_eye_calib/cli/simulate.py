@@ -13,7 +13,6 @@ from hand_eye_calib.simulation.options import (
     MIXTURE,
     PUBLISHED_DRIVE,
     REALISTIC,
-    DriveConfig,
     NoiseConfig,
 )
 from hand_eye_calib.text import counted
@@ -24,11 +23,10 @@ PARENT_TOPIC, CHILD_TOPIC = "/parent/odometry", "/child/odometry"
 _TYPE = "nav_msgs/msg/Odometry"
 
 _DRIVES = {"published": PUBLISHED_DRIVE, "hilly": HILLY_DRIVE}
-_NOISE_OPTIONS = {"noise": "gaussian", "outliers": "outliers", "drift": "drift"}
 _EPILOG = f"""\
 examples:
   hand_eye_calib simulate --out simulated --drive hilly --mixture --bag mcap
-  hand_eye_calib simulate --out repeats --runs 20 --noise 0.002
+  hand_eye_calib simulate --out repeats --runs 20
 
 DIR/run_01, run_02, ... have the layout of the simulations published with Valimaki et al. 2023, in
 TUM format:
@@ -62,24 +60,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     poses = "poses of the parent sensor. Default: 100 (published), 1200 (hilly)"
     group.add_argument("--poses", type=at_least(2), metavar="N", help=poses)
     group = parser.add_argument_group("noise")
-    fields = {field.name: field for field in dataclasses.fields(NoiseConfig)}
-    for option, name in _NOISE_OPTIONS.items():
-        meta, default = fields[name].metadata, getattr(REALISTIC, name)
-        unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-        text = f"{meta['doc']}{unit} Default: {default}."
-        group.add_argument(f"--{option}", type=float, metavar=option.upper(), help=text)
     level = group.add_mutually_exclusive_group()
     level.add_argument(
         "--noise-free",
         action="store_true",
-        help="exact poses but for the noise options that are given: streams that agree to the last "
-        "digit count as copies of each other, and a result from them as unusable",
+        help="exact poses: streams that agree to the last digit count as copies of each other, and "
+        "a result from them as unusable",
     )
     level.add_argument(
         "--mixture",
         action="store_true",
-        help=f"the paper's mixture: --noise {MIXTURE.gaussian} --outliers {MIXTURE.outliers} "
-        f"--drift {MIXTURE.drift}; noise options that are given replace these",
+        help=f"the paper's mixture: errors of {MIXTURE.gaussian} m per axis, jumps at "
+        f"{MIXTURE.outliers} of the poses, and a drift of {MIXTURE.drift} m/m",
     )
 
 
@@ -89,7 +81,9 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.io.trajectory_files import write_trajectory
     from hand_eye_calib.simulation.drive import simulate_drive
 
-    config, noise = _configs(arguments)
+    config = _DRIVES[arguments.drive]
+    config = dataclasses.replace(config, poses=arguments.poses or config.poses)
+    noise = MIXTURE if arguments.mixture else NoiseConfig() if arguments.noise_free else REALISTIC
     _make_empty(arguments.out)
     digits = max(2, len(str(arguments.runs)))
     folders = [arguments.out / f"run_{number:0{digits}}" for number in range(1, arguments.runs + 1)]
@@ -107,22 +101,12 @@ def run(arguments: argparse.Namespace) -> int:
             name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
             write_bag(folder / name, streams, arguments.bag)
     if arguments.json:
-        document = {"runs": [str(folder) for folder in folders], "seed": arguments.seed}
-        document |= {"drive": dataclasses.asdict(config), "noise": noise.to_options()}
-        print(json.dumps(document, indent=2))
+        runs = [str(folder) for folder in folders]
+        options = {"drive": dataclasses.asdict(config), "noise": noise.to_options()}
+        print(json.dumps({"runs": runs, "seed": arguments.seed, **options}, indent=2))
     else:
         print(f"{counted(len(folders), 'recording')} written to {arguments.out}")
     return 0
-
-
-def _configs(arguments: argparse.Namespace) -> tuple[DriveConfig, NoiseConfig]:
-    config = _DRIVES[arguments.drive]
-    if arguments.poses is not None:
-        config = dataclasses.replace(config, poses=arguments.poses)
-    noise = MIXTURE if arguments.mixture else NoiseConfig() if arguments.noise_free else REALISTIC
-    given = {name: getattr(arguments, option) for option, name in _NOISE_OPTIONS.items()}
-    given = {name: value for name, value in given.items() if value is not None}
-    return config, dataclasses.replace(noise, **given)
 
 
 def _make_empty(folder: Path) -> None:

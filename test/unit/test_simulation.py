@@ -215,16 +215,14 @@ def simulate(capsys, *arguments):
 
 
 def test_command_writes_the_published_layout(tmp_path, capsys):
-    given = ["--runs", "3", "--seed", "4", "--poses", "20", "--mixture", "--drift", "0"]
+    given = ["--runs", "3", "--seed", "4", "--poses", "20", "--mixture"]
     code, output, _ = simulate(capsys, "--out", tmp_path / "sims", *given)
     assert (code, output) == (0, f"3 recordings written to {tmp_path / 'sims'}\n")
     folders = sorted((tmp_path / "sims").iterdir())
     assert [path.name for path in folders] == ["run_01", "run_02", "run_03"]
     for number, folder in enumerate(folders):
         expected = simulate_drive(
-            (4, number),
-            dataclasses.replace(PUBLISHED_DRIVE, poses=20),
-            dataclasses.replace(MIXTURE, drift=0.0),
+            (4, number), dataclasses.replace(PUBLISHED_DRIVE, poses=20), MIXTURE
         )
         for name, trajectory in (("T_S1_W1", expected.parent), ("T_S2_W2", expected.child)):
             written = read_trajectory(folder / f"{name}.txt")
