@@ -127,6 +127,7 @@ def test_json_is_one_document_on_stdout(run, new_bag):
     assert document["inputs"]["bag"] == bag
     assert document["inputs"]["parent"] == {
         "topic": PARENT_TOPIC, "messages": 120, "refused_duplicate": 0, "refused_late": 0,
+        "dropped_unpaired": 0,
         "first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000,
     }  # fmt: skip
     assert document["inputs"]["options"]["method"] == "dnl"
