@@ -295,16 +295,6 @@ def test_a_growing_path_is_its_newest_message(tmp_path, storage):
     assert_same_motion(hec.read_trajectory(path, topic="/path"), PARENT.stamps_ns, POSES)
 
 
-def test_a_path_that_drops_its_oldest_poses_is_put_together(tmp_path):
-    parts = [slice(max(end - 30, 0), end) for end in range(10, 121, 10)]
-    messages = [
-        (PARENT.stamps_ns[p.stop - 1], "/path", PATH, path_message(PARENT.stamps_ns[p], POSES[p]))
-        for p in parts
-    ]
-    found = hec.read_trajectory(write_messages(tmp_path / "bag", messages), topic="/path")
-    assert_same_motion(found, PARENT.stamps_ns, POSES)
-
-
 def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
     without = (SECOND, "/path", PATH, path_message(np.zeros(5, dtype=int), POSES[:5]))
     path = write_messages(tmp_path / "bag", [without, (SECOND, "/p", PATH, path_message([], []))])

@@ -110,10 +110,10 @@ def test_a_path(encoding, world, frames, drawn):
         ]
         return types.types[PATH](header(types, 12, world), steps)
 
-    found_world, found_ns, found = unpack_path(*serialized(encoding, PATH, make))
-    assert found_world == printable(world)
-    assert found_ns.tolist() == [stamp_ns for stamp_ns, _ in drawn]
-    np.testing.assert_array_equal(found, np.reshape([values for _, values in drawn], (-1, 7)))
+    found = unpack_path(*serialized(encoding, PATH, make))
+    assert {*found.world_frames} <= {printable(world)}
+    assert found.stamps_ns.tolist() == [stamp_ns for stamp_ns, _ in drawn]
+    np.testing.assert_array_equal(found.poses, np.reshape([each for _, each in drawn], (-1, 7)))
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

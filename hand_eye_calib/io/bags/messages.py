@@ -288,39 +288,22 @@ def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatAr
     """Stamps and poses of rows of bytes (N, size) that begin with a stamp and end with a pose; None
     if what is between them, the frames, differs, or a stamp cannot be right.
     """
-    frames = rows[:, 8:-_POSE_SIZE]
-    seconds, nanoseconds = (
-        np.ascontiguousarray(rows[:, at : at + 4]).view(kind)[:, 0].astype(np.int64)
-        for at, kind in ((0, "<u4" if is_ros1 else "<i4"), (4, "<u4"))
-    )
-    if (frames != frames[0]).any() or (nanoseconds >= _NS_PER_S).any():
+    frames, stamps = rows[:, 8:-_POSE_SIZE], np.ascontiguousarray(rows[:, :8])
+    seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(np.int64)
+    if (frames != frames[0]).any() or not (nanoseconds // _NS_PER_S == 0).all():
         return None
     poses = np.ascontiguousarray(rows[:, -_POSE_SIZE:]).view("<f8")
     return seconds * _NS_PER_S + nanoseconds, poses
 
 
-def unpack_path(data: Buffer, is_ros1: bool) -> tuple[str, IntArray, FloatArray]:
-    """World frame, stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of a nav_msgs/Path;
-    raises MALFORMED.
-    """
+def unpack_path(data: Buffer, is_ros1: bool) -> PoseColumns:
+    """Unpack the poses of a nav_msgs/Path; raises MALFORMED."""
     cursor = Cursor(data, is_ros1)
     _, world_frame = cursor.header()
-    count = cursor.count()
-    stamps_ns, poses = np.empty(count, dtype=np.int64), np.empty((count, 7))
-    for index in range(count):
-        start = cursor.position
-        stamps_ns[index], _ = cursor.header()
-        poses[index] = _pose(cursor)
-        # The first pose may be aligned otherwise than the rest. The second shows what the others
-        # are like.
-        size = cursor.position - start
-        if index == 1 and len(data) - start >= (count - 1) * size:
-            rest = np.frombuffer(data, np.uint8, (count - 1) * size, start).reshape(-1, size)
-            found = _unpack_together(rest[:, _START * is_ros1 :], is_ros1)
-            if found is not None:
-                stamps_ns[1:], poses[1:] = found
-                break
-    return world_frame, stamps_ns, poses
+    rows = [(cursor.header()[0], _pose(cursor)) for _ in range(cursor.count())]
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64)
+    poses = np.reshape([pose for _, pose in rows], (-1, 7))
+    return PoseColumns.of_frames(stamps_ns, poses, world_frame)
 
 
 def unpack_transforms(data: Buffer, is_ros1: bool) -> list[PoseFields]:

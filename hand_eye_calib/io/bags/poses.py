@@ -32,6 +32,11 @@ class PoseColumns(NamedTuple):
         """All in the same frames."""
         return cls(stamps_ns, [world] * len(stamps_ns), [sensor] * len(stamps_ns), poses)
 
+    @classmethod
+    def nothing(cls) -> "PoseColumns":
+        """No messages."""
+        return cls(np.empty(0, dtype=np.int64), [], [], np.empty((0, 7)))
+
 
 @dataclass(frozen=True)
 class PoseTable:

@@ -56,9 +56,7 @@ _MOST_FRAMES = 20
 
 
 class TopicInfo(NamedTuple):
-    """A topic of a bag: its name, its message type (empty if publishers disagree), and how many
-    messages it has.
-    """
+    """A topic of a bag: name, message type (empty if publishers disagree), number of messages."""
 
     name: str
     type: str
@@ -72,20 +70,10 @@ class PoseBag:
     """One bag, or several of one recording, opened for reading; a context manager. They are read in
     the order of their times; those that were recorded at the same time are merged.
 
-    Attributes
-    ----------
-    topics : dict of str to TopicInfo
-        In the order of their names.
-    start_ns, end_ns : int or None
-        Bag time of the first and last message; None if there is none.
-    shown : callable
-        Passes on runs of messages, and may show how far they are; of the runs, the number of all
-        messages, what is being done, and the size of a run.
-
-    Raises
-    ------
-    InputError
-        If there is no bag or it cannot be read: one line that names the path and says what to do.
+    An InputError if there is no bag or it cannot be read. ``topics`` are in the order of their
+    names, ``start_ns`` and ``end_ns`` the bag times of the first and last message, if there are
+    any. ``shown`` passes on runs of messages, and may show how far they are; it takes the runs, the
+    number of all messages, what is being done, and the size of a run.
     """
 
     def __init__(self, *paths: str | Path) -> None:

@@ -56,13 +56,8 @@ class Scan(NamedTuple):
 
 
 def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
-    """Points and times of a PointCloud2 message. Without times of its points, a scan counts as
-    taken at once.
-
-    Raises
-    ------
-    ValueError
-        If the message is damaged, or has no x, y and z.
+    """Points and times of a PointCloud2 message; a ValueError if it is damaged, or has no x, y and
+    z. Without times of its points, a scan counts as taken at once.
     """
     cursor = Cursor(data, is_ros1)
     header_ns, frame = cursor.header()
@@ -80,18 +75,16 @@ def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
         raise ValueError(f"points have no x, y, z, but {', '.join(formats)}")
     if size < height * width * step or cursor.position + size > len(data):
         raise ValueError(f"{height * width} points do not fit into {size} bytes")
-    layout = np.dtype(
-        {
-            "names": [*formats],
-            "formats": [order + each for each in formats.values()],
-            "offsets": [*offsets.values()],
-            "itemsize": step,
-        }
-    )
-    table = np.frombuffer(data, layout, height * width, cursor.position)
-    points = np.stack([table[axis].astype(float) for axis in "xyz"], axis=-1)
+    table = np.frombuffer(data, np.uint8, height * width * step, cursor.position).reshape(-1, step)
+
+    def column(name: str) -> FloatArray:
+        kind = np.dtype(order + formats[name])
+        part = table[:, offsets[name] : offsets[name] + kind.itemsize]
+        return np.ascontiguousarray(part).view(kind)[:, 0].astype(float)
+
+    points = np.stack([column(axis) for axis in "xyz"], axis=-1)
     of_time = next((name for name in _TIMES if name in formats), None)
-    times = table[of_time].astype(float) if of_time else np.zeros(len(points))
+    times = column(of_time) if of_time else np.zeros(len(points))
     ranges = np.linalg.norm(points, axis=1)
     is_used = (ranges > _NEAREST_M) & (ranges < _FARTHEST_M)  # nor those that are not finite
     points, times = points[is_used], times[is_used]
@@ -120,19 +113,8 @@ class Odometry(NamedTuple):
 
 class ScanOdometry:
     """Registers the scans on a topic of a bag one after the other; what is found is kept beside the
-    bag for the next time.
-
-    Attributes
-    ----------
-    place : Path
-        Where it is kept.
-    kept : Odometry or None
-        What was kept for files of the same sizes and times.
-
-    Raises
-    ------
-    MissingDependencyError
-        If small_gicp is not installed.
+    bag for the next time, in ``place``. ``kept`` is what was kept for files of the same sizes and
+    times.
     """
 
     def __init__(self, topic: str, bag: Path, files: Sequence[Path]) -> None:

@@ -3,6 +3,7 @@ of a lidar, fields of any message, or transforms.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ class TopicReading(Reading):
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
         self._reader = MessageReader(message_type, measures)
-        self._tables = [self._of_frames([], np.empty((0, 7)), [])]
+        self._tables = [PoseTable.of_columns(stream, PoseColumns.nothing(), [])]
 
     def take(self, run: Run) -> None:
         with run.named():
@@ -103,29 +104,24 @@ class JoinedReading(Reading):
 
 class PathReading(Reading):
     """A path that is published again and again as it grows, perhaps with all poses corrected: the
-    poses of its newest message, and before its first stamp those of older ones. Its stamps count
-    as bag times.
+    poses of its newest message. Its stamps count as bag times.
     """
 
     def __init__(self, stream: str, topic: str) -> None:
         super().__init__(stream, topic)
-        self._stamps_ns, self._poses = np.empty(0, dtype=np.int64), np.empty((0, 7))
-        self._frame = ""
+        self._newest: PoseColumns | None = None
 
     def take(self, run: Run) -> None:
-        for self._frame, stamps_ns, poses in run.unpacked(unpack_path):
-            if len(stamps_ns):
-                older = self._stamps_ns < stamps_ns.min()
-                self._stamps_ns = np.r_[self._stamps_ns[older], stamps_ns]
-                self._poses = np.r_[self._poses[older], poses]
+        self._newest = replace(run, messages=run.messages[-1:]).unpacked(unpack_path)[0]
 
     def table(self) -> PoseTable:
-        if len(self._stamps_ns) > 1 and not self._stamps_ns.any():
+        path = self._newest or PoseColumns.nothing()
+        if len(path.stamps_ns) > 1 and not path.stamps_ns.any():
             raise InputError(
                 f"the poses of path {self.topics[0]} have no stamps: all are zero; use the "
                 "odometry that the path was made from"
             )
-        return self._of_frames(self._stamps_ns, self._poses, self._stamps_ns, self._frame)
+        return PoseTable.of_columns(self.stream, path, path.stamps_ns)
 
 
 class ScanReading(Reading):

@@ -45,21 +45,10 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 class Storage:
     """A storage file opened for reading: ``path`` is its name for a person, ``file`` where it is,
-    unpacked.
+    unpacked. An InputError if nothing in it can be read.
 
-    Attributes
-    ----------
-    counts : Counter of MessageKind
-        Number of messages of each kind.
-    span_ns : tuple of two ints
-        Bag time of the first and last message; empty if there is none.
-    losses : list of str
-        What could not be read, one line each.
-
-    Raises
-    ------
-    InputError
-        If nothing in it can be read; from :meth:`blocks`, too.
+    ``counts`` has the number of messages of each kind, ``span_ns`` the bag times of the first and
+    the last, if there are any, and ``losses`` what could not be read, one line each.
     """
 
     def __init__(self, path: Path, file: Path) -> None:
@@ -87,11 +76,16 @@ class Storage:
         self._reader = None
 
     def _open(self) -> None:
-        self._reader = reader = _opened(self._file)
-        chunks = getattr(getattr(reader, "storage", None), "chunks", None)
-        n_indexed = sum(sum(each.channel_count.values()) for each in chunks or ())
-        if chunks is not None and n_indexed != reader.message_count:
-            raise ValueError("it has no index of its messages")
+        library = rosbags()[self._file.suffix != ".bag"]
+        reader = library.Reader(self._file)
+        if self._file.suffix == ".db3":  # whose path SQLite reads as an address
+            reader.storage.path = Path(quote(str(self._file)))
+        reader.open()
+        self._reader = reader
+        if self._file.suffix == ".mcap":
+            counts = (sum(each.channel_count.values()) for each in reader.storage.chunks)
+            if sum(counts) != reader.message_count:
+                raise ValueError("it has no index of its messages")
         for each in reader.connections:
             encoding = getattr(each.ext, "serialization_format", "ros1")
             kind = message_kind(each.topic, each.msgtype, encoding, each.msgdef)
@@ -162,19 +156,15 @@ class Storage:
             ) from error
 
 
-def _opened(file: Path) -> Any:
-    """A reader of rosbags, open."""
+def rosbags() -> tuple[Any, Any]:
+    """The modules of the library for bags of ROS 1 and ROS 2."""
     try:
         from rosbags import rosbag1, rosbag2
     except ImportError as error:
         raise MissingDependencyError(
-            "reading bags needs rosbags, which is not installed: pip install rosbags"
+            "bags need rosbags, which is not installed: pip install rosbags"
         ) from error
-    reader: Any = rosbag1.Reader(file) if file.suffix == ".bag" else rosbag2.Reader(file)
-    if file.suffix == ".db3":  # whose path SQLite reads as an address
-        reader.storage.path = Path(quote(str(file)))
-    reader.open()
-    return reader
+    return rosbag1, rosbag2
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:

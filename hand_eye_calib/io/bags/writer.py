@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import POSE_TYPES
+from hand_eye_calib.io.bags.storage import rosbags
 
 STORAGES = ("mcap", "sqlite3", "rosbag1")
 
@@ -24,21 +25,12 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
     Parameters
     ----------
     path : str or path-like
-        Directory to make, or for rosbag1 the ``.bag`` file. It must not exist.
+        Directory to make, or for rosbag1 the ``.bag`` file; an InputError if it exists.
     streams : mapping of str to (Trajectory, str)
         Topic to trajectory and message type, one of POSE_TYPES. If the type has a place for the
         sensor's frame, the trajectory's is put there. Stamps are written to both header and bag.
     storage : str
-        "mcap", "sqlite3" or "rosbag1".
-
-    Raises
-    ------
-    InputError
-        If the path exists or cannot be written.
-    ConfigError
-        For an unknown storage or message type.
-    MissingDependencyError
-        Without the library rosbags.
+        One of STORAGES.
     """
     path = Path(path)
     unknown = [each for _, each in streams.values() if each not in POSE_TYPES]
@@ -54,12 +46,7 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
         )
     if path.exists():
         raise InputError(f"{path} exists already; remove it or choose another name")
-    try:
-        from rosbags import rosbag1, rosbag2
-    except ImportError as error:
-        raise MissingDependencyError(
-            "writing bags needs rosbags, which is not installed: pip install rosbags"
-        ) from error
+    rosbag1, rosbag2 = rosbags()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         writer: Any = rosbag1.Writer(path) if storage == "rosbag1" else None
