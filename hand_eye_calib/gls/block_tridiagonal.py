@@ -85,29 +85,6 @@ class _Level:
         all_below[::2], all_below[1::2] = with_before, with_behind
         return all_diagonal, all_below
 
-    @classmethod
-    def of(cls, diagonal: FloatArray, below: FloatArray, inverse: FloatArray) -> _Level:
-        """From the blocks of a matrix and the inverse roots of those that are eliminated."""
-        n_behind = (len(diagonal) - 1) // 2
-        return cls(inverse, inverse @ below[::2], inverse[:n_behind] @ transposed(below[1::2]))
-
-    def rest(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The diagonal, and the blocks below it, of the matrix that stays."""
-        n_behind, diagonal = len(self.behind), diagonal[::2].copy()
-        diagonal[: len(self.before)] -= transposed(self.before) @ self.before
-        diagonal[1 : 1 + n_behind] -= transposed(self.behind) @ self.behind
-        return diagonal, -transposed(self.behind) @ self.before[:n_behind]
-
-
-def _whole(diagonal: FloatArray, below: FloatArray) -> FloatArray:
-    """The lower half of a matrix (n d, n d) from its blocks."""
-    n_blocks, size, _ = diagonal.shape
-    whole = np.zeros((n_blocks, size, n_blocks, size))
-    blocks = np.arange(n_blocks)
-    whole[blocks, :, blocks] = diagonal
-    whole[blocks[1:], :, blocks[:-1]] = below
-    return whole.reshape(n_blocks * size, -1)
-
 
 class Factor:
     """Cholesky factor L of a positive definite matrix with permuted rows and columns;
@@ -129,11 +106,19 @@ class Factor:
         self._levels: list[_Level] = []
         self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _DENSE:
-            level = _Level.of(diagonal, below, self._inverse_root(diagonal[1::2]))
-            diagonal, below = level.rest(diagonal)
-            self._levels.append(level)
+            inverse, n_behind = self._inverse_root(diagonal[1::2]), (len(diagonal) - 1) // 2
+            before = inverse @ below[::2]
+            behind = inverse[:n_behind] @ transposed(below[1::2])
+            self._levels.append(_Level(inverse, before, behind))
+            diagonal = diagonal[::2].copy()
+            diagonal[: len(before)] -= transposed(before) @ before
+            diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
+            below = -transposed(behind) @ before[:n_behind]
         self._n_last, self._size, _ = diagonal.shape
-        self._last = self._inverse_root(_whole(diagonal, below)[None])[0]
+        whole, blocks = np.zeros((self._n_last, self._size) * 2), np.arange(self._n_last)
+        whole[blocks, :, blocks] = diagonal
+        whole[blocks[1:], :, blocks[:-1]] = below
+        self._last = self._inverse_root(whole.reshape(1, self._n_last * self._size, -1))[0]
 
     def _inverse_root(self, blocks: FloatArray) -> FloatArray:
         inverse, log_determinants = inverse_roots(blocks)

@@ -35,16 +35,20 @@ from hand_eye_calib.stats import median
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
 # of the child's path along its axes (m/m), by how much the child's stamps are late (s), the bias of
 # the child's rates minus that of the parent's, along the axes of the child (rad/s).
-PARAMETERS: dict[str, list[int]] = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
+SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
+PARAMETERS = {
+    "scale": [SCALE],
+    "bias": [*range(BIAS.start, BIAS.stop)],
+    "time": [TIME],
+    "rate": [*range(RATE.start, RATE.stop)],
+}
 SYSTEMATIC = ("scale", "bias", "time")
 # Of streams without positions, and of those whose rotations are integrated rates.
 SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
-N_SYSTEMATIC = 8
+N_SYSTEMATIC = RATE.stop
 
 # Steps count as noise until they differ from their neighbours by so many times its variance.
 _CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
-
-SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
 
 
 @dataclass(frozen=True)

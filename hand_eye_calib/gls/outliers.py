@@ -95,7 +95,7 @@ def first_outliers(residuals: FloatArray) -> Outliers:
     A pose between two jumps counts as a spike, and its increments as evidence, until shown
     otherwise.
     """
-    jumps = _standing_out(residuals, _limits(residuals))
+    jumps = _standing_out(residuals, residuals)
     spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
     if np.mean(spikes) > _MOST_SPIKES:
         return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
@@ -108,22 +108,17 @@ def with_jumps_across_spikes(
     """With a jump behind each spike where what stood out of the residuals (n, 6) stands out of
     those with bridged poses, too.
     """
-    behind = _standing_out(bridging, _limits(residuals)) & outliers.spikes[:-1]
+    behind = _standing_out(bridging, residuals) & outliers.spikes[:-1]
     return Outliers(outliers.jumps | behind, outliers.spikes)
 
 
-def _limits(residuals: FloatArray) -> list[float]:
-    limits = []
-    for part in (slice(0, 3), slice(3, 6)):
-        sizes = np.linalg.norm(residuals[:, part], axis=1)
-        robust = _FIRST_JUMP_SIGMAS * median(sizes) / MEDIAN_LENGTH
-        limits.append(max(robust, _LEAST_JUMP))
-    return limits
-
-
-def _standing_out(residuals: FloatArray, limits: list[float]) -> BoolArray:
-    sizes = [np.linalg.norm(residuals[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))]
-    return (sizes[0] > limits[0]) | (sizes[1] > limits[1])
+def _standing_out(residuals: FloatArray, usual: FloatArray) -> BoolArray:
+    """Which residuals (n, 6) are far larger than usual ones, in translation or in rotation."""
+    sizes, ordinary = (
+        np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in (residuals, usual)
+    )
+    limits = [_FIRST_JUMP_SIGMAS * median(each) / MEDIAN_LENGTH for each in ordinary.T]
+    return np.asarray((sizes > np.maximum(limits, _LEAST_JUMP)).any(axis=1))
 
 
 def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:

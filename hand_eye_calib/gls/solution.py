@@ -183,19 +183,22 @@ class AdaptiveSolution(ModelSolution):
         """The noise in plain numbers and in words, with the times of jumps and outliers."""
         jumps, spikes = stamps_ns[1:][self.jumps], stamps_ns[self.spikes]
         said = [*self._noise_in_words(), *self._systematic_in_words()]
-        said += _when("jump", "jumps", "of a trajectory, just before", jumps)
-        said += _when("pose", "poses", "wrong by {} and left out, at", spikes)
+        said += _when("jump", "of a trajectory, just before", jumps)
+        said += _when("pose", "wrong by {} and left out, at", spikes)
         return replace(self.noise, in_words=tuple(said))
 
     def _noise_in_words(self) -> list[str]:
-        sigmas = np.exp(0.5 * self.levels)
-        if not self.metres_per_pose:
-            return [
-                f"Noise: {angle(sigmas[ROTATION])} per axis of each pose (both sensors "
-                f"together). Drift: {angle(sigmas[WALK_ROTATION])} from pose to pose.",
-                *(_slow_in_words(slow) for slow in self.noise.lasting if slow.part == "rotation"),
-            ]
-        drift_m, drift_rad = sigmas[[WALK_TRANSLATION, WALK_ROTATION]] / self.metres_per_pose**0.5
+        sigmas, lasting = np.exp(0.5 * self.levels), self.noise.lasting
+        white, drift = angle(sigmas[ROTATION]), f"{angle(sigmas[WALK_ROTATION])} from pose to pose"
+        if self.metres_per_pose:
+            white = f"{length(sigmas[TRANSLATION])} and {white}"
+            by_m, by_rad = sigmas[[WALK_TRANSLATION, WALK_ROTATION]] / self.metres_per_pose**0.5
+            drift = (
+                f"{length(by_m)} and {angle(by_rad)} after 1 m, "
+                f"{length(10 * by_m)} and {angle(10 * by_rad)} after 100 m"
+            )
+        else:
+            lasting = tuple(slow for slow in lasting if slow.part == "rotation")
         about = ""
         if self.model.centre != "sensors":
             about = (
@@ -203,11 +206,9 @@ class AdaptiveSolution(ModelSolution):
                 "camera that sees a target"
             )
         said = [
-            f"Noise: {length(sigmas[TRANSLATION])} and {angle(sigmas[ROTATION])} per axis "
-            f"of each pose (both sensors together){about}.",
-            f"Drift: {length(drift_m)} and {angle(drift_rad)} after 1 m, "
-            f"{length(10 * drift_m)} and {angle(10 * drift_rad)} after 100 m.",
-            *map(_slow_in_words, self.noise.lasting),
+            f"Noise: {white} per axis of each pose (both sensors together){about}.",
+            f"Drift: {drift}.",
+            *map(_slow_in_words, lasting),
         ]
         if sigmas[JITTER] > _NOTABLE_JITTER_S:
             said.append(f"stamps jitter by {1000 * sigmas[JITTER]:.2g} ms")
@@ -216,35 +217,22 @@ class AdaptiveSolution(ModelSolution):
         return said
 
     def _systematic_in_words(self) -> list[str]:
-        said, systematic = [], self.systematic.split("+")
-        if "scale" in systematic:
-            off = 100 * (self.scale - 1)
-            than = "shorter" if off > 0 else "longer"
-            said.append(
-                f"the child's lengths are {abs(off):.2f} +/- {100 * self.scale_sigma:.2g} % "
-                f"{than} than the parent's"
-            )
-        if "bias" in systematic:
-            along = ", ".join(
-                f"{axis} {1000 * value:.2g}" for axis, value in zip("xyz", self.bias, strict=True)
-            )
-            said.append(
-                f"the child's path is off by {along} mm per metre travelled, along its axes"
-            )
+        systematic = self.systematic.split("+")
+        off, offset_ms = 100 * (self.scale - 1), 1000 * self.time_offset_s
+        bias, sigmas = np.degrees(self.rate_bias)
+        along = ", ".join(f"{'xyz'[k]} {1000 * self.bias[k]:.2g}" for k in range(3))
+        rates = ", ".join(f"{'xyz'[k]} {bias[k]:.3g} +/- {sigmas[k]:.1g}" for k in range(3))
+        said = {
+            "scale": f"the child's lengths are {abs(off):.2f} +/- {100 * self.scale_sigma:.2g} % "
+            f"{'shorter' if off > 0 else 'longer'} than the parent's",
+            "bias": f"the child's path is off by {along} mm per metre travelled, along its axes",
+            "rate": f"bias of the angular rates, along the child's axes: {rates} deg/s",
+            "time": f"the child's stamps are {abs(offset_ms):.1f} +/- "
+            f"{1000 * self.time_offset_sigma_s:.2g} ms {'early' if offset_ms > 0 else 'late'}",
+        }
         if "rate" in systematic:
-            bias, sigmas = np.degrees(self.rate_bias)
-            told = ", ".join(
-                f"{axis} {value:.3g} +/- {sigma:.1g}"
-                for axis, value, sigma in zip("xyz", bias, sigmas, strict=True)
-            )
-            said.append(f"bias of the angular rates, along the child's axes: {told} deg/s")
-        if "time" in systematic and "rate" not in systematic:
-            offset_ms = 1000 * self.time_offset_s
-            said.append(
-                f"the child's stamps are {abs(offset_ms):.1f} +/- "
-                f"{1000 * self.time_offset_sigma_s:.2g} ms {'early' if offset_ms > 0 else 'late'}"
-            )
-        return said
+            del said["time"]
+        return [sentence for name, sentence in said.items() if name in systematic]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,12 +301,10 @@ def _slow_in_words(slow: CorrelatedError) -> str:
     return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
 
 
-def _when(one: str, several: str, what: str, stamps_ns: IntArray) -> list[str]:
+def _when(thing: str, what: str, stamps_ns: IntArray) -> list[str]:
     """A line, or none, about what happened at these times."""
-    if not len(stamps_ns):
+    if not (count := len(stamps_ns)):
         return []
-    is_one = len(stamps_ns) == 1
     shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in stamps_ns[:5].tolist())
-    what = what.format("itself" if is_one else "themselves")
-    more = " ..." if len(stamps_ns) > 5 else ""
-    return [f"{len(stamps_ns)} {one if is_one else several} {what} {shown}{more} s"]
+    things, selves = (thing, "itself") if count == 1 else (f"{thing}s", "themselves")
+    return [f"{count} {things} {what.format(selves)} {shown}{' ...' if count > 5 else ''} s"]
