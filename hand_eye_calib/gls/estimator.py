@@ -65,20 +65,15 @@ def solve(
         without=frozenset(without) | (_SLOW if quick else frozenset()),
         tuning=tuning,
     )
+    return _solved(problem)
+
+
+def _solved(problem: Problem) -> AdaptiveSolution:
     first = _passed(problem, start(problem), STAGES[:_FIRST])
     kept = _strided(problem, first)
-    if len(kept) < len(stamps_ns):
-        fewer = solve(
-            stamps_ns[kept],
-            Ts_pw_p[kept],
-            Ts_cw_c[kept],
-            systematic,
-            quick,
-            is_clock_free,
-            without,
-            tuning,
-        )
-        return _at_all_poses(fewer, kept, first.outliers.spikes)
+    if len(kept) < len(problem.streams):
+        fewer = replace(problem, streams=problem.streams[kept], _last=[])
+        return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
     fit = _passed(problem, first, STAGES[_FIRST:])
     if not is_settled(problem, fit):
         problem = replace(problem, without=problem.without | {"lasting"})

@@ -61,9 +61,9 @@ def fit(space: StateSpace, start: FloatArray, prior: Prior) -> tuple[Posterior, 
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
             if np.abs(step).max() < _SETTLED_STEP or (is_newton and promised < _SETTLED_LOSS):
                 break
-            rival = _at_or_none(space, levels + step)
-            gain = loss - _total(rival, prior)
-            if rival is not None and gain > 0.0:
+            rival, rival_loss = _tried(space, levels + step, prior)
+            gain = loss - rival_loss
+            if gain > 0.0:
                 break
             radius, gain = _SHRINK * float(np.abs(step).max()), 0.0
         if gain == 0.0 or rival is None:
@@ -78,17 +78,14 @@ def fit(space: StateSpace, start: FloatArray, prior: Prior) -> tuple[Posterior, 
     return posterior, information
 
 
-def _at_or_none(space: StateSpace, levels: FloatArray) -> Posterior | None:
+def _tried(space: StateSpace, levels: FloatArray, prior: Prior) -> tuple[Posterior | None, float]:
+    """The posterior at some levels, and its loss with the prior; infinite where there is none."""
     try:
-        return Posterior(space, levels)
+        posterior = Posterior(space, levels)
     except np.linalg.LinAlgError:
-        return None
-
-
-def _total(posterior: Posterior | None, prior: Prior) -> float:
-    if posterior is None or not np.isfinite(posterior.loss):
-        return np.inf
-    return posterior.loss + prior.loss(posterior.levels)
+        return None, np.inf
+    loss = posterior.loss + prior.loss(levels)
+    return posterior, loss if np.isfinite(loss) else np.inf
 
 
 def _step(
@@ -179,12 +176,7 @@ def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) 
     )
     by_phi = (phi * innovations / rest**2 - (ahead - phi * here[:-1]) / rest) / variance
     by_phi -= size * phi / rest
-    return np.array([by_variance, float((by_phi * _phi_slope(process)).sum())])
-
-
-def _phi_slope(process: Markov) -> FloatArray:
-    """Derivative of phi by log tau."""
-    return process.phi * process.ratio
+    return np.array([by_variance, float((by_phi * process.slope).sum())])
 
 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
@@ -217,7 +209,7 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
 
 def _by_tau(process: Markov, values: FloatArray) -> FloatArray:
     """Derivative by log tau of the states (N, k) that the covariance makes of fixed forces."""
-    phi, rest, slope = process.phi, process.rest, _phi_slope(process)
+    phi, rest, slope = process.phi, process.rest, process.slope
     by_rest = 2.0 * phi * slope / rest**2
     beside = (slope / rest + phi * by_rest)[:, None]
     first = (2.0 * phi * slope / rest + phi**2 * by_rest)[:, None]

@@ -63,7 +63,7 @@ def start(problem: Problem) -> Fit:
     course, none = course_of(streams, T), np.zeros(N_SYSTEMATIC)
     linearisation = linearise(streams, course, T, none, ())
     residuals = linearisation.residuals
-    extent = Extent(median(np.diff(streams.stamps_s)), float(streams.stamps_s[-1]))
+    extent = Extent(median(np.diff(streams.stamps_s)), float(np.ptp(streams.stamps_s)))
     outliers = first_outliers(residuals)
     poses = bridged(streams, T, outliers.spikes)
     if outliers.spikes.any():

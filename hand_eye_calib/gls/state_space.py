@@ -166,22 +166,22 @@ class StateSpace:
 
 @dataclass(frozen=True)
 class Markov:
-    """A group at given levels: ``dt_i / tau``, phi_i and the innovations' relative variances
-    ``1 - phi_i^2``.
+    """A group at given levels: phi_i, its derivative by log tau, and the innovations' relative
+    variances ``1 - phi_i^2``.
     """
 
     group: Group
     variance: float
-    ratio: FloatArray
     phi: FloatArray
+    slope: FloatArray
     rest: FloatArray
 
     @classmethod
     def of(cls, group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
         """At these log levels."""
         ratio = intervals_s / np.exp(levels[group.tau])
-        variance = float(np.exp(levels[group.variance]))
-        return cls(group, variance, ratio, np.exp(-ratio), -np.expm1(-2.0 * ratio))
+        variance, phi = float(np.exp(levels[group.variance])), np.exp(-ratio)
+        return cls(group, variance, phi, phi * ratio, -np.expm1(-2.0 * ratio))
 
     def transitions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """What each increment (n,) adds to the precision for unit variance: beside the diagonal, to
