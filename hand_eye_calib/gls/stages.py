@@ -7,7 +7,6 @@ are looked for once outliers are out; systematic errors are chosen under the noi
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.increments import (
-    BIAS,
     N_SYSTEMATIC,
     RATE,
     SCALE,
@@ -189,34 +187,39 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
 
 
 def systematic(problem: Problem, fit: Fit) -> Fit:
-    """The likeliest systematic errors; and a step of X and of these, at poses freed of errors."""
-    posterior, tuning = problem.posterior(fit), problem.tuning
-    without = posterior.products - problem.known(fit)
-    log_odds = np.full(N_SYSTEMATIC, np.log(tuning.odds))
-    if problem.is_clock_free:
-        log_odds[TIME] = tuning.certain
-    choices = [
-        [tuning.none, size] if column in problem.columns and column < RATE.start else [size]
-        for column, size in enumerate(tuning.sizes)
-    ]
-    best, plainest = np.inf, None
-    for sigmas in map(np.array, product(*choices)):
-        is_there = (sigmas > tuning.none) & [len(both) > 1 for both in choices]
-        if is_there[SCALE] and is_there[BIAS].any():
-            continue  # along the direction of travel both say the same
-        rival = replace(fit, sigmas=sigmas)
-        normal = NormalEquations(without + problem.known(rival))
-        loss = normal.cost + normal.log_determinant + 2.0 * float(np.log(sigmas).sum())
-        loss -= 2.0 * float(log_odds[is_there].sum())
-        if plainest is None:
-            plainest = np.linalg.pinv(normal.covariance[:6, :6], hermitian=True)
-        elif loss < best:
-            growth = np.linalg.eigvals(plainest @ normal.covariance[:6, :6]).real.max()
-            loss = loss if growth < tuning.most_growth**2 else np.inf
-        if loss < best:
-            best, chosen, step = loss, rival, normal.step
-    states = posterior.states_after(step)
-    return chosen.moved(step, problem.columns).freed(problem.streams, states)
+    """The likeliest systematic errors; and a step of X and of these, at poses freed of errors.
+
+    The child's path has a scale, or a bias along one of its axes, or neither.
+    """
+    posterior, tuning, columns = problem.posterior(fit), problem.tuning, problem.columns
+    without, log_odds = posterior.products - problem.known(fit), np.log(tuning.odds)
+    times = [[], [TIME]] if TIME in columns else [[]]
+
+    def likeliest(of_path: list[int]) -> tuple[float, Fit, NormalEquations]:
+        """The loss with these errors of the path, with a time offset or without."""
+        found = []
+        for there in (of_path + time for time in times):
+            is_there = [k in there or k >= RATE.start for k in range(N_SYSTEMATIC)]
+            rival = replace(fit, sigmas=np.where(is_there, tuning.sizes, tuning.none))
+            normal = NormalEquations(without + problem.known(rival))
+            loss = normal.cost + normal.log_determinant + 2.0 * float(np.log(rival.sigmas).sum())
+            odds = [
+                tuning.certain if k == TIME and problem.is_clock_free else log_odds for k in there
+            ]
+            found.append((loss - 2.0 * sum(odds), rival, normal))
+        return min(found, key=lambda each: each[0])
+
+    best = plain = likeliest([])
+    known, most = np.linalg.pinv(plain[2].covariance[:6, :6], hermitian=True), 0.0
+    for column in (column for column in columns if column < TIME):
+        rival = likeliest([column])
+        gain = (plain[0] - rival[0]) * (1.0 if column == SCALE else tuning.like_scale)
+        growth = np.linalg.eigvals(known @ rival[2].covariance[:6, :6]).real.max()
+        if growth < tuning.most_growth**2 and gain > most:
+            best, most = rival, gain
+    _, chosen, normal = best
+    states = posterior.states_after(normal.step)
+    return chosen.moved(normal.step, columns).freed(problem.streams, states)
 
 
 def polish(problem: Problem, fit: Fit) -> Fit:

@@ -29,10 +29,10 @@ from hand_eye_calib.stats import chi_square_quantile
 VALUES = {
     "none": np.zeros(0),
     "scale": np.array([0.03]),
-    "bias": np.array([0.02, -0.01, 0.03]),
+    "bias": np.array([0.0, -0.03, 0.0]),
     "time": np.array([0.02]),
     "scale+time": np.array([0.03, 0.02]),
-    "bias+time": np.array([0.02, -0.01, 0.03, 0.02]),
+    "bias+time": np.array([0.0, -0.03, 0.0, 0.02]),
 }
 
 
