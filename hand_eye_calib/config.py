@@ -17,9 +17,14 @@ from hand_eye_calib.option import check_value as check_value
 from hand_eye_calib.option import did_you_mean as did_you_mean
 from hand_eye_calib.option import option as option
 from hand_eye_calib.option import option_name as option_name
-from hand_eye_calib.text import AXIS_UNITS, parse_prior, parse_targets, split_frames
+from hand_eye_calib.text import (
+    AXIS_UNITS,
+    parse_prior,
+    parse_reference,
+    parse_targets,
+    split_frames,
+)
 
-REFERENCE_PATTERN = r"auto|A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})"
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 # As of results/exports.py.
 EXPORT_FORMATS = (
@@ -138,8 +143,7 @@ class CalibratorConfig(OptionSet):
         "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
         "it), C<n> (each with the first of its segment of n), or auto (the one with the answer "
         "nearest to adaptive's).",
-        pattern=REFERENCE_PATTERN,
-        form="auto, A, B<n> such as B5, or C<n> such as C20",
+        parse=lambda name, text: text == "auto" or parse_reference(name, text),
     )
     backend: str = option(
         "fast",
@@ -311,14 +315,6 @@ class CalibratorConfig(OptionSet):
         single = parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
         return tuple(single.get(axis, of_unit[unit]) for axis, unit in AXIS_UNITS.items())
-
-    def target_fields(self) -> dict[str, Any]:
-        """The targets as the fields of a result."""
-        return {
-            "target_translation": self.target_translation,
-            "target_rotation": self.target_rotation,
-            "target_axes": parse_targets("target.axes", self.target_axes),
-        }
 
     def prior(self) -> dict[str, tuple[float, float]]:
         """The prior: axis name to (value, standard deviation), in m and rad; an option of a single

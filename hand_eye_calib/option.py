@@ -3,9 +3,8 @@
 import contextlib
 import dataclasses
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.text import shown_value
@@ -23,8 +22,6 @@ def option(
     unit: str = "",
     within: tuple[float, float] | None = None,
     choices: tuple[str, ...] | None = None,
-    pattern: str | None = None,
-    form: str = "",
     words: tuple[str, ...] = (),
     name: str | None = None,
     read_only: bool = False,
@@ -40,8 +37,6 @@ def option(
         One line for a person who is about to set it; unit of the value, empty for none.
     within, choices
         Smallest and largest allowed value; the allowed values.
-    pattern, form
-        Regular expression that the whole value must match, and the same in words.
     words
         Words that may stand for a number, such as "none".
     name, read_only
@@ -85,8 +80,6 @@ def check_value(field: OptionField, value: object) -> OptionValue:
                 f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
                 f"{did_you_mean(value, meta['choices'])}"
             )
-        if meta["pattern"] is not None and not re.fullmatch(meta["pattern"], value):
-            raise ConfigError(f"{name} must be {meta['form']}; got {shown_value(value)}")
         if meta["parse"] is not None and value:
             meta["parse"](name, value)
         return value
@@ -113,14 +106,11 @@ class OptionSet:
     """Base of dataclasses made of options: checks every value and knows the public names."""
 
     given: frozenset[str]
+    __dataclass_fields__: ClassVar[dict[str, OptionField]]
 
     def __post_init__(self) -> None:
-        for field in self._options():
+        for field in dataclasses.fields(self):
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
-
-    @classmethod
-    def _options(cls) -> tuple[OptionField, ...]:
-        return dataclasses.fields(cls)  # type: ignore[arg-type]
 
     @classmethod
     def from_options(cls, options: Mapping[str, object]) -> Self:
@@ -131,7 +121,7 @@ class OptionSet:
         ConfigError
             If a name is unknown, with a list of the known ones, or a value is not allowed.
         """
-        known = {option_name(field): field.name for field in cls._options()}
+        known = {option_name(field): field.name for field in dataclasses.fields(cls)}
         unknown = [name for name in options if name not in known]
         if unknown:
             raise ConfigError(
@@ -142,4 +132,4 @@ class OptionSet:
 
     def to_options(self) -> dict[str, OptionValue]:
         """Mapping of public names to values."""
-        return {option_name(field): getattr(self, field.name) for field in self._options()}
+        return {option_name(field): getattr(self, field.name) for field in dataclasses.fields(self)}

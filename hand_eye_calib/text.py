@@ -13,8 +13,8 @@ from hand_eye_calib.errors import ConfigError
 
 # Shorter lengths (m) are in mm, from the second on in m.
 _MM_BELOW, _M_FROM = 0.00995, 0.995
-# Longer durations (s) are in min, in h, and not told any more.
-_MIN_FROM, _H_FROM, _LONGEST = 90.0, 5_400.0, 86_400.0
+# Longer durations (s) are in min, and in h.
+_MIN_FROM, _H_FROM = 90.0, 5_400.0
 _MOST_DECIMALS = 6
 _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 
@@ -100,8 +100,6 @@ def given_or_estimated(value: float, sigma: float, unit: str) -> str:
 
 def duration(seconds: float) -> str:
     """Seconds, minutes or hours."""
-    if seconds >= _LONGEST:
-        return "more than a day"
     if seconds >= _H_FROM:
         return f"{seconds / 3600:.0f} h"
     if seconds >= _MIN_FROM:
@@ -251,6 +249,17 @@ def _quantities(
             )
         found.append(value)
     return found
+
+
+def parse_reference(name: str, text: str) -> tuple[str, int]:
+    """Kind, "A", "B" or "C", and step, 1 for "A", of which poses form motion pairs; a ConfigError
+    for anything else.
+    """
+    if not re.fullmatch("A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})", text):
+        raise ConfigError(
+            f"{name} must be auto, A, B<n> such as B5, or C<n> such as C20; got {shown_value(text)}"
+        )
+    return text[0], int(text[1:] or 1)
 
 
 def split_frames(name: str, text: str) -> tuple[str, str]:

@@ -30,6 +30,7 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, Residuals
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.text import parse_targets
 
 # Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both
 # trajectories it is a fifth.
@@ -132,7 +133,9 @@ def calibration_of(
         n_pairs=len(residuals),
         n_inliers=int(residuals.is_inlier.sum()),
         contradictions=fused.contradictions,
-        **config.target_fields(),
+        target_translation=config.target_translation,
+        target_rotation=config.target_rotation,
+        target_axes=parse_targets("target.axes", config.target_axes),
         motion_residuals=residuals,
         **fields,
     )

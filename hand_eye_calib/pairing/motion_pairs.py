@@ -1,6 +1,5 @@
 """Pairs of relative motions, what every AX = XB solver starts from."""
 
-import re
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -8,33 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median
-
-_PATTERN = re.compile(r"A|([BC])([1-9][0-9]{0,8})")
+from hand_eye_calib.text import parse_reference
 
 _MAX_PAIRS = 800
-
-
-def parse_reference(reference: str) -> tuple[str, int]:
-    """Split a reference into its kind ("A", "B" or "C") and its step (1 for "A").
-
-    Raises
-    ------
-    ConfigError
-        If it is not A, B<n> with n >= 1, or C<n> with n >= 2.
-    """
-    match = _PATTERN.fullmatch(reference) if isinstance(reference, str) else None
-    if match and reference == "A":
-        return "A", 1
-    if match and (match[1] == "B" or int(match[2]) >= 2):
-        return match[1], int(match[2])
-    raise ConfigError(
-        f"reference {str(reference)[:40]!r} is not one of A, B<n> (n >= 1) or C<n> (n >= 2), "
-        "for example B5"
-    )
 
 
 def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]:
@@ -59,7 +37,7 @@ def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]
     ConfigError
         If the reference has another form.
     """
-    kind, step = parse_reference(reference)
+    kind, step = parse_reference("reference", reference)
     if kind == "A":
         j = np.arange(1, n_poses)
         return np.zeros_like(j), j

@@ -131,7 +131,6 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
     values = f" Values: {', '.join(words)}." if words else ""
     descriptor = ParameterDescriptor(
         description=f"{meta['doc']}{unit}{values}",
-        additional_constraints=f"must be {meta['form']}" if meta["form"] else "",
         read_only=meta["read_only"],
         dynamic_typing=is_dynamic,
     )

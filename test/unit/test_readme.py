@@ -69,7 +69,7 @@ def allowed(field):
         return " or ".join([*words, f"{least:g} to {most:g}"])
     if words:
         return " or ".join(words)
-    if meta["parse"] or meta["pattern"]:
+    if meta["parse"]:
         return "see meaning"
     return "any path" if field.name.endswith("_directory") else "any name"
 
