@@ -20,9 +20,6 @@ _SILENT_AFTER_S, _BAD_INPUT_FOR_S = 2.0, 10.0
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
-# A message may be overtaken by so many others of its publisher; farther back, the publisher was
-# started again.
-_MOST_OVERTAKEN = 1000
 # Reports (one a second) over which rates and shares are taken.
 _REPORTS = 10
 
@@ -113,15 +110,10 @@ class PoseInput:
         """Count the lost messages before one with this number of its publisher; None if nothing is
         known of them: there are several publishers, or the middleware gives no numbers.
         """
-        expected, self._next_number = self._next_number, sequence_number
-        if sequence_number is None:
-            return
-        missing = 0 if expected is None else sequence_number - expected
-        if -_MOST_OVERTAKEN <= missing < 0:  # counted when a later one overtook it
-            self._lost, self._next_number = max(self._lost - 1, 0), expected
-        else:
-            self._lost += max(missing, 0)
-            self._next_number = sequence_number + 1
+        expected, number = self._next_number, sequence_number
+        self._next_number = None if number is None else number + 1
+        if expected is not None and number is not None:  # less: the publisher was started again
+            self._lost += max(number - expected, 0)
 
     def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         """Take a message; it is read when its stamp is believed."""

@@ -76,6 +76,7 @@ class CalibratorNode(Node):
         tree = RobotTree(self, self._log)
         self._robot = Robot(self._log, options, tree)
         if options.base_frame or options.installed == TF:
+            message_type("base_frame" if options.base_frame else "installed")  # or it raises
             tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
@@ -256,13 +257,8 @@ class CalibratorNode(Node):
 
     def _check_options(self, options: NodeConfig) -> None:
         """Raise ConfigError if options cannot be had together, or not on this machine."""
-        of_tf = {name: getattr(options, name) for name in ("parent_tf", "child_tf")}
-        of_tf |= {"publish_tf": options.publish_tf, "base_frame": options.base_frame}
-        for name, wanted in (of_tf | {"installed": options.installed == TF}).items():
-            if wanted:
-                message_type(name)
-            if wanted and name in ("parent_tf", "child_tf"):
-                TfSource.parse(wanted)
+        if options.publish_tf:
+            message_type()
         if options.monitor and not options.installed:
             raise ConfigError("monitor needs installed: what the mount is watched against")
         if options.monitor and options.other_children:

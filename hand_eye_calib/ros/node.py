@@ -10,10 +10,6 @@ import signal
 import sys
 import threading
 import traceback
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from rclpy.executors import SingleThreadedExecutor
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -86,12 +82,20 @@ def _run_node(signals: int) -> int:
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
 
     # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
-    executor = SingleThreadedExecutor()
+    executor, stopping = SingleThreadedExecutor(), threading.Event()
+
+    def wait_for_signal() -> None:
+        os.read(signals, 1)
+        # As a task: executor.wake() alone does not make spin_once() return.
+        executor.create_task(stopping.set)
+
+    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
     node, code = None, 1
     try:
         node = CalibratorNode()
         executor.add_node(node)
-        _spin(executor, signals)
+        while not stopping.is_set():
+            executor.spin_once()
         code = 0
     except HandEyeCalibError as error:
         print(f"calibrator: {error}", file=sys.stderr)
@@ -107,16 +111,3 @@ def _run_node(signals: int) -> int:
         node.destroy_node()
     rclpy.try_shutdown()
     return code
-
-
-def _spin(executor: "SingleThreadedExecutor", signals: int) -> None:
-    stopping = threading.Event()
-
-    def wait_for_signal() -> None:
-        os.read(signals, 1)
-        # As a task: executor.wake() alone does not make spin_once() return.
-        executor.create_task(stopping.set)
-
-    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
-    while not stopping.is_set():
-        executor.spin_once()

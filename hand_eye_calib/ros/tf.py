@@ -259,12 +259,11 @@ class TfBroadcaster:
 
     def _broadcast(self, result: Calibration) -> None:
         self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
+        kind, own, transform = message_type(), self._tree.own, to_transform(result, True)
+        if self._publisher is not None and transform == own[-1]:
+            return
         if self._publisher is None:
-            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
-            self._sent: TransformStamped | None = None
+            self._publisher = self._node.create_publisher(kind, STATIC_TOPIC, LATCHED)
             self._log.info("the result is broadcast on /tf_static from now on")
-        transform = to_transform(result, is_mounting=True)
-        if transform != self._sent:
-            self._sent = transform
-            self._tree.own.append(transform)
-            self._publisher.publish(message_type()(transforms=[transform]))
+        own.append(transform)
+        self._publisher.publish(kind(transforms=[transform]))

@@ -91,7 +91,7 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
     assert all(angle > 20 for angle in good.extrinsic.rotation_deg.values())
     result = good.extrinsic.result
     assert result.status == "ok"
-    assert all(0.005 < result.pose_sigma[axis] < 0.006 for axis in "xyz")
+    assert all(0.001 < result.pose_sigma[axis] < 0.01 for axis in "xyz")  # the floor
     assert 0 <= result.age_s < 60
     assert (good.journal.level, good.journal.directory) == (Level.OK, str(tmp_path / "journal"))
 
