@@ -34,7 +34,9 @@ _CLEARLY = 3.0
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
 
-# What the axes of a vehicle mean: x is forward, z is up.
+# Names of the axes, and what they mean on a vehicle: x is forward, z is up.
+_AXES = [f"{how} {axis}" for how in ("along", "about") for axis in "xyz"]
+_NAMES = dict(zip(AXES, _AXES, strict=True))
 _WORDS = ("forward", "sideways", "height", "tilt to a side", "nose up or down", "turn")
 _ON_A_VEHICLE = dict(zip(AXES, _WORDS, strict=True))
 
@@ -47,6 +49,11 @@ class Tone(Enum):
     ACT = "!"
     BAD = "✗"
     UNKNOWN = "?"
+
+    @property
+    def css(self) -> str:
+        """Its class in the page."""
+        return self.name.lower()
 
 
 @dataclass(frozen=True)
@@ -252,7 +259,7 @@ def _moved(comparison: Comparison | None) -> str:
         return ""
     rows = comparison.differences[0].axes
     axes = [axis for axis in AXES if axis in rows and rows[axis].verdict == "moved"]
-    return listing([f"{_name(axis)} {_signed(axis, rows[axis].difference)}" for axis in axes])
+    return listing([f"{_NAMES[axis]} {_signed(axis, rows[axis].difference)}" for axis in axes])
 
 
 def _of_end(state: NodeState) -> tuple[Tone, str, str]:
@@ -278,27 +285,18 @@ def _facts(state: NodeState) -> str:
     seen = state.extrinsic
     if seen is None or not seen.n_poses:
         return ""
-    told = [f"{seen.path_m:,.0f} m", f"{_about(seen.motion_s)} of motion"]
-    told += [f"result {_about(seen.result.age_s)} old"] if seen.result else []
+    told = [f"{seen.path_m:,.0f} m", f"{duration(seen.motion_s)} of motion"]
+    told += [f"result {duration(seen.result.age_s)} old"] if seen.result else []
     return ", ".join(told)
 
 
 def _ago(mount: MountState) -> str:
     if not mount.since_ns or not mount.newest_ns:
-        return f"{_about(mount.seconds_of_motion)} of motion seen"
-    return f"{_about((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
-
-
-def _about(seconds: float) -> str:
-    return duration(seconds) if seconds >= 10 else f"{seconds:.0f} s"
+        return f"{duration(mount.seconds_of_motion)} of motion seen"
+    return f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
 
 
 # ------------------------------------------------------------------------ axes
-
-
-def _name(axis: str) -> str:
-    """Such as ``along x`` or ``about z``."""
-    return f"about {'xyz'[ROTATIONS.index(axis)]}" if axis in ROTATIONS else f"along {axis}"
 
 
 def _signed(axis: str, value: float) -> str:
@@ -330,7 +328,7 @@ def _bar(axis: str, state: NodeState) -> Bar:
         difference = difference if math.isfinite(row.sigma) else "unknown"
     is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
     meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""
-    return Bar(_name(axis), meaning, share, tone, word, against, difference)
+    return Bar(_NAMES[axis], meaning, share, tone, word, against, difference)
 
 
 def _values(result: ResultState) -> Iterator[tuple[str, str]]:
@@ -356,7 +354,7 @@ def _watched(axis: str, mount: MountState) -> Line:
     else:
         text = "not known yet" if mount.is_learning else "cannot be watched with this motion"
         tone = Tone.UNKNOWN
-    return Line(tone, _name(axis), text)
+    return Line(tone, _NAMES[axis], text)
 
 
 # ------------------------------------------------- health, verdict, comparison

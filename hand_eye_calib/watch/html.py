@@ -44,7 +44,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     )
     facts = f'<p class="facts">{escape(view.facts)}</p>' if view.facts else ""
     return (
-        f'<div id="state" class="{_tone(view.tone)}" data-buttons="{" ".join(view.buttons)}" '
+        f'<div id="state" class="{view.tone.css}" data-buttons="{" ".join(view.buttons)}" '
         f'data-by-hand="{escape(view.by_hand)}">'
         f'<p class="node">{escape(view.node or "no node")}</p>'
         f'<section class="headline"><h1>{_sign(view.tone)} {escape(view.word)}</h1>'
@@ -67,7 +67,7 @@ def _wrapped(tag: str, parts: Iterable[str]) -> list[str]:
 def _bar(bar: Bar) -> str:
     difference = f"from installed: {bar.difference}" if bar.difference else ""
     return (
-        f'<div class="axis {_tone(bar.tone)}"><b>{escape(bar.name)}</b>'
+        f'<div class="axis {bar.tone.css}"><b>{escape(bar.name)}</b>'
         f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.name)}"></progress>'
         f'<span class="state">{_sign(bar.tone)} {escape(bar.word)}</span>'
         f'<span class="meaning">{escape(bar.meaning)}</span>'
@@ -78,14 +78,10 @@ def _bar(bar: Bar) -> str:
 
 def _line(line: Line) -> str:
     return (
-        f'<p class="line {_tone(line.tone)}">{_sign(line.tone)} <b>{escape(line.name)}</b> '
+        f'<p class="line {line.tone.css}">{_sign(line.tone)} <b>{escape(line.name)}</b> '
         f"{escape(line.text)}</p>"
     )
 
 
 def _sign(tone: Tone) -> str:
     return f'<span class="sign">{tone.value}</span>'
-
-
-def _tone(tone: Tone) -> str:
-    return tone.name.lower()
