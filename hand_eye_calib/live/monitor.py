@@ -426,8 +426,10 @@ class MountWatch:
         elif monitor.is_learning:
             text = f"learning the noise: {monitor.seconds} of {LEARNING_S} s of motion"
         else:
-            targets = np.array(self._session.calibrator.config.targets)
-            text = _quiet(visible, visible <= _TARGETS * targets)
+            hidden = visible > _TARGETS * np.array(self._session.calibrator.config.targets)
+            unwatched = axes_in_words([AXES[index] for index in np.flatnonzero(hidden)])
+            text = "the mount has not moved"
+            text += f"; {unwatched} cannot be watched here" if unwatched else ""
         told = np.where(visible < _UNKNOWN, visible, np.nan)
         return MountState(
             level=Level.ERROR if alarm else Level.OK,
@@ -440,15 +442,3 @@ class MountWatch:
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,
         )
-
-
-def _quiet(visible: FloatArray, is_watched: np.ndarray) -> str:
-    told = []
-    for part in (range(3), range(3, 6)):
-        if known := [index for index in part if is_watched[index]]:
-            worst = amount(AXES[known[0]], float(visible[known].max()))
-            told.append(f"{worst} in {axes_in_words([AXES[index] for index in known])}")
-    shown = f": ten minutes of motion would show {listing(told)}" if told else ""
-    unwatched = [axis for axis, watched in zip(AXES, is_watched, strict=True) if not watched]
-    hidden = f"; {axes_in_words(unwatched)} cannot be watched here" if unwatched else ""
-    return f"the mount has not moved{shown}{hidden}"
