@@ -107,7 +107,7 @@ def estimate_time_offset(
     """
     for name, stream in (("parent", parent), ("child", child)):
         if leap := find_leap(stream.stamps_ns):
-            raise InputError(f"the {name} stream's {leap.what}; {leap.advice}")
+            raise InputError(f"the {name} stream's {'; '.join(leap)}")
     correlation = correlate_rates(parent, child, max_gap_s, of_speed)
     if correlation.is_clear and of_speed:
         sigma_s = max(parent.interval_s, child.interval_s) / 5

@@ -362,7 +362,7 @@ def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
     if len(pairs) < 3:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
-    return _size(pairs.rotation_residuals(X))
+    return _size(pairs.residuals(X)[1])
 
 
 def _size(vectors: FloatArray) -> float:

@@ -262,7 +262,7 @@ def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Exp
     # Wrong axes of the positions do not affect the rotations: they agree alone.
     pairs = streams.pairs(lag_s, MAX_PAIRS)
     T_rotation = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
-    errors = np.linalg.norm(pairs.rotation_residuals(T_rotation), axis=1)
+    errors = np.linalg.norm(pairs.residuals(T_rotation)[1], axis=1)
     angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
     if median(errors) < 2 * HOLDS * np.sqrt(np.mean(angles**2)):
         start = replace(plain.fit, T_parent_child=T_rotation)

@@ -138,7 +138,7 @@ def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> lis
         text = f"the {stream} stream has {len(trajectory)} poses"
         return [finding("too_short", stream, text=text)]
     if leap := find_leap(trajectory.stamps_ns):
-        return [finding("leap", stream, text=leap.what, remedy=leap.advice)]
+        return [finding("leap", stream, text=leap[0], remedy=leap[1])]
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     gaps = are_gaps(intervals_s, max_gap_s)
     if not gaps.any():

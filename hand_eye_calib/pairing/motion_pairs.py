@@ -35,7 +35,7 @@ def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]
     Raises
     ------
     ConfigError
-        If the reference has another form.
+        If the reference has another form: n is at least 1, of C at least 2.
     """
     kind, step = parse_reference("reference", reference)
     if kind == "A":
@@ -80,28 +80,20 @@ class MotionPairs:
         )
 
     def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """:meth:`translation_residuals` and :meth:`rotation_residuals` (K, 3) at X (4, 4)."""
-        return self.translation_residuals(T_parent_child), self.rotation_residuals(T_parent_child)
+        """Residuals (K, 3) of translation and of rotation at X (4, 4).
 
-    def translation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
-        """``R_A t + t_A - R t_B - t`` (K, 3), in m, in the axes of the parent sensor at instant i.
-
-        It is the residual of Välimäki et al. 2023, eq. (6). The article prints its last term with
-        the opposite sign; its published results have this one.
+        ``R_A t + t_A - R t_B - t``, in m, in the axes of the parent sensor at instant i: Välimäki
+        et al. 2023, eq. (6). The article prints its last term with the opposite sign; its published
+        results have this one. Rotation vectors, in rad, in the axes of the child sensor at instant
+        j, of the rotation from ``R_A R`` to ``R R_B``; their lengths are the angles of eq. (7).
         """
         rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
         chord = self.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
         moved_child = self.Ts_childi_childj[:, :3, 3] @ rotation.T
-        return chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
-
-    def rotation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
-        """Rotation vectors (K, 3), in rad, in the axes of the child sensor at instant j, of the
-        rotation from ``R_A R`` to ``R R_B``. Their lengths are the angles of eq. (7).
-        """
-        rotation = T_parent_child[:3, :3]
+        apart = chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
         via_parent = self.Ts_parenti_parentj[:, :3, :3] @ rotation
         via_child = rotation @ self.Ts_childi_childj[:, :3, :3]
-        return se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
+        return apart, se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
 
 
 def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> MotionPairs:

@@ -1,7 +1,7 @@
 """Synchronisation: poses of two streams at common instants, by interpolation."""
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,50 +132,34 @@ def select_keyframes(
     n_poses = len(pose_pairs)
     if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
         return np.arange(n_poses)
-    stamps_ns, poses = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p
+    stamps_ns, poses, kept = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, []
     if previous is not None and len(previous):
-        kept, last_stamp_ns, T_last = [], previous.stamps_ns[-1], previous.Ts_pw_p[-1]
+        last_ns, T_last = previous.stamps_ns[-1], previous.Ts_pw_p[-1]
     else:
-        kept, last_stamp_ns, T_last = [0], stamps_ns[0], poses[0]
-    next_index = len(kept)
-    while next_index < n_poses:
-        window = slice(next_index, next_index + _WINDOW)
-        wanted = stamps_ns[window] - last_stamp_ns >= min_interval_s * 1e9
-        if min_translation > 0.0 or min_rotation > 0.0:
-            wanted &= _has_moved(T_last, poses[window], min_translation, min_rotation)
-        hits = np.flatnonzero(wanted)
-        if hits.size == 0:
-            next_index += _WINDOW
-            continue
-        index = next_index + int(hits[0])
-        kept.append(index)
-        last_stamp_ns, T_last, next_index = stamps_ns[index], poses[index], index + 1
+        kept, last_ns, T_last = [0], stamps_ns[0], poses[0]
+    index = len(kept)
+    while index < n_poses:
+        window = slice(index, index + _WINDOW)
+        wanted = stamps_ns[window] - last_ns >= min_interval_s * 1e9
+        has_moved = np.full(len(wanted), max(min_translation, min_rotation) == 0.0)
+        if min_translation > 0.0:
+            away_m = np.linalg.norm(poses[window, :3, 3] - T_last[:3, 3], axis=1)
+            has_moved |= away_m >= min_translation
+        if min_rotation > 0.0:
+            turned = se3.rotation_angle(T_last[:3, :3].T @ poses[window, :3, :3])
+            has_moved |= turned >= min_rotation
+        hits = index + np.flatnonzero(wanted & has_moved)
+        if hits.size:
+            kept.append(int(hits[0]))
+            last_ns, T_last = stamps_ns[hits[0]], poses[hits[0]]
+        index = kept[-1] + 1 if hits.size else index + _WINDOW
     return np.array(kept, dtype=int)
 
 
-def _has_moved(
-    T_last: FloatArray, poses: FloatArray, min_translation: float, min_rotation: float
-) -> BoolArray:
-    """Whether each pose (N, 4, 4) is at least one of both thresholds away from the last."""
-    moved = np.zeros(len(poses), dtype=bool)
-    if min_translation > 0.0:
-        moved |= np.linalg.norm(poses[:, :3, 3] - T_last[:3, 3], axis=1) >= min_translation
-    if min_rotation > 0.0:
-        moved |= se3.rotation_angle(T_last[:3, :3].T @ poses[:, :3, :3]) >= min_rotation
-    return moved
-
-
-class Leap(NamedTuple):
-    """The longest leap in a stream's stamps: the finding, to follow "the parent stream's", and the
-    remedy.
+def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
+    """The longest leap in stamps (N,), in rising order, of a stream: what it is, to follow "the
+    parent stream's", and what to do about it; None without one.
     """
-
-    what: str
-    advice: str
-
-
-def find_leap(stamps_ns: IntArray) -> Leap | None:
-    """The longest leap in stamps (N,), in rising order; None without one."""
     if len(stamps_ns) < 2:
         return None
     intervals_s, count = np.diff(stamps_ns) * 1e-9, len(stamps_ns)
@@ -184,7 +168,5 @@ def find_leap(stamps_ns: IntArray) -> Leap | None:
     if days <= 1.0:
         return None
     few = f"the first {before}" if before < count - before else f"the last {count - before}"
-    return Leap(
-        f"stamps leap by {days:,.0f} days after pose {before} of {count}",
-        f"repair the stamps, or remove {few} of its poses",
-    )
+    what = f"stamps leap by {days:,.0f} days after pose {before} of {count}"
+    return what, f"repair the stamps, or remove {few} of its poses"

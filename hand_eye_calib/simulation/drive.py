@@ -30,8 +30,9 @@ _START = np.array([0.0, 0.5])
 # Time from their start to the first pose (s), and time for which their first yaw rate is held.
 _LEAD_S, _FIRST_HOLD_S = 0.1, 0.4
 
-# Variance of a jump per axis, m^2.
-JUMP_VARIANCE = 0.02
+# Largest offset of the child sensor along each axis of the parent (m), and variance of a jump per
+# axis (m^2).
+_LARGEST_OFFSET_M, _JUMP_VARIANCE = 0.5, 0.02
 
 
 @dataclass(frozen=True)
@@ -103,19 +104,7 @@ def simulate_drive(
     config: DriveConfig = PUBLISHED_DRIVE,
     noise: NoiseConfig = NoiseConfig(),  # noqa: B008 - frozen
 ) -> SimulatedDrive:
-    """Simulate one drive.
-
-    Parameters
-    ----------
-    seed : int or sequence of int
-        The same seed gives the same drive, with any noise, and the same noise.
-    config : DriveConfig
-    noise : NoiseConfig
-
-    Returns
-    -------
-    SimulatedDrive
-    """
+    """Simulate one drive: of one seed the same, with any noise, and with the same noise."""
     motion_rng, extrinsic_rng, noise_rng = np.random.default_rng(seed).spawn(3)
     n_child = max(2, round(config.poses * config.child_rate / config.parent_rate))
     parent_times_s = np.arange(config.poses) / config.parent_rate
@@ -123,11 +112,9 @@ def simulate_drive(
     Ts_pw_p, Ts_pw_p_at_child = _vehicle_poses(
         config, motion_rng, _LEAD_S + parent_times_s, _LEAD_S + child_times_s
     )
-    offset_m = config.max_offset
-    T_parent_child = se3.from_rotation_translation(
-        Rotation.from_quat(extrinsic_rng.standard_normal(4)).as_matrix(),
-        extrinsic_rng.uniform(-offset_m, offset_m, 3),
-    )
+    rotation = Rotation.from_quat(extrinsic_rng.standard_normal(4)).as_matrix()
+    offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
+    T_parent_child = se3.from_rotation_translation(rotation, offset)
     # Euler angles (rad) and translation (m) are differences of two uniform numbers from 0 to 1.
     angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
     T_pw_cw = se3.from_rotation_translation(
@@ -213,42 +200,33 @@ def _poses_on_terrain(
     return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 
-def peaks(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of three hills and three hollows around the origin, flat beyond about 3.5; arrays of
-    one shape, no unit.
-    """
-    total: FloatArray = (
-        3.0 * (1.0 - x) ** 2 * np.exp(-(x**2) - (y + 1.0) ** 2)
-        - 10.0 * (x / 5.0 - x**3 - y**5) * np.exp(-(x**2) - y**2)
-        - np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
-    )
-    return total
-
-
-def peaks_gradient(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of :func:`peaks` with respect to x and y."""
-    hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
-    middle, polynomial = 10.0 * np.exp(-(x**2) - y**2), x / 5.0 - x**3 - y**5
-    hollow = np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
-    along_x = -2.0 * (1.0 - x) * (1.0 + x * (1.0 - x)) * hill
-    along_x += (2.0 * x * polynomial - 0.2 + 3.0 * x**2) * middle + 2.0 * (x + 1.0) * hollow
-    along_y = -2.0 * (y + 1.0) * (1.0 - x) ** 2 * hill
-    along_y += (2.0 * y * polynomial + 5.0 * y**4) * middle + 2.0 * y * hollow
-    return along_x, along_y
-
-
 def surface(
     x: FloatArray, y: FloatArray, height: float, scale: float, limit: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Height (N,) of the ground, m, and its slopes (N,) along x and y, at places (N,), m.
 
-    ``height`` and ``scale`` are metres per unit of :func:`peaks` and of its arguments; arguments
+    ``height`` and ``scale`` are metres per unit of :func:`_peaks` and of its arguments; arguments
     beyond +/- ``limit`` are mirrored back, so that a long drive stays on the hills.
     """
     (u, sign_u), (v, sign_v) = _mirrored(x / scale, limit), _mirrored(y / scale, limit)
-    along_u, along_v = peaks_gradient(u, v)
+    peaks, along_u, along_v = _peaks(u, v)
     slope = height / scale
-    return height * peaks(u, v), slope * sign_u * along_u, slope * sign_v * along_v
+    return height * peaks, slope * sign_u * along_u, slope * sign_v * along_v
+
+
+def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Height of three hills and three hollows around the origin, flat beyond about 3.5, and its
+    derivatives by x and y; arrays of one shape, no unit.
+    """
+    hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
+    middle, polynomial = 10.0 * np.exp(-(x**2) - y**2), x / 5.0 - x**3 - y**5
+    hollow = np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
+    total = (1.0 - x) ** 2 * hill - polynomial * middle - hollow
+    along_x = -2.0 * (1.0 - x) * (1.0 + x * (1.0 - x)) * hill
+    along_x += (2.0 * x * polynomial - 0.2 + 3.0 * x**2) * middle + 2.0 * (x + 1.0) * hollow
+    along_y = -2.0 * (y + 1.0) * (1.0 - x) ** 2 * hill
+    along_y += (2.0 * y * polynomial + 5.0 * y**4) * middle + 2.0 * y * hollow
+    return total, along_x, along_y
 
 
 def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
@@ -256,9 +234,6 @@ def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]
     phase = np.mod(values + limit, 4.0 * limit)
     falling = phase > 2.0 * limit
     return np.where(falling, 3.0 * limit - phase, phase - limit), np.where(falling, -1.0, 1.0)
-
-
-# ---- noise
 
 
 def add_noise(
@@ -314,7 +289,7 @@ def add_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generato
     count = len(Ts_world_sensor)
     indices = rng.integers(count, size=round(share * count))
     shifts = np.zeros((count, 3))
-    np.add.at(shifts, indices, np.sqrt(JUMP_VARIANCE) * rng.standard_normal((len(indices), 3)))
+    np.add.at(shifts, indices, np.sqrt(_JUMP_VARIANCE) * rng.standard_normal((len(indices), 3)))
     jumped = Ts_world_sensor.copy()
     jumped[:, :3, 3] += np.cumsum(shifts, axis=0)
     return jumped

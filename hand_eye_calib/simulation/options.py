@@ -25,8 +25,6 @@ class DriveConfig:
     attitude : {"vehicle", "published"}
         x ahead and z along the normal of the surface; or the orientations of the published
         trajectories, which no vehicle has (transposed, slopes not rotated with the heading).
-    max_offset : float
-        Of the child sensor along each axis of the parent, m.
     """
 
     poses: int = 100
@@ -41,7 +39,6 @@ class DriveConfig:
     terrain_scale: float = 1.0
     terrain_limit: float = 5.0
     attitude: str = "vehicle"
-    max_offset: float = 0.5
     parent_frame: str = "parent"
     child_frame: str = "child"
 

@@ -51,4 +51,4 @@ def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
 
 def squared_translation_residual(pairs: MotionPairs, T_parent_child: FloatArray) -> float:
     """Sum over the pairs of ``|R_A t + t_A - R t_B - t|^2``, m^2."""
-    return float((pairs.translation_residuals(T_parent_child) ** 2).sum())
+    return float((pairs.residuals(T_parent_child)[0] ** 2).sum())
