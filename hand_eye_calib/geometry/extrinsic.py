@@ -81,13 +81,8 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
 
 
 def sigmas_translation(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (3,) of the translation along the axes of the target frame, m.
-
-    Parameters
-    ----------
-    T_target_source : (4, 4) array
-    covariance : (6, 6) array
-        Of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
+    """Standard deviations (3,) of the translation along the axes of the target frame, m, of a
+    transform (4, 4) and a covariance (6, 6) as for :func:`sigmas_rpy`.
     """
     rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
     covariance = np.asarray(covariance, dtype=float)[:3, :3]

@@ -203,12 +203,10 @@ class FrameTree:
 
     def listing(self) -> str:
         """List the edges in one line."""
-        if not self.edges:
-            return "it has none"
         edges = sorted(
             f"{edge.parent}:{frame}{' (static)' * edge.is_static}"
             for frame, edge in self.edges.items()
         )
-        n_more = len(edges) - _MOST_LISTED
-        more = [f"and {n_more} more"] if n_more > 0 else []
-        return f"it has {', '.join(edges[:_MOST_LISTED] + more)}"
+        if len(edges) > _MOST_LISTED:
+            edges[_MOST_LISTED:] = [f"and {len(edges) - _MOST_LISTED} more"]
+        return f"it has {', '.join(edges) or 'none'}"

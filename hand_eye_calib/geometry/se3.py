@@ -21,16 +21,7 @@ _SINGULAR_COSINE = 1e-7
 
 
 def skew(vectors: ArrayLike) -> FloatArray:
-    """Cross-product matrices.
-
-    Parameters
-    ----------
-    vectors : (..., 3) array
-
-    Returns
-    -------
-    (..., 3, 3) array ``S`` with ``S @ v == cross(vector, v)``
-    """
+    """Matrices S (..., 3, 3) of vectors (..., 3), with ``S @ v == cross(vector, v)``."""
     vectors = np.asarray(vectors, dtype=float)
     matrices: FloatArray = np.zeros(vectors.shape + (3,))
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
@@ -43,15 +34,8 @@ def vee(matrices: FloatArray) -> FloatArray:
     """Vectors (..., 3) of twice the antisymmetric part of matrices (..., 3, 3): of a rotation, its
     axis times twice the sine of its angle.
     """
-    M = matrices
-    return np.stack(
-        [
-            M[..., 2, 1] - M[..., 1, 2],
-            M[..., 0, 2] - M[..., 2, 0],
-            M[..., 1, 0] - M[..., 0, 1],
-        ],
-        axis=-1,
-    )
+    apart = matrices - np.swapaxes(matrices, -1, -2)
+    return np.stack([apart[..., 2, 1], apart[..., 0, 2], apart[..., 1, 0]], axis=-1)
 
 
 def cross(left: FloatArray, right: FloatArray) -> FloatArray:
@@ -122,9 +106,8 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
     R = np.asarray(rotation, dtype=float)
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
     singular = cosine < _SINGULAR_COSINE
-    roll = np.where(
-        singular, np.arctan2(-R[..., 1, 2], R[..., 1, 1]), np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    )
+    at_pole = np.arctan2(-R[..., 1, 2], R[..., 1, 1])
+    roll = np.where(singular, at_pole, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
     yaw = np.where(singular, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
     return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
 
@@ -187,21 +170,14 @@ def rotation_exp(rotation_vector: ArrayLike) -> FloatArray:
 
 def _matrices(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> FloatArray:
     """Rotation matrices (..., 3, 3) of unit quaternions, given by coefficient, each (...)."""
-    matrices = np.empty((*np.shape(w), 3, 3))
     twice_x, twice_y, twice_z = 2.0 * x, 2.0 * y, 2.0 * z
     xx, yy, zz = twice_x * x, twice_y * y, twice_z * z
-    matrices[..., 0, 0], matrices[..., 1, 1], matrices[..., 2, 2] = (
-        1.0 - (yy + zz),
-        1.0 - (xx + zz),
-        1.0 - (xx + yy),
-    )
-    for row, column, product, other in (
-        (1, 0, twice_x * y, twice_z * w),
-        (0, 2, twice_x * z, twice_y * w),
-        (2, 1, twice_y * z, twice_x * w),
-    ):
-        matrices[..., row, column], matrices[..., column, row] = product + other, product - other
-    return matrices
+    xy, xz, yz = twice_x * y, twice_x * z, twice_y * z
+    xw, yw, zw = twice_x * w, twice_y * w, twice_z * w
+    entries = [1.0 - (yy + zz), xy - zw, xz + yw]
+    entries += [xy + zw, 1.0 - (xx + zz), yz - xw]
+    entries += [xz - yw, yz + xw, 1.0 - (xx + yy)]
+    return np.stack(entries, axis=-1).reshape(*np.shape(w), 3, 3)
 
 
 def inverse(transforms: ArrayLike) -> FloatArray:
@@ -234,16 +210,11 @@ def exp(xi: ArrayLike) -> FloatArray:
     xi = np.asarray(xi, dtype=float)
     rho, phi = xi[..., :3], xi[..., 3:]
     angle = np.linalg.norm(phi, axis=-1)
-    safe = np.where(angle < _SERIES_ANGLE, 1.0, angle)
-    squared = angle**2
-    first = np.where(
-        angle < _SERIES_ANGLE, 0.5 - squared / 24 + squared**2 / 720, (1 - np.cos(safe)) / safe**2
-    )
-    second = np.where(
-        angle < _SERIES_ANGLE,
-        1 / 6 - squared / 120 + squared**2 / 5040,
-        (safe - np.sin(safe)) / safe**3,
-    )
+    small, squared = angle < _SERIES_ANGLE, angle**2
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - np.cos(safe)) / safe**2)
+    series = 1 / 6 - squared / 120 + squared**2 / 5040
+    second = np.where(small, series, (safe - np.sin(safe)) / safe**3)
     cross_once = cross(phi, rho)
     translation = rho + first[..., None] * cross_once + second[..., None] * cross(phi, cross_once)
     return from_rotation_translation(rotation_exp(phi), translation)
@@ -271,13 +242,10 @@ def log(transforms: ArrayLike) -> FloatArray:
     phi = rotation_log(transforms[..., :3, :3])
     translation = transforms[..., :3, 3]
     angle = np.linalg.norm(phi, axis=-1)
-    safe = np.where(angle < _SERIES_ANGLE, 1.0, angle)
-    squared = angle**2
-    coefficient = np.where(
-        angle < _SERIES_ANGLE,
-        1 / 12 + squared / 720 + squared**2 / 30240,
-        (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2,
-    )
+    small, squared = angle < _SERIES_ANGLE, angle**2
+    safe = np.where(small, 1.0, angle)
+    series = 1 / 12 + squared / 720 + squared**2 / 30240
+    coefficient = np.where(small, series, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
     cross_once = cross(phi, translation)
     rho = translation - 0.5 * cross_once + coefficient[..., None] * cross(phi, cross_once)
     return np.concatenate([rho, phi], axis=-1)

@@ -34,16 +34,6 @@ REACH = _NEARBY + 2
 _CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
 
 
-def integrated(stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-    """Orientations (N, 3, 3) of a body in its own first axes, from its angular rates (N, 3), rad/s,
-    about its axes at stamps (N,). Between two stamps the mean of both counts; a step back in time
-    is a rotation back.
-    """
-    intervals_s = np.diff(stamps_ns) * 1e-9
-    steps = 0.5 * (rates[1:] + rates[:-1]) * intervals_s[:, None]
-    return chained(se3.rotation_exp(steps))
-
-
 def chained(steps: FloatArray) -> FloatArray:
     """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on."""
     rotations = np.concatenate([np.eye(3)[None], steps])
@@ -59,17 +49,22 @@ class RateIntegrator:
     """Integrates the angular rates of one sensor as they come in, in parts of any length."""
 
     def __init__(self) -> None:
-        self._last: tuple[ArrayLike, FloatArray] | None = None
+        self._last: tuple[IntArray, FloatArray] | None = None
         self._rotation = np.eye(3)
 
-    def quats_xyzw(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-        """Orientations (M, 4), scalar last, at the stamps (M,) of the next rates (M, 3), rad/s."""
+    def rotations(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
+        """Orientations (M, 3, 3) of the sensor in its own first axes at the stamps (M,) of the next
+        rates (M, 3), rad/s, about its axes. Between two stamps the mean of both counts; a step back
+        in time is a rotation back.
+        """
         last_ns, last_rate = self._last or (stamps_ns[:1], rates[:1])
-        steps = integrated(np.r_[last_ns, stamps_ns], np.concatenate([last_rate, rates]))
-        rotations = self._rotation @ steps[1:]
-        self._last = [int(stamps_ns[-1])], np.array(rates[-1:], dtype=float)
+        intervals_s = np.diff(np.concatenate([last_ns, stamps_ns])) * 1e-9
+        means = 0.5 * (rates + np.concatenate([last_rate, rates[:-1]]))
+        steps = se3.rotation_exp(means * intervals_s[:, None])
+        rotations = self._rotation @ chained(steps)[1:]
+        self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
         self._rotation = se3.nearest_rotation(rotations[-1])  # rounding adds up over hours
-        return se3.to_quat_xyzw(rotations)
+        return rotations
 
 
 @dataclass(frozen=True)
@@ -194,7 +189,7 @@ class Trajectory:
         """
         rates = np.asarray(rates, dtype=float).reshape(-1, 3)
         _check_finite("rate", rates)
-        rotations = integrated(np.asarray(stamps_ns), rates)
+        rotations = RateIntegrator().rotations(np.asarray(stamps_ns), rates)
         poses = se3.from_rotation_translation(rotations, np.zeros_like(rates))
         return cls(stamps_ns, poses, sensor_frame, "", "rates")
 
@@ -255,21 +250,17 @@ class Trajectory:
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
     ) -> FloatArray:
-        """Interpolate poses at other stamps, see :func:`corners`.
+        """Interpolate poses (M, 4, 4) at other stamps (M,), see :func:`corners`. A stamp of the
+        trajectory gives its very pose, bit by bit.
 
         Parameters
         ----------
         stamps_ns : (M,) int64 array
         extrapolate : bool
             Extend the twist of the first and last segment beyond the ends, as the paper's KITTI
-            experiments do. Without it a stamp outside the trajectory is an error.
+            experiments do.
         straight : bool
             Along the geodesic of SE(3) between neighbours, as in the paper.
-
-        Returns
-        -------
-        (M, 4, 4) array
-            A stamp of the trajectory gives its very pose, bit by bit.
 
         Raises
         ------
@@ -338,9 +329,8 @@ def _check_poses(poses: FloatArray) -> None:
             f"pose {index}: {far_position(*poses[index, :3, 3])}; check its unit, or remove it"
         )
     rotation = poses[:, :3, :3]
-    deviation = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(
-        axis=(1, 2), initial=0.0
-    )
+    apart = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3))
+    deviation = apart.max(axis=(1, 2), initial=0.0)
     wrong = (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0)
     if wrong.any():
         raise InputError(

@@ -18,6 +18,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.fields import FIELDS
 from hand_eye_calib.io.bags.mcap_files import MessageKind
@@ -360,7 +361,7 @@ class MessageReader:
     def _measured(self, stamps_ns: IntArray, values: FloatArray, rows: BoolArray) -> FloatArray:
         """Positions (N, 3) or quaternions (N, 4) of what was read in some rows."""
         if self._measures == "rates":
-            return self._rates.quats_xyzw(stamps_ns[rows], values[rows])
+            return se3.to_quat_xyzw(self._rates.rotations(stamps_ns[rows], values[rows]))
         if self._row.unpack is not _fix:
             return values[rows]
         beyond = values[np.abs(values[:, 0]) > POLE_DEG]
