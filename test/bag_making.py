@@ -36,7 +36,6 @@ class Pose(NamedTuple):
     """A row of a PoseTable."""
 
     stream: str
-    number: int
     stamp_ns: int
     world_frame: str
     sensor_frame: str | None
@@ -47,7 +46,7 @@ class Pose(NamedTuple):
 def poses_of(bag, parent="/a", child="/b"):
     """The poses of an open bag one by one."""
     columns = [column.tolist() for column in vars(bag.poses(parent, child)).values()]
-    return [Pose(*row[:5], tuple(row[5]), row[6]) for row in zip(*columns, strict=True)]
+    return [Pose(*row[:4], tuple(row[4]), row[5]) for row in zip(*columns, strict=True)]
 
 
 def all_poses(path, parent="/a", child="/b"):

@@ -230,7 +230,7 @@ def _read_bags(
 
 def _feed(calibrator: "Calibrator", poses: "PoseTable", topics: Mapping[str, Any]) -> None:
     """Give every pose to the engine. The first message that cannot be used is an InputError with
-    topic, message number and stamp.
+    topic and stamp.
     """
     # A message without a frame name changes nothing.
     frames: set[tuple[str, str | None]] = {(stream, None) for stream in topics}
@@ -246,8 +246,7 @@ def _feed(calibrator: "Calibrator", poses: "PoseTable", topics: Mapping[str, Any
     except InputError as error:
         seconds, nanoseconds = divmod(int(poses.stamps_ns[row]), 1_000_000_000)
         raise InputError(
-            f"{topics[poses.streams[row]]}, message {poses.message_numbers[row]}, stamp "
-            f"{seconds}.{nanoseconds:09d}: {error}"
+            f"{topics[poses.streams[row]]}, stamp {seconds}.{nanoseconds:09d}: {error}"
         ) from error
 
 

@@ -247,7 +247,7 @@ def test_paths_that_are_no_bag(tmp_path):
 @pytest.mark.parametrize("data", [b"", b"\x00\x07\x00\x00" + b"\x00" * 100])
 def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data):
     with_message(tmp_path / "bag", "sqlite3", data)
-    message = "/a, message 61: not a readable nav_msgs/msg/Odometry .*expected plain CDR"
+    message = "/a: a message is not a readable nav_msgs/msg/Odometry .*expected plain CDR"
     with pytest.raises(InputError, match=message):
         all_poses(tmp_path / "bag")
 

@@ -68,7 +68,6 @@ def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_b
     ):
         found = [pose for pose in poses if pose.stream == stream]
         assert [pose.stamp_ns for pose in found] == source.stamps_ns.tolist()
-        assert [pose.number for pose in found] == list(range(1, len(source) + 1))
         assert {(pose.world_frame, pose.sensor_frame) for pose in found} == {frames}
         values = [pose.pose for pose in found]
         quats_xyzw = se3.to_quat_xyzw(source.poses)
@@ -241,7 +240,7 @@ def test_both_sensors_from_transforms(tmp_path):
         poses = poses_of(bag, *sources)
         assert bag.warnings == []
     assert [pose.bag_ns for pose in poses] == sorted(pose.bag_ns for pose in poses)
-    assert {pose[0:1] + pose[3:5] for pose in poses} == {
+    assert {pose[0:1] + pose[2:4] for pose in poses} == {
         ("parent", "map", "lidar"),
         ("child", "odom", "camera"),
     }
@@ -318,7 +317,6 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
         assert [*bag.topics.values()] == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
         assert (bag.start_ns, bag.end_ns) == (PARENT.stamps_ns[0], PARENT.stamps_ns[-1])
     assert [pose.stamp_ns for pose in poses if pose.stream == "parent"] == PARENT.stamps_ns.tolist()
-    assert [pose.number for pose in poses if pose.stream == "child"] == list(range(1, 121))
 
 
 def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):

@@ -118,10 +118,10 @@ def recovered_messages(path: Path, lose: Callable[[str], None]) -> Iterator[Mess
         except MemoryError:
             raise
         except Exception as error:
-            size = file.seek(0, 2)
+            share = position / max(file.seek(0, 2), 1)
             lose(
-                f"it is cut off or damaged after {position / max(size, 1):.0%} of its {size} bytes "
-                f"({reason_of(error)}), what came later is lost"
+                f"it is cut off or damaged after {share:.0%} of its bytes ({reason_of(error)}), "
+                "what came later is lost"
             )
 
 

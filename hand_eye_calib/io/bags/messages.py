@@ -7,11 +7,8 @@ of a whole message and needs no type definitions. A new type is a row in :data:`
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -38,14 +35,6 @@ _NS_PER_S = STAMP_UNITS["s"]
 _POSE_SIZE = struct.calcsize("=7d")
 # Of what is no pose, the part that is not measured: at the origin, level.
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-class MalformedMessage(ValueError):
-    """One of many messages cannot be unpacked: its index, and why."""
-
-    def __init__(self, index: int, reason: Exception) -> None:
-        super().__init__(str(reason))
-        self.index = index
 
 
 # ---- bytes
@@ -204,56 +193,30 @@ def unpack_stamp_ns(data: Buffer) -> int:
     return Cursor(data, is_ros1=False).stamp_ns()
 
 
-def each_unpacked(
-    messages: Sequence[Buffer], unpack: Callable[[Any], T], errors: Errors = MALFORMED
-) -> list[T]:
-    """What is unpacked of each message; a MalformedMessage at the first that raises one of the
-    errors.
-    """
-    found = []
-    for index, data in enumerate(messages):
-        try:
-            found.append(unpack(data))
-        except InputError:
-            raise
-        except errors as error:
-            raise MalformedMessage(index, error) from error
-    return found
-
-
-@dataclass
-class Run:
-    """Messages of one kind that follow each other, their bag times (N,), and how many of their
-    topic were before.
-    """
+class Run(NamedTuple):
+    """Messages of one kind that follow each other, and their bag times (N,)."""
 
     kind: MessageKind
     messages: list[bytes]
     bag_ns: IntArray
-    n_before: int
 
-    def __len__(self) -> int:
-        return len(self.messages)
-
-    def unpacked(self, unpack: Callable[..., T], errors: Errors = MALFORMED) -> list[T]:
-        """What is unpacked of each message and whether it is of ROS 1; an InputError names the
-        first that raises one of the errors.
+    def read(self, unpack: Callable[..., T], errors: Errors = MALFORMED) -> T:
+        """What is unpacked of the messages and whether they are of ROS 1; an InputError if that
+        raises one of the errors.
         """
-        with self.named():
-            of_kind = partial(unpack, is_ros1=self.kind.is_ros1)
-            return each_unpacked(self.messages, of_kind, errors)
-
-    @contextmanager
-    def named(self) -> Iterator[None]:
-        """Give the message of a MalformedMessage its name."""
         try:
-            yield
-        except MalformedMessage as error:
-            number = self.n_before + error.index + 1
+            return unpack(self.messages, self.kind.is_ros1)
+        except InputError:
+            raise
+        except errors as error:
             raise InputError(
-                f"{self.kind.topic}, message {number}: not a readable {self.kind.type} ({error}); "
-                "the bag is damaged, record it again"
+                f"{self.kind.topic}: a message is not a readable {self.kind.type} ({error}); the "
+                "bag is damaged, record it again"
             ) from error
+
+    def each(self, unpack: Callable[..., T], errors: Errors = MALFORMED) -> list[T]:
+        """The same of each message."""
+        return self.read(lambda data, is_ros1: [unpack(each, is_ros1) for each in data], errors)
 
 
 _Unpacked = tuple[int, str, str | None, Sequence[float], int]
@@ -269,19 +232,19 @@ def _unpack(row: MessageType, is_ros1: bool, data: Buffer) -> _Unpacked:
 
 def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -> PoseColumns:
     """Unpack one or more messages of one of MESSAGE_TYPES, poses together if they differ only in
-    stamps and values. Raises as :func:`each_unpacked`.
+    stamps and values; raises MALFORMED.
     """
     row, size = MESSAGE_TYPES[message_type], len(messages[0])
-    unpack = partial(_unpack, row, is_ros1)
     if row.unpack is _pose and len(messages) > 1 and {*map(len, messages)} == {size}:
-        ((_, world, sensor, _, end),) = each_unpacked(messages[:1], unpack)
+        _, world, sensor, _, end = _unpack(row, is_ros1, messages[0])
         bytes_of = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
         # The sequence number of ROS 1 may differ, the encoding of CDR may not.
         is_alike = is_ros1 or bool((bytes_of[:, :2] == bytes_of[0, :2]).all())
         found = _unpack_together(bytes_of[:, _START:end], is_ros1)
         if found is not None and is_alike:
             return PoseColumns.of_frames(*found, world, sensor)
-    stamps_ns, worlds, sensors, values, _ = zip(*each_unpacked(messages, unpack), strict=True)
+    rows = (_unpack(row, is_ros1, data) for data in messages)
+    stamps_ns, worlds, sensors, values, _ = zip(*rows, strict=True)
     return PoseColumns(np.array(stamps_ns, dtype=np.int64), [*worlds], [*sensors], np.array(values))
 
 

@@ -46,8 +46,6 @@ class PoseTable:
     ----------
     streams : (N,) array of str
         "parent" or "child".
-    message_numbers : (N,) int array
-        Of the message within its topic, from 1; of a path or a transform, of the pose.
     stamps_ns, bag_ns : (N,) int64 arrays
         Of the header, and when the message was recorded.
     world_frames, sensor_frames : (N,) arrays of str or None
@@ -57,7 +55,6 @@ class PoseTable:
     """
 
     streams: NDArray[np.object_]
-    message_numbers: IntArray
     stamps_ns: IntArray
     world_frames: NDArray[np.object_]
     sensor_frames: NDArray[np.object_]
@@ -72,16 +69,13 @@ class PoseTable:
         return type(self)(*(column[index] for column in vars(self).values()))
 
     @classmethod
-    def of_columns(
-        cls, stream: str, columns: PoseColumns, bag_ns: Any, first_number: int = 1
-    ) -> "PoseTable":
+    def of_columns(cls, stream: str, columns: PoseColumns, bag_ns: Any) -> "PoseTable":
         """Of one stream."""
         stamps_ns, *frames, poses = columns
-        numbers = first_number + np.arange(len(stamps_ns))
         streams = np.full(len(stamps_ns), stream, dtype=object)
         world, sensor = (np.array(each, dtype=object) for each in frames)
         bag_ns = np.array(bag_ns, dtype=np.int64)
-        return cls(streams, numbers, stamps_ns, world, sensor, poses, bag_ns)
+        return cls(streams, stamps_ns, world, sensor, poses, bag_ns)
 
     @classmethod
     def joined(cls, tables: Iterable["PoseTable"]) -> "PoseTable":

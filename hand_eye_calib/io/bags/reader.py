@@ -122,9 +122,7 @@ class PoseBag:
     # ---- topics
 
     def _listing(self) -> str:
-        if not self.topics:
-            return f"There are no topics in {self}"
-        return f"The bag has {', '.join(map(str, self.topics.values()))}"
+        return f"The bag has {', '.join(map(str, self.topics.values())) or 'no topics'}"
 
     def _type_of(self, source: Source) -> str:
         """Message type of a topic; empty for frames, and for what is not there."""
@@ -138,7 +136,7 @@ class PoseBag:
         transforms. An InputError if they cannot be read.
         """
         runs = self._runs([topic] if self.topics[topic].type in TF_TYPES else [])
-        first = next((run.unpacked(unpack_transforms) for run in runs), [])
+        first = next((run.each(unpack_transforms) for run in runs), [])
         return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in chain(*first)})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
@@ -201,8 +199,7 @@ class PoseBag:
             raise InputError(
                 "name the topics of poses with --parent-topic and --child-topic, or frames with "
                 f"--parent-tf and --child-tf. {self._listing()}"
-                + f". Transforms are {', '.join(found[:_MOST_FRAMES])}"
-                * bool(found)
+                + (f". Transforms are {', '.join(found[:_MOST_FRAMES])}" if found else "")
             )
         chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
         return parent or chosen.pop(0), child or chosen.pop(0)
@@ -239,14 +236,12 @@ class PoseBag:
             self._reading(stream, source, measures.get(stream, "auto"), max_gap_s)
             for stream, source in sources.items()
         ]
-        takers = defaultdict[str, list[Reading]](list)
-        for reading in readings:
-            for topic in reading.topics:
-                takers[topic].append(reading)
-        count = sum(self.topics[topic].count for topic in takers)
-        for run in self.shown(self._runs(takers), count, f"reading {self}", len):
-            for reading in takers[run.kind.topic]:
-                reading.take(run)
+        topics = {topic for reading in readings for topic in reading.topics}
+        count, runs = sum(self.topics[topic].count for topic in topics), self._runs(topics)
+        for run in self.shown(runs, count, f"reading {self}", lambda run: len(run.messages)):
+            for reading in readings:
+                if run.kind.topic in reading.topics:
+                    reading.take(run)
         tables = [reading.table() for reading in readings]
         self._notes += [note for reading in readings for note in reading.notes]
         return PoseTable.joined(tables)
@@ -279,16 +274,14 @@ class PoseBag:
         poses = self.poses(source, measures={"parent": measures})
         if not len(poses):
             raise InputError(f"no poses on {source} of {self}")
-        trajectory, notes = poses.trajectory(), []
-        if len(trajectory) < len(poses):
-            notes.append(
-                f"{source}: {len(poses) - len(trajectory)} of {len(poses)} poses had a stamp that "
-                "was there already and were dropped"
-            )
-        if (np.diff(poses.stamps_ns) < 0).any():
-            notes.append(f"{source}: stamps were not in the order of the bag and were sorted")
         kind: Any = self.measured(source, measures)
-        return replace(trajectory, measures=kind) if kind != "poses" else trajectory, notes
+        trajectory, notes = replace(poses.trajectory(), measures=kind), []
+        if (np.diff(poses.stamps_ns) <= 0).any():
+            notes.append(
+                f"{source}: poses were put in the order of their stamps; "
+                f"{len(poses) - len(trajectory)} of {len(poses)} repeated one and were dropped"
+            )
+        return trajectory, notes
 
     @cached_property
     def static_frames(self) -> FrameTree:
@@ -298,7 +291,7 @@ class PoseBag:
         tree, notes = FrameTree("the bag's transforms"), {}
         for run in self._runs(self._of_transforms()):
             is_fixed = is_static(run.kind.topic)
-            for _, parent, frame, *values in chain(*run.unpacked(unpack_transforms)):
+            for _, parent, frame, *values in chain(*run.each(unpack_transforms)):
                 try:
                     pose = checked_pose(*values) if is_fixed else None
                 except InputError as error:
@@ -312,13 +305,11 @@ class PoseBag:
 
     def _runs(self, topics: Collection[str]) -> Iterator[Run]:
         """Messages of some topics in the order of bag time, many of a kind at once."""
-        done = Counter[str]()
         for block in self._blocks(topics):
             for kind in {id(each): each for each, _, _ in block}.values():
                 messages = [data for each, _, data in block if each is kind]
-                bag_ns = np.array([bag_ns for each, bag_ns, _ in block if each is kind])
-                yield Run(kind, messages, bag_ns, done[kind.topic])
-                done[kind.topic] += len(messages)
+                bag_ns = [bag_ns for each, bag_ns, _ in block if each is kind]
+                yield Run(kind, messages, np.array(bag_ns))
 
     def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Messages of some topics in the order of bag time, many at once."""

@@ -3,7 +3,6 @@ of a lidar, fields of any message, or transforms.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +54,8 @@ class TopicReading(Reading):
         self._tables = [PoseTable.of_columns(stream, PoseColumns.nothing(), [])]
 
     def take(self, run: Run) -> None:
-        with run.named():
-            columns, keep = self._reader.columns(run.messages, run.kind.is_ros1)
-        table = PoseTable.of_columns(self.stream, columns, run.bag_ns, run.n_before + 1)
-        self._tables.append(table[keep])
+        columns, keep = run.read(self._reader.columns)
+        self._tables.append(PoseTable.of_columns(self.stream, columns, run.bag_ns)[keep])
 
     def table(self) -> PoseTable:
         table = PoseTable.joined(self._tables)
@@ -112,7 +109,7 @@ class PathReading(Reading):
         self._newest: PoseColumns | None = None
 
     def take(self, run: Run) -> None:
-        self._newest = replace(run, messages=run.messages[-1:]).unpacked(unpack_path)[0]
+        (self._newest,) = run._replace(messages=run.messages[-1:]).each(unpack_path)
 
     def table(self) -> PoseTable:
         path = self._newest or PoseColumns.nothing()
@@ -132,7 +129,7 @@ class ScanReading(Reading):
         super().__init__(stream, *([] if self._lidar.kept else [topic]))
 
     def take(self, run: Run) -> None:
-        for scan, bag_ns in zip(run.unpacked(unpack_scan), run.bag_ns.tolist(), strict=True):
+        for scan, bag_ns in zip(run.each(unpack_scan), run.bag_ns.tolist(), strict=True):
             self._lidar.add(scan, bag_ns)
 
     def table(self) -> PoseTable:
@@ -154,7 +151,7 @@ class FieldReading(Reading):
 
     def take(self, run: Run) -> None:
         # The library's errors are of many kinds.
-        self._rows += run.unpacked(self._reader.cells_of(run.kind), Exception)
+        self._rows += run.each(self._reader.cells_of(run.kind), Exception)
         self._bag_ns += run.bag_ns.tolist()
 
     def table(self) -> PoseTable:
@@ -173,7 +170,7 @@ class TransformReading(Reading):
         self._found: list[tuple[Any, ...]] = []
 
     def take(self, run: Run) -> None:
-        lists = run.unpacked(unpack_transforms)
+        lists = run.each(unpack_transforms)
         for transforms, bag_ns in zip(lists, run.bag_ns.tolist(), strict=True):
             for transform in transforms:
                 poses = self._source.edges_at(transform, False)

@@ -171,8 +171,7 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
     """Messages in blocks that are neither long nor large; those compressed one by one unpacked. A
     ValueError at the first that is not bytes with a time.
     """
-    rows: list[Message] = []
-    size = 0
+    rows, size = list[Message](), 0
     for kind, bag_ns, data in messages:
         if type(data) is not bytes or type(bag_ns) is not int or not 0 <= bag_ns < 1 << 63:
             raise ValueError(f"a message on {kind.topic} is not bytes with a time")
@@ -234,14 +233,11 @@ def _unpack(file: Path, target: Path) -> str:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """The files of a bag that hold messages; those that are there unpacked, too, once. Refuses
-    mistakes that are easily made and easily explained.
-    """
-    if not path.exists():
-        raise InputError(f"no bag at {path}; expected {_EXPECTED}")
+    """The files of a bag that hold messages; those that are there unpacked, too, once."""
     if not path.is_dir():
         if not (_suffix(path) and path.is_file()):
-            raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
+            what = f"{path} is not a bag" if path.exists() else f"no bag at {path}"
+            raise InputError(f"{what}; expected {_EXPECTED}")
         return [path]
     found = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
     found -= {file for file in found if file.suffix == ".zstd" and file.with_suffix("") in found}
