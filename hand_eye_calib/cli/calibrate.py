@@ -41,7 +41,7 @@ examples:
   hand_eye_calib replay live/journal --out result"""
 
 # Files of an arm's samples.
-_SAMPLES = (".json", ".yaml", ".yml", ".samples")
+_SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 # Of the table of topics.
 _ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--list", action="store_true", help=listing)
     order = (
         "none: the poses of two files are stops without an order, paired by their rows. So are the "
-        "samples of an arm (MoveIt, easy_handeye2, OpenCV), given as the only PATH"
+        "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
     )
     add("--order", choices=("time", "none"), default="time", help=order)
     add_config_arguments(parser)

@@ -1,10 +1,12 @@
 """Samples of a robot arm: at each stop the pose of the hand, and that of a target before a camera.
 
 Read are the samples of MoveIt's calibration (YAML of ``effector_wrt_world``,
-``object_wrt_sensor``, or JSON of pairs of matrices), of easy_handeye and easy_handeye2, and
-pairs ``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV.
+``object_wrt_sensor``, or JSON of pairs of matrices), of easy_handeye and easy_handeye2, pairs
+``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV, and the stacks ``robot`` and ``tracking`` of an
+``.npz``.
 """
 
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +65,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     >>> hec.read_arm_samples("samples.yaml").robot.shape
     (40, 4, 4)
     """
-    document: Any = read_yaml(path, _EXPECTED)
+    document: Any = _stacks(path) if Path(path).suffix == ".npz" else read_yaml(path, _EXPECTED)
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
@@ -85,6 +87,16 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
             raise InputError(f"{path}, sample {number}: {error}") from None
     robot, tracking = np.swapaxes(poses, 0, 1)
     return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
+
+
+def _stacks(path: str | Path) -> list[dict[str, Any]]:
+    """The samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
+    try:
+        with np.load(path, allow_pickle=False) as stacks:
+            names, poses = list(stacks), [stacks[name] for name in stacks]
+        return [dict(zip(names, sample, strict=True)) for sample in zip(*poses, strict=True)]
+    except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
 
 
 def _pair(sample: Any) -> Sequence[Any]:

@@ -89,3 +89,18 @@ def test_what_is_wrong_is_said_in_one_line(text, said, tmp_path):
         read_arm_samples(path)
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("as_rows", [False, True])
+def test_two_stacks_in_an_npz(as_rows, poses, tmp_path):
+    stacks = [np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)] for Ts in poses] if as_rows else poses
+    file = tmp_path / "arm.npz"
+    np.savez(file, robot=stacks[0], tracking=stacks[1])
+    read = read_arm_samples(file)
+    np.testing.assert_allclose([read.robot, read.tracking], poses, atol=1e-12)
+    np.savez(file, first=np.eye(4))
+    with pytest.raises(InputError, match="found first"):
+        read_arm_samples(file)
+    file.write_bytes(b"PK and no more")
+    with pytest.raises(InputError, match=r"cannot read .*arm\.npz"):
+        read_arm_samples(file)
