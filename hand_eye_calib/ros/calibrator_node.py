@@ -30,7 +30,7 @@ from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.ros.inputs import TfInput, TopicInput, qos_parameter_names
+from hand_eye_calib.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.tf import TF, Robot, RobotTree, TfBroadcaster, message_type
@@ -60,9 +60,7 @@ class CalibratorNode(Node):
             ) from None
         self._log = NodeLog(self.get_logger())
         self._output_base: Path | None = None
-        self._options = Parameters(
-            self, set(qos_parameter_names(self)), self._follow_parameters, self._check_options
-        )
+        self._options = Parameters(self, self._follow_parameters, self._check_options)
         for line in self._options.unknown:
             self._log.warning(line)
         options, config = self._options.node, self._options.calibrator
@@ -96,12 +94,8 @@ class CalibratorNode(Node):
         self._say_start()
 
     def stop(self, timeout_s: float) -> bool:
-        """End the solving process and save the newest result.
-
-        Returns
-        -------
-        bool
-            False if a result that was to be saved could not be.
+        """End the solving process and save the newest result; False if that was wanted and could
+        not be done.
         """
         self._cycle.stop(timeout_s)
         saved = True

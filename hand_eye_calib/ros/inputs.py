@@ -11,7 +11,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from hand_eye_calib.config import POSE_TYPES, CalibratorConfig, other_names
+from hand_eye_calib.config import POSE_TYPES, CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, unpack_stamp_ns
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
@@ -194,11 +194,3 @@ def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, d
             if taken is None:
                 return
             yield taken
-
-
-def qos_parameter_names(node: Node) -> Iterator[str]:
-    """The parameters that rclpy declares for the QoS of the inputs."""
-    for name in ("parent", "child", *other_names()):
-        topic = node.resolve_topic_name(f"{name}_odom")
-        for policy in _QOS_OVERRIDES:
-            yield f"qos_overrides.{topic}.subscription.{policy.name.lower()}"

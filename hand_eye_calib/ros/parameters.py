@@ -1,7 +1,7 @@
 """The node's parameters, made from the option dataclasses."""
 
 import dataclasses
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -43,8 +43,6 @@ class Parameters:
     Parameters
     ----------
     node : rclpy.node.Node
-    qos_names : collection of str
-        Of the QoS override parameters that the node's subscriptions will declare.
     on_change : callable
         Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
         new options by then.
@@ -58,7 +56,7 @@ class Parameters:
     calibrator : CalibratorConfig
     node : NodeConfig
     unknown : list of str
-        One line for every given name that does not exist.
+        One line for every given name that does not exist, unless it is of a QoS.
 
     Raises
     ------
@@ -69,7 +67,6 @@ class Parameters:
     def __init__(
         self,
         node: Node,
-        qos_names: Collection[str],
         on_change: Callable[[], None],
         check: Callable[[NodeConfig], None],
     ) -> None:
@@ -82,7 +79,7 @@ class Parameters:
         self.unknown = [
             f"parameter {name} does not exist and is ignored{did_you_mean(name, FIELDS)}"
             for name in overrides
-            if name not in FIELDS and name not in qos_names
+            if name not in FIELDS and not name.startswith("qos_overrides.")
         ]
         if overrides.get("journal") is False:
             overrides["journal"] = "off"  # of which YAML makes a false, without quotes
