@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.text import AXIS_UNITS, parse_prior
+from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.text import AXIS_UNITS
 from hand_eye_calib.watch.board import Board
 from hand_eye_calib.watch.html import fragment
 
@@ -34,7 +34,7 @@ _LOOK_S, _SEND_S = 0.25, 1.0
 # A browser that takes nothing for so long is gone (s).
 _PATIENCE_S = 10.0
 
-_PAGE = {"/": "page.html", "/page.css": "page.css", "/page.js": "page.js"}
+_PAGE = ("page.html", "page.css", "page.js")
 _KINDS = {"css": "text/css", "js": "text/javascript", "html": "text/html", "yaml": "text/plain"}
 # Files of a saved result that the page links to.
 SAVED = ("report.html", "extrinsic.yaml")
@@ -126,17 +126,17 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE_S
 
     def do_GET(self) -> None:
-        path = self._path()
-        if path in _PAGE and (path != "/" or self._has_key()):  # the others have no secrets
-            content = files("hand_eye_calib.watch").joinpath("page", _PAGE[path]).read_bytes()
-            self._send(HTTPStatus.OK, content, _PAGE[path])
+        name = self._path() or "page.html"
+        if name in _PAGE and (name != "page.html" or self._has_key()):  # the others have no secrets
+            content = files("hand_eye_calib.watch").joinpath("page", name).read_bytes()
+            self._send(HTTPStatus.OK, content, name)
         elif not self._has_key():
             text = "Open the whole address that the terminal with `hand_eye_calib watch` shows."
             self._send(HTTPStatus.FORBIDDEN, text)
-        elif path == "/events":
+        elif name == "events":
             self._send_events()
-        elif path[1:] in SAVED and (saved := self._saved(path[1:])):
-            self._send(HTTPStatus.OK, saved, path, _POLICY_OF_SAVED)
+        elif name in SAVED and (saved := self._saved(name)):
+            self._send(HTTPStatus.OK, saved, name, _POLICY_OF_SAVED)
         else:
             self._send(HTTPStatus.NOT_FOUND, "there is no such page")
 
@@ -148,17 +148,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         self.close_connection = True  # a body, if there is one, is not read
-        request = self._path()[1:]
+        request, axis = self._path(), self._given("axis")
         status, text = HTTPStatus.OK, ""
         if not self._has_key():
             status, text = HTTPStatus.FORBIDDEN, "the key is missing"
         elif request in BUTTONS:
             self.server.ask(request)
-        elif request == "prior":
-            try:
-                self.server.ask(_prior(*map(self._given, ("axis", "value", "sigma"))))
-            except ConfigError as error:
-                status, text = HTTPStatus.BAD_REQUEST, str(error)
+        elif request == "prior" and axis in AXIS_UNITS:  # the node refuses what is no number
+            unit = "m" if AXIS_UNITS[axis] == "m" else "deg"
+            given = [self._given(each).strip() for each in ("value", "sigma")]
+            value, sigma = (each.replace(",", ".") for each in given)
+            self.server.ask(printable(f"prior.{axis}:={value}{unit}+/-{sigma}{unit}"))
         else:
             status, text = HTTPStatus.NOT_FOUND, "there is no such request"
         self._send(status, text)
@@ -167,7 +167,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Keep the terminal to the view."""
 
     def _path(self) -> str:
-        return urlsplit(self.path).path
+        return urlsplit(self.path).path[1:]
 
     def _given(self, name: str) -> str:
         return parse_qs(urlsplit(self.path).query).get(name, [""])[-1]
@@ -210,20 +210,3 @@ class _Handler(BaseHTTPRequestHandler):
             if made != sent or now_s - sent_s >= _SEND_S:
                 yield f"data: {made if made != sent else ''}\n\n".encode()
                 sent, sent_s = made, now_s
-
-
-def _prior(axis: str, value: str, sigma: str) -> str:
-    """The parameter for an axis that was measured by hand, in m or degrees.
-
-    Raises
-    ------
-    ConfigError
-        If these are no numbers.
-    """
-    if axis not in AXIS_UNITS:
-        raise ConfigError(f"an axis is one of {', '.join(AXIS_UNITS)}")
-    unit = "m" if AXIS_UNITS[axis] == "m" else "deg"
-    value, sigma = (each.strip().replace(",", ".") for each in (value, sigma))
-    text = f"{value}{unit}+/-{sigma}{unit}"
-    parse_prior(f"prior.{axis}", text)
-    return f"prior.{axis}:={text}"
