@@ -7,14 +7,13 @@ import json
 import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
-from published_data import data_folder
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import read_trajectory_file, write_trajectory
+from hand_eye_calib.io.trajectory_files import write_trajectory
 
 POSE = "1 2 3 0 0 0 1"
 START_NS = 1_700_000_000_123_456_789
@@ -274,19 +273,3 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
     assert json.loads(capsys.readouterr().out)["T_parent_child"] == document["T_parent_child"]
     assert main([*command, "--format", "tum"]) == 2
     assert "columns are named for format csv only; the format is tum" in capsys.readouterr().err
-
-
-def test_published_files_of_other_programs():
-    folder = data_folder()
-    counts = {}
-    for pattern, columns in (("asl_*/*.csv", XYZW), ("zxl19/bag*/[ILV]*_FCPE.mat", WXYZ)):
-        for path in sorted(folder.glob(pattern)):
-            trajectory, notes, _ = read_trajectory_file(path, "csv", columns=columns, repair=True)
-            counts[path.name] = len(trajectory)
-            assert 30 < trajectory.duration_s < 100, path
-            assert all("were sorted" in note or "dropped" in note for note in notes)
-    assert len(counts) >= 10
-    export = folder / "zxl19" / "raw_bag1" / "bag1-aft_mapped_to_init.csv"
-    trajectory = read_trajectory_file(export, "csv").trajectory
-    # The stamp of the header, not of the arrival.
-    assert (len(trajectory), trajectory.stamps_ns[0]) == (572, 1636512749922900677)

@@ -19,7 +19,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.files import read_text
+from hand_eye_calib.io.files import open_regular, read_text
 from hand_eye_calib.io.limits import LARGEST_TEXT
 from hand_eye_calib.io.trajectory_files.columns import MATRIX, POSITION, QUATERNION
 
@@ -61,13 +61,8 @@ def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
         If it cannot be read.
     """
     path = Path(path)
-    try:
-        if not path.is_file():  # a pipe would wait for ever
-            return None
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except (OSError, ValueError):
-        return None  # the reader of tables says why
+    with open_regular(path) as file:
+        head = file.read(_HEAD_BYTES)
     for start, sentence in _NOT_READ.items():
         if head.startswith(start):
             raise InputError(f"{path}: {sentence}")
@@ -91,16 +86,16 @@ def rows_of(path: str | Path, choice: str | None = None) -> Rows | None:
 
 
 def _of_nmea(text: str, _: str | None) -> Rows:
-    """GGA sentences; the day is that of the RMC sentence before."""
+    """GGA sentences; the day is that of the last RMC sentence."""
     rows: list[Sequence[float]] = []
     day = None
     for line in text.splitlines():
         cells = line.partition("*")[0].strip().split(",")
         if cells[0][-3:] == "RMC" and len(cells) > 9 and cells[9]:
             day = datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-        elif cells[0][-3:] == "GGA" and len(cells) > 11 and cells[6] not in ("", "0") and cells[9]:
-            if day is None:
-                raise ValueError("NMEA without a date: record RMC sentences, too")
+        elif day is None or cells[0][-3:] != "GGA" or len(cells) < 12:
+            continue
+        elif cells[6] not in ("", "0") and cells[9]:
             clock, lat, north, lon, east = cells[1:6]
             now = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
             degrees = (
@@ -109,7 +104,7 @@ def _of_nmea(text: str, _: str | None) -> Rows:
             )
             rows.append([day + now, *degrees, float(cells[9]) + float(cells[11] or 0)])
     if not rows:
-        raise ValueError("NMEA without positions: expected GGA sentences with a fix")
+        raise ValueError("NMEA: expected GGA sentences with a fix, and the date in RMC sentences")
     return Rows(_PLACE, rows)
 
 

@@ -345,7 +345,8 @@ def read_table(path: _Path, options: FileOptions) -> Table:
             f"{len(head.cells)} with `columns`, such as t,x,y,z,qx,qy,qz,qw or t,wx,wy,wz"
         )
     _, expected, cells_of = _FORMATS.get(format, ((), "", _cells_of))
-    lines = lines_of(path, after=after if format == "csv" else 0)
+    # A file without data is not gone through again.
+    lines = lines_of(path, after=after if format == "csv" else 0) if head.cells else iter(())
     measures = options.measures if format == "csv" else AUTO
     table = table_of(path, header or _UNNAMED, lines, cells_of, measures, expected)
     if format == "kitti" and times is not None:
