@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.alignment.scale import settle_scale
+from hand_eye_calib.alignment.similarity import settle_scale
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot

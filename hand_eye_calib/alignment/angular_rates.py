@@ -70,13 +70,15 @@ class Correlation:
         """Whether the evidence suffices to trust the offset."""
         return not self.doubt()
 
-    def doubt(self) -> str:
-        """What is wrong with the evidence, in words; empty if nothing is."""
+    def doubt(self, quantity: str = "angular rates") -> str:
+        """What is wrong with the evidence, in words; empty if nothing is. ``quantity`` is what was
+        correlated.
+        """
         if self.variation < MIN_VARIATION:
             return "the streams hardly rotate, or rotate at a constant rate"
         if self.correlation < _CORRELATED:
             return (
-                f"their angular rates are correlated by {self.correlation:.2f} at best "
+                f"their {quantity} are correlated by {self.correlation:.2f} at best "
                 f"({_CORRELATED} is needed)"
             )
         if self.distinctness < _DISTINCT:
@@ -93,21 +95,11 @@ def correlate_rates(
     max_gap_s: float = CalibratorConfig.max_gap,
     of_speed: bool = False,
 ) -> Correlation:
-    """Find the clock offset at which the angular rates of two streams agree best.
+    """Find the clock offset at which the angular rates of two streams agree best, or their speeds,
+    for sensors without an orientation; there is no evidence if a stream is too short.
 
-    Parameters
-    ----------
-    parent, child : Trajectory
-        Their time ranges need not overlap.
-    max_gap_s : float
-        Windows that touch a longer gap between poses are left out, in seconds.
-    of_speed : bool
-        Compare speeds instead, for sensors without an orientation.
-
-    Returns
-    -------
-    Correlation
-        Without any evidence if a stream is too short; see :attr:`Correlation.is_clear`.
+    Windows that touch a gap between poses longer than ``max_gap_s`` are left out. The time ranges
+    of both need not overlap.
     """
     if min(len(parent), len(child)) < 4:
         return Correlation()

@@ -21,8 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
+from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
@@ -40,7 +42,7 @@ EXPLAINED = 0.03
 
 # Largest share of the translations that may stay unexplained for the scale and the offset of a fit
 # to mean something.
-MAX_UNEXPLAINED_TRANSLATION = 0.3
+_MAX_UNEXPLAINED_TRANSLATION = 0.3
 
 # Smallest standard deviations: of rotations (rad), and of translations as a share of the motion.
 # Smaller ones are rounding.
@@ -48,6 +50,14 @@ _MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
 
 # Damping of directions that the motion does not determine, in balanced units.
 _DAMPING = 1e-10
+
+# Motions over these times (s) are compared for the scale; that with the smallest relative standard
+# deviation wins. Long motions show the scale best.
+_SCALE_LAGS_S, _MIN_PAIRS = (3.0, 1.0, 8.0), 20
+
+# A scale differs from 1 if it is off by more than this and by so many standard deviations, and if
+# the fit leaves less than this of the motion unexplained: many jumps could imitate a scale.
+_MIN_DIFFERENCE, _MIN_SIGMAS, _MAX_UNEXPLAINED_TO_DIFFER = 0.01, 5.0, 0.1
 
 _SCALE, _OFFSET, _UNKNOWNS = 6, 7, 8
 
@@ -106,7 +116,7 @@ class SimilarityFit:
     @property
     def explains_translation(self) -> bool:
         """Whether the fit explains enough of the translations to trust its scale and offset."""
-        return self.unexplained_translation < MAX_UNEXPLAINED_TRANSLATION
+        return self.unexplained_translation < _MAX_UNEXPLAINED_TRANSLATION
 
     @property
     def scale_sigma(self) -> float:
@@ -153,6 +163,77 @@ def fit_similarity(
             break
     # The volume that the residuals spread over, in the smaller unit of length.
     return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
+
+
+def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) -> SimilarityFit:
+    """Estimate the factor from the child's unit of length to the parent's.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    start : SimilarityFit, optional
+        Fit of the same streams to start at; a start is searched for without one.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there are too few poses.
+    """
+    fits: list[SimilarityFit] = []
+    for lag_s in _SCALE_LAGS_S:
+        pairs = pairs_over(pose_pairs, lag_s)
+        if len(pairs) >= _MIN_PAIRS:
+            fits.append(fit_similarity(pairs, start=fits[-1] if fits else start))
+    if not fits:
+        raise NotEnoughDataError(
+            f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "
+            f"{_MIN_PAIRS} of them are {min(_SCALE_LAGS_S):g} s apart; record longer, or give scale"
+        )
+    # By the relative standard deviation, plus the unexplained share if the fit does not hold.
+    return min(
+        fits,
+        key=lambda fit: (
+            fit.scale_sigma / fit.scale
+            + (0.0 if fit.explains_translation else fit.unexplained_translation)
+        ),
+    )
+
+
+def scale_differs(fit: SimilarityFit) -> bool:
+    """Whether the lengths of two streams differ significantly, and by enough to matter."""
+    significant = abs(fit.scale - 1.0) > max(_MIN_DIFFERENCE, _MIN_SIGMAS * fit.scale_sigma)
+    return significant and fit.unexplained_translation < _MAX_UNEXPLAINED_TO_DIFFER
+
+
+def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, SimilarityFit | None]:
+    """The scale to use, given or estimated as the option ``scale`` asks for, and the fit that it
+    comes from if it was estimated.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If it is to be estimated and cannot be.
+    """
+    if not isinstance(option, str):
+        return option, None
+    if option == "none":
+        return 1.0, None
+    try:
+        fit = estimate_scale(pose_pairs)
+    except NotEnoughDataError:
+        if option == "estimate":
+            raise
+        return 1.0, None
+    if option == "auto" and not scale_differs(fit):
+        return 1.0, None
+    if not fit.explains_translation:
+        raise NotEnoughDataError(
+            "the scale cannot be estimated: even with a scale, "
+            f"{fit.unexplained_translation:.0%} of the motion stays unexplained "
+            f"(at most {_MAX_UNEXPLAINED_TRANSLATION:.0%} is allowed); "
+            "check the streams, or give scale"
+        )
+    return fit.scale, fit
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
@@ -238,10 +319,13 @@ class _Problem:
         moved_j = np.einsum("kij,kj->ki", rotation_b, twists_j[:, :3])
         self.translation_by_offset = moved_i - moved_j
 
-    def linearised(self, T: FloatArray, scale: float, offset_s: float) -> list[FloatArray]:
-        """Derivatives of the residuals of translation (m) and of rotation (rad), in the parent's
-        axes, by (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; the residuals in the
-        last column. Two (K, 3, 9) arrays.
+    def rows(
+        self, T: FloatArray, scale: float, offset_s: float
+    ) -> tuple[list[FloatArray], tuple[float, float]]:
+        """Derivatives of the residuals of translation and of rotation, in the parent's axes, by
+        (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; the residuals in the last
+        column. Two (K, 3, 9) arrays in standard deviations and times their robust weights, and
+        these per axis (m, rad).
         """
         rotation, back = T[:3, :3], T[:3, :3].T
         of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _UNKNOWNS + 1))
@@ -261,34 +345,7 @@ class _Problem:
         of_translation[:, :, -1] -= scale * moved_b @ back
         of_rotation[:, :, -1] = se3.quat_log(np.concatenate([vector, scalar], axis=1))
         of_rotation[:, :, -1] += offset_s * of_rotation[:, :, _OFFSET]
-        return [of_translation, of_rotation]
-
-    def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
-        """X, scale and offset after Gauss-Newton steps with robust weights until they are small."""
-        offset_s = 0.0
-        for _ in range(_MAX_STEPS):
-            rows = [
-                part.reshape(-1, _UNKNOWNS + 1) for part in self.whitened(T, scale, offset_s)[0]
-            ]
-            moments = sum((part.T @ part for part in rows), np.zeros(2 * (_UNKNOWNS + 1,)))
-            step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
-            step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
-            rotation = T[:3, :3]
-            T = se3.from_rotation_translation(
-                rotation @ se3.rotation_exp(step[3:6]), T[:3, 3] + rotation @ step[:3]
-            )
-            scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
-            if np.abs(np.r_[step[:3] / max(self.rms_a, 1e-9), step[3:]]).max() < _STEP_TOLERANCE:
-                break
-        return T, scale, offset_s
-
-    def whitened(
-        self, T: FloatArray, scale: float, offset_s: float
-    ) -> tuple[list[FloatArray], tuple[float, float]]:
-        """Both arrays of :meth:`linearised` in standard deviations and times their robust weights,
-        and these per axis (m, rad).
-        """
-        parts = self.linearised(T, scale, offset_s)
+        parts = [of_translation, of_rotation]
         lengths = [np.linalg.norm(part[:, :, -1], axis=1) for part in parts]
         sigmas = (
             max(median(lengths[0]) / MEDIAN_LENGTH, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
@@ -300,9 +357,28 @@ class _Problem:
             part *= (root / sigma)[:, None, None]
         return parts, sigmas
 
+    def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
+        """X, scale and offset after Gauss-Newton steps with robust weights until they are small."""
+        offset_s = 0.0
+        for _ in range(_MAX_STEPS):
+            moments = np.zeros((_UNKNOWNS + 1, _UNKNOWNS + 1))
+            for part in self.rows(T, scale, offset_s)[0]:
+                flat = part.reshape(-1, _UNKNOWNS + 1)
+                moments += flat.T @ flat
+            step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
+            step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
+            rotation = T[:3, :3]
+            T = se3.from_rotation_translation(
+                rotation @ se3.rotation_exp(step[3:6]), T[:3, 3] + rotation @ step[:3]
+            )
+            scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
+            if np.abs(np.r_[step[:3] / max(self.rms_a, 1e-9), step[3:]]).max() < _STEP_TOLERANCE:
+                break
+        return T, scale, offset_s
+
     def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
         """The result, with its uncertainty."""
-        parts, (sigma_translation, sigma_rotation) = self.whitened(T, scale, offset_s)
+        parts, (sigma_translation, sigma_rotation) = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
         blocks = np.array_split(rows, min(N_BLOCKS, len(rows)))
         moments = np.array([np.tensordot(each, each, axes=([0, 1], [0, 1])) for each in blocks])

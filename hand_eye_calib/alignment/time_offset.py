@@ -8,7 +8,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
@@ -18,12 +18,10 @@ from hand_eye_calib.pairing.synchronise import find_leap, synchronise
 from hand_eye_calib.results.records import ClockRate
 
 # Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
-# Short motions show the offset best.
+# Short motions show the offset best. Motions needed, most that are compared, and if there is a rate
+# to be measured.
 _LAGS_S = (1.0, 0.3, 3.0)
-_MIN_PAIRS = 20
-
-# Most motions that are compared, and if there is a rate to be measured.
-_PAIRS, _PAIRS_OF_RATE = 800, 4_000
+_MIN_PAIRS, _PAIRS, _PAIRS_OF_RATE = 20, 800, 4_000
 
 # Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
 # intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
@@ -114,7 +112,7 @@ def estimate_time_offset(
         return TimeOffset(correlation.offset_s, sigma_s, correlation)
     if correlation.is_clear:
         return refine_time_offset(parent, child, correlation, max_gap_s)
-    doubt = correlation.doubt().replace("angular rates", "speeds" if of_speed else "angular rates")
+    doubt = correlation.doubt("speeds" if of_speed else "angular rates")
     raise NotEnoughDataError(
         f"the time offset cannot be estimated: {doubt}; drive with more turns and "
         "changes of speed, or give time_offset in seconds"
@@ -129,23 +127,9 @@ def refine_time_offset(
     start: SimilarityFit | None = None,
     least_s: float = 0.0,
 ) -> TimeOffset:
-    """Refine a coarse offset.
-
-    Parameters
-    ----------
-    parent, child : Trajectory
-    correlation : Correlation
-        Has the coarse offset.
-    max_gap_s : float
-    start : SimilarityFit, optional
-        Fit of the same streams to start at; a start is searched for without one.
-    least_s : float
-        A smaller offset of motions over one time need not be compared with those over others.
-
-    Returns
-    -------
-    TimeOffset
-        The coarse offset with a wide sigma if no fit explains the motion.
+    """Refine the coarse offset of a correlation; as it is, with a wide sigma, if no fit explains
+    the motion. A ``start`` is a fit of the same streams; without one it is searched for. An offset
+    below ``least_s`` of motions over one time need not be compared with those over others.
     """
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
     best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation), start
@@ -182,8 +166,14 @@ def _fine_offset(
         pairs = pairs_over(pose_pairs, lag_s, most_pairs)
         if len(pairs) < _MIN_PAIRS:
             return TimeOffset(offset_s, np.inf, correlation), None
-        used, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
-        twists = _twists(shifted, pose_pairs.stamps_ns[used], span_s)[where]
+        # Velocities of the child in its own frame, over less at the ends of the trajectory.
+        at, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
+        stamps_ns, span_ns = pose_pairs.stamps_ns[at], round(span_s * 1e9)
+        first_ns, last_ns = shifted.stamps_ns[[0, -1]]
+        before = np.clip(stamps_ns - span_ns, first_ns, last_ns)
+        after = np.clip(stamps_ns + span_ns, first_ns, last_ns)
+        steps = se3.log(se3.inverse(shifted.at(before)) @ shifted.at(after))
+        twists = (steps / ((after - before) * 1e-9)[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
         fit = fit_similarity(pairs, of_child, start=fit)
         if not fit.explains_translation:
@@ -227,14 +217,3 @@ def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRa
     sigma = float(np.sqrt(variance))
     is_used = abs(total) > _PLAIN_RATE * sigma
     return replace(before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used)
-
-
-def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> FloatArray:
-    """Velocities (K, 6) of the sensor in its own frame, over ``span_s`` on either side of a stamp
-    and less at the ends of the trajectory.
-    """
-    span_ns = round(span_s * 1e9)
-    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
-    before, after = (np.clip(stamps_ns + sign * span_ns, first_ns, last_ns) for sign in (-1, 1))
-    steps = se3.log(se3.inverse(trajectory.at(before)) @ trajectory.at(after))
-    return steps / ((after - before) * 1e-9)[:, None]

@@ -20,8 +20,7 @@ from hand_eye_calib.alignment.angular_rates import (
     Correlation,
     correlate_rates,
 )
-from hand_eye_calib.alignment.scale import estimate_scale, scale_differs
-from hand_eye_calib.alignment.similarity import SimilarityFit
+from hand_eye_calib.alignment.similarity import SimilarityFit, estimate_scale, scale_differs
 from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
@@ -282,7 +281,7 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
 
 def unrelated_rates(correlation: Correlation, quantity: str = "angular rates") -> Finding:
     """The finding that angular rates, or speeds, agree at no clock offset."""
-    doubt = correlation.doubt().replace("angular rates", quantity)
+    doubt = correlation.doubt(quantity)
     return finding("unrelated_rates", quantity=quantity, doubt=doubt)
 
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.scale import settle_scale
-from hand_eye_calib.alignment.similarity import SimilarityFit
+from hand_eye_calib.alignment.similarity import SimilarityFit, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adaptive, without_axes

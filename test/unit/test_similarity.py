@@ -15,7 +15,7 @@ from motions import (
     wandering_poses,
 )
 
-from hand_eye_calib.alignment.scale import estimate_scale
+from hand_eye_calib.alignment.similarity import estimate_scale
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
