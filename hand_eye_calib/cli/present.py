@@ -58,7 +58,7 @@ def deliver(
     ``inputs`` say where the data came from, in plain values. The snapshot has the poses and options
     that gave it, unless they were stops; the bag may have the base frame among its transforms.
     """
-    if not calibration.status.failure:
+    if (arguments.installed or arguments.base_frame) and not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
@@ -88,8 +88,6 @@ def _with_robot(
     they were asked for.
     """
     installed, base = arguments.installed, arguments.base_frame
-    if not (installed or base):
-        return calibration
     from hand_eye_calib.io.installed import frames_of_bag, open_installed
     from hand_eye_calib.io.urdf import read_urdf
     from hand_eye_calib.session.compare import with_comparison

@@ -88,6 +88,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
     )
     environment.filters |= {"number": fixed, "in_words": in_words, "printable": printable}
     environment.globals |= {"amount": amount, "counted": counted, "axis_names": _AXIS_NAMES}
+    environment.globals |= {"with_sigma": with_sigma, "printed_angle": printed_angle}
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
     return environment.get_template(template).render(
         **values, marks=MARKS, said=f"{said[:1].upper()}{said[1:]}"
