@@ -131,10 +131,9 @@ def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
     columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
     values = [*transform["translation"], *transform["rpy_deg"]]
-    sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
+    sigmas = [*transform["sigma_total_translation"], *transform["sigma_total_rpy_deg"]]
     for column, value, sigma in zip(columns, values, sigmas, strict=True):
-        is_known = sigma is not None and math.isfinite(sigma)
-        row |= {column: value, f"sigma_{column}": sigma if is_known else None}
+        row |= {column: value, f"sigma_{column}": sigma}
     return row | {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
 
 
