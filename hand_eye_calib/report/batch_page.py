@@ -50,23 +50,10 @@ def render_batch(
     vehicles: Mapping[str, Calibration],
     with_report: Collection[str],
 ) -> str:
-    """The page as HTML.
+    """The page as HTML, the gravest recordings and vehicles first.
 
-    Parameters
-    ----------
-    title : str
-        What the recordings are of.
-    rows : sequence of dict
-        One for each recording.
-    vehicles : mapping of str to Calibration
-        The result of each vehicle of several recordings.
-    with_report : collection of str
-        Names of the recordings that have a report.
-
-    Returns
-    -------
-    str
-        The gravest recordings and vehicles first.
+    The title says what they are of; there is a row for each, the result of each vehicle of several
+    by its name, and the names of the recordings that have a report.
     """
     cells = sorted(
         (_cells(row, row["name"] in with_report) for row in rows),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, count
 
 import numpy as np
 
@@ -42,9 +42,7 @@ def compare(
     Returns
     -------
     Comparison
-        The differences from what is installed, or of each result from each; ``verdict`` is "same",
-        "moved" or "cannot tell". ``moved`` names the results that differ from what is installed, or
-        without which the others agree.
+        Its ``moved`` names the results that differ, or without which the others agree.
 
     Raises
     ------
@@ -56,37 +54,39 @@ def compare(
     >>> hec.compare([result], installed=result).verdict
     'same'
     """
-    called = list(names) if names else [f"result {i}" for i in range(1, len(results) + 1)]
-    if len(called) != len(results) or len(set(called)) != len(called):
-        raise InputError(f"expected {len(results)} different names, found {len(called)}")
+    named = list(zip(names or map("result {}".format, count(1)), results, strict=False))
+    if len(dict(named)) < len(results):
+        raise InputError(f"expected {len(results)} different names, found {len(dict(named))}")
     require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
-    named = list(zip(called, results, strict=True))
-    couples: list[tuple[_Named, _Named]] = [*combinations(named, 2)]
+    couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(named, 2)]
     if installed is not None:
         couples = [(("installed", installed), each) for each in named]
     if not couples:
         raise InputError("expected two results or more, or one and what is installed")
-    limits = _TARGETS * np.array([target_of(axis, results[0]) for axis in AXES])
-    differences = tuple(_difference(*couple, limits) for couple in couples)
+    differences = tuple(_difference(*couple) for couple in couples)
     verdict = Change.of_all([Change(each.verdict) for each in differences]).value
-    apart = [each for each in differences if each.verdict == Change.MOVED]
-    of_all, who = f"{len(results)}", tuple(each.second for each in apart)
+    apart = tuple(each.second for each in differences if each.verdict == Change.MOVED)
+    others = "another" if installed is None else "what is installed"
+    sentence = f"{verdict}: none of {len(results)} differs from {others}"
+    sentence = f"moved: {listing(apart)} of {len(results)}" if apart else sentence
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
-    elif not apart:
-        beside = "another" if installed is None else "what is installed"
-        sentence = f"{verdict}: none of {of_all} differs from {beside}"
-    elif installed is not None:
-        sentence = f"moved: {listing(who)} of {of_all}"
-    else:
-        # Two differ, so that less evidence says which.
-        found = agreement_of_results(results, level=0.05)
-        pairs = listing([f"{each.first} and {each.second}" for each in apart])
-        who, told = (), f"{pairs} differ; which of them has moved, they do not tell"
-        if found.kind in ("one off", "moved"):
-            who, told = tuple(called[index] for index in found.apart), found.sentence(called)
-        sentence = f"moved: {told}"
-    return Comparison(sentence=sentence, verdict=verdict, moved=who, differences=differences)
+    elif apart and installed is None:
+        apart, sentence = _who_moved([*dict(named)], results, differences)
+    return Comparison(sentence=sentence, verdict=verdict, moved=apart, differences=differences)
+
+
+def _who_moved(
+    names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
+) -> tuple[tuple[str, ...], str]:
+    """Those without which the others agree, and a sentence; none if nothing explains it."""
+    # Two differ, so that less evidence says which.
+    found = agreement_of_results(results, level=0.05)
+    if found.kind in ("one off", "moved"):
+        return tuple(names[index] for index in found.apart), f"moved: {found.sentence(names)}"
+    apart = [each for each in differences if each.verdict == Change.MOVED]
+    pairs = listing([f"{each.first} and {each.second}" for each in apart])
+    return (), f"moved: {pairs} differ; which of them has moved, they do not tell"
 
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
@@ -99,13 +99,14 @@ def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> 
     return replace(result, comparison=replace(found, installed=stated.origin, values=values))
 
 
-def _difference(first: _Named, second: _Named, limits: FloatArray) -> Difference:
+def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     (first_name, one), (second_name, two) = first, second
     covariance, scatter, floor = _spread(one) + _spread(two)
     if not (_is_found(one) and _is_found(two)):
         # What is the same in all recordings is in one of both only: the larger of both, by axis.
         scatter = floor + np.diag(np.maximum(np.diag(scatter - floor), 0.0))
     values = deviation(two.T_parent_child, one.T_parent_child)
+    limits = _TARGETS * np.array([target_of(axis, two) for axis in AXES])
     found = moved(values, covariance + scatter, limits)
     columns = (found.values.tolist(), found.sigmas.tolist(), found.visible.tolist())
     rows = zip(*columns, (each.value for each in found.verdicts), strict=True)
