@@ -134,7 +134,7 @@ def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> d
 
     units = ("translation_m", "rotation_rad")
 
-    def apart(T_parent_child: FloatArray, other: FloatArray) -> dict[str, float]:
+    def apart(T_parent_child: "FloatArray", other: "FloatArray") -> dict[str, float]:
         return dict(zip(units, absolute_errors(T_parent_child, other), strict=True))
 
     document: dict[str, Any] = {
