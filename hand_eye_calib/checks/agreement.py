@@ -7,20 +7,18 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change
 from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.checks.response import (
-    LITTLE,
-    MAX_ROTATION,
     Fitted,
     Regression,
-    long_response,
-    short_response,
+    delays,
+    response,
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.park import align_rotation_vectors
 from hand_eye_calib.stats import median, quantile
@@ -55,12 +53,20 @@ _TURNED = (float(np.radians(0.5)), float(np.radians(1.5)))
 _SHIFTS_M = (0.008, 0.05)
 _MOVED_M, _MOVED_RAD = (0.005, 0.02), (float(np.radians(0.2)), float(np.radians(1.0)))
 
+# An axis whose root mean square rotation is below this share of the main axis's has no gain.
+_LITTLE = 0.1
+
+# Rotation vectors near half a turn may point either way.
+_MAX_ROTATION = 2.8
+
 # A coordinate explains why streams disagree if it takes away this share of the squared residuals.
 _MOST = 0.3
 
-# Smallest delay (s), and smoothing (s^2), that count.
+# Delays and smoothing are looked for in motions over this time (s), so many at most. Smallest delay
+# (s), and smoothing (s^2), that count; that of interpolation is a share of the squared interval.
+_SHORT_S, _MOST_SHORT = 0.5, 6000
 _DELAY_S = 0.003
-_SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
+_SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
 
 # Speeds are over about this time (s), so that noise is no speed.
 _SPEED_SPAN_S = 0.4
@@ -107,30 +113,28 @@ def check_agreement(
     """
     if same := check_same(*known):
         return same
-    change = find_change(pose_pairs, T_parent_child)
-    slow = long_response(pose_pairs, motions, T_parent_child, change.at_ns if change else None)
-    gain, speeds = np.eye(3), _speeds(pose_pairs)
-    suspects: list[_Suspect] = []
-    if slow:
-        response, axes = slow
-        drift = response.fit("drift")
-        tried = [(drift.share, _world_drift(drift, pose_pairs, speeds))]
-        tried += [_rotation_gain(response, axes, gain)]
-        tried += [make(response, stream) for make in (_turned, _axis_gain) for stream in _STREAMS]
-        if change:
-            tried += [_moved_mount(response, change, int(pose_pairs.stamps_ns[0]))]
-        suspects += [max(tried, key=lambda each: each[0])]
-    if fast := short_response(pose_pairs, T_parent_child, gain):
-        suspects += _delays(*fast[:2], speeds)
-        suspects += _smoothing(*fast, speeds)
+    slow, axes = response(pose_pairs, motions, T_parent_child)
+    speeds = _speeds(pose_pairs)
+    drift = slow.fit("drift")
+    tried = [(drift.share, _world_drift(drift, pose_pairs, speeds))]
+    tried += [_rotation_gain(slow.fit("gain"), axes)]
+    tried += [_turned(slow, stream) for stream in (*_STREAMS, "both")]
+    tried += [_axis_gain(slow, stream) for stream in _STREAMS]
+    tried += [_moved_mount(slow, pose_pairs.stamps_ns, motions)]
+    suspects = [max(tried, key=lambda each: each[0])]
+    motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
+    if fast := delays(pose_pairs, motions, T_parent_child):
+        suspects += _delays(fast, speeds)
+        interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
+        suspects += _smoothing(fast, _OF_INTERVAL * interval_s**2, speeds)
     return _likeliest(suspects)
 
 
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
-    slow = long_response(pose_pairs, motions, X)
-    tried = [_axis_gain(slow[0], stream) for stream in _STREAMS] if slow else []
+    slow, _ = response(pose_pairs, motions, X)
+    tried = [_axis_gain(slow, stream) for stream in _STREAMS]
     return _likeliest([each for each in tried if each[0] > _MOST])
 
 
@@ -163,17 +167,15 @@ def _found(key: str, stream: str, is_error: bool | np.bool_, **values: Any) -> F
     return finding(key, stream, _severity(is_error), **values)
 
 
-def _rotation_gain(slow: Regression, axes: FloatArray, gain: FloatArray) -> _Suspect:
-    """A gain of the child's rotations about an axis, which is put into the matrix ``gain``."""
-    fitted, powers = slow.fit("gain"), slow.powers("gain")
-    sizes = np.abs(fitted.values)
-    limits = np.maximum(_SIGMAS * fitted.sigmas, _BIASES * slow.biases("gain"))
-    limits = np.maximum(_GAINS[0], limits)
-    counts = (sizes > limits) & (powers > LITTLE**2 * powers[0])
-    if not counts.any():
+def _rotation_gain(fitted: Fitted, axes: FloatArray) -> _Suspect:
+    """A gain of the child's rotations about an axis."""
+    sizes, powers = np.abs(fitted.values), 1.0 / fitted.biases
+    limits = np.maximum(_SIGMAS * fitted.sigmas, _BIASES * fitted.biases)
+    ratios = sizes / np.maximum(_GAINS[0], limits)
+    ratios = np.where(powers > _LITTLE**2 * powers[0], ratios, 0.0)
+    k = int(np.argmax(ratios))
+    if ratios[k] < 1.0:
         return fitted.share, None
-    gain += (axes * np.where(counts, fitted.values, 0.0)) @ axes.T
-    k = int(np.argmax(np.where(counts, sizes / limits, 0.0)))
     axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
     values = {"axis": axis, "gain": 1.0 + fitted.values[k], "sigma": fitted.sigmas[k]}
     return fitted.share, _found("rotation_gain", "child", sizes[k] > _GAINS[1], **values)
@@ -182,7 +184,8 @@ def _rotation_gain(slow: Regression, axes: FloatArray, gain: FloatArray) -> _Sus
 def _turned(slow: Regression, stream: str) -> _Suspect:
     """Positions of a stream that are turned against its orientations."""
     fitted = slow.fit(f"turned_{stream}")
-    if fitted.significance.max() < _SIGMAS or np.abs(fitted.values).max() < _TURNED[0]:
+    significance = np.abs(fitted.values) / np.maximum(fitted.sigmas, 1e-12)
+    if significance.max() < _SIGMAS or np.abs(fitted.values).max() < _TURNED[0]:
         return fitted.share, None
     turned_rad = float(np.linalg.norm(fitted.values))
     axis = "xyz"[int(np.argmax(np.abs(fitted.values)))]
@@ -210,23 +213,28 @@ def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     """A coordinate of a stream that has another scale than the others."""
     fitted = slow.fit(f"axes_{stream}", without="scale")
     k, off, sigma = _odd_one(fitted)
-    bias = float(slow.biases(f"axes_{stream}")[k])
-    if abs(off) < max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * bias):
+    if abs(off) < max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * fitted.biases[k]):
         return fitted.share, None
     values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
     return fitted.share, _found("axis_scale", stream, abs(off) > _AXIS_GAINS[1], **values)
 
 
-def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspect:
+def _moved_mount(slow: Regression, stamps_ns: IntArray, motions: MotionPairs) -> _Suspect:
     """A mount that has moved."""
-    share, sigmas = slow.fit("moved").share, np.sqrt(np.diag(change.covariance))
-    known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
+    duration_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
+    H, S, squared = slow.of_mount
+    change = find_change(H, S, duration_s)
+    if change is None:
+        return 0.0, None
+    sigmas, share = np.sqrt(np.diag(change.covariance)), change.squared / max(squared, 1e-300)
+    known = np.where(np.abs(change.shift) > 2.0 * sigmas, change.shift, 0.0)
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
     if change.log_ratio < SIGNIFICANT or (moved_m < _MOVED_M[0] and moved_rad < _MOVED_RAD[0]):
         return share, None
     is_large = moved_m > _MOVED_M[1] or moved_rad > _MOVED_RAD[1]
     size = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
-    values = {"size": size, "at_s": (change.at_ns - start_ns) * 1e-9}
+    at_ns = (stamps_ns[motions.i] + stamps_ns[motions.j])[change.index] // 2
+    values = {"size": size, "at_s": float(at_ns - stamps_ns[0]) * 1e-9}
     is_error = is_large and change.log_ratio > 2.0 * SIGNIFICANT
     return share, _found("mount_moved", "both", is_error, **values)
 
@@ -237,33 +245,28 @@ def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Fi
     turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(_rms(speeds), 1e-9)
-    if drift.significance.max() < _SIGMAS or share < _MOVING:
+    if (np.abs(drift.values) < _SIGMAS * drift.sigmas).all() or share < _MOVING:
         return None
     speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
     values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
     return _found("world_drift", "both", False, percent=100 * share, **values)
 
 
-def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
+def _delays(fast: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
     """Positions that are late, or early, against orientations of their stream: all, or those along
     one axis of its world.
     """
-    of_rotations, of_positions = (
-        each.fit("late", without="late") for each in (rotations, positions)
-    )
-    delay_s = float(of_positions.values[0] - of_rotations.values[0])
-    sigma_s = float(np.hypot(of_positions.sigmas[0], of_rotations.sigmas[0]))
-    shift_m = abs(delay_s) * _rms(speeds)
-    if abs(delay_s) > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-        # Which stream it is cannot be told; hardly a filter makes positions early.
-        stream = "child" if delay_s > 0 else "parent"
-        share = max(of_positions.share, of_rotations.share)
-        values: dict[str, Any] = {"part": "positions", "others": "orientations"}
-        values |= {"delay_s": abs(delay_s), "sigma_s": sigma_s, "shift_m": shift_m}
-        is_error = shift_m > _SHIFTS_M[1]
-        yield share, _found("late", stream, is_error, code="position_clock", **values)
     for stream, columns in (("child", 0), ("parent", 3)):
-        fitted = positions.fit(f"late_axes_{stream}", without="late")
+        fitted = fast.fit(f"late_{stream}")
+        delay_s, sigma_s = float(fitted.values[0]), float(fitted.sigmas[0])
+        shift_m = abs(delay_s) * _rms(speeds)
+        if abs(delay_s) > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
+            parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
+            values: dict[str, Any] = {"part": parts[0], "others": parts[1]}
+            values |= {"delay_s": abs(delay_s), "sigma_s": sigma_s, "shift_m": shift_m}
+            is_error = shift_m > _SHIFTS_M[1]
+            yield fitted.share, _found("late", stream, is_error, code="position_clock", **values)
+        fitted = fast.fit(f"late_axes_{stream}")
         k, off_s, sigma_s = _odd_one(fitted)
         shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
         # The other stream's coordinate cannot be early.
@@ -274,17 +277,15 @@ def _delays(rotations: Regression, positions: Regression, speeds: FloatArray) ->
             yield fitted.share, _found("late", stream, is_error, code="axis_lag", **values)
 
 
-def _smoothing(
-    rotations: Regression, positions: Regression, least_s2: float, speeds: FloatArray
-) -> Iterator[_Suspect]:
+def _smoothing(fast: Regression, more_s2: float, speeds: FloatArray) -> Iterator[_Suspect]:
     """Smoothing of one part of the poses."""
-    for part, regression in (("positions", positions), ("orientations", rotations)):
-        for stream in ("child", "parent"):
-            fitted = regression.fit(f"smooth_{stream}")
+    for part, least_s2 in _SMOOTHING_S2.items():
+        for stream in _STREAMS:
+            fitted = fast.fit(f"{part}_{stream}")
             value, sigma = float(fitted.values[0]), float(fitted.sigmas[0])
             smoothing_s = float(np.sqrt(max(value, 0.0)))
             shift_m = smoothing_s * _rms(speeds)
-            least = max(_SMOOTHING_S2[part] + least_s2, _SMOOTHING_SIGMAS * sigma)
+            least = max(least_s2 + more_s2, _SMOOTHING_SIGMAS * sigma)
             if value >= least and shift_m > _SHIFTS_M[0]:
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": shift_m}
                 is_error = shift_m > _SHIFTS_M[1]
@@ -358,7 +359,7 @@ def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
     between = fast.at(slow.stamps_ns[indices], straight=True)
     start = np.arange(len(indices) - 1)
     pairs = pairs_between(between, slow.poses[indices], start, start + 1)
-    pairs = pairs[se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3]) < MAX_ROTATION]
+    pairs = pairs[se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3]) < _MAX_ROTATION]
     if len(pairs) < 3:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
