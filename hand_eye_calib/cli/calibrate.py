@@ -122,14 +122,16 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.cli.batch.run import run_batch
 
         return run_batch(arguments)
-    from hand_eye_calib.io.remote import local_copies
-
     if any("*" in str(path) for path in arguments.paths):
         from hand_eye_calib.cli.batch.work import matching
 
         arguments.paths = [
             type(path)(found) for path in arguments.paths for found in matching(str(path))
         ]
+    if not any("://" in str(path) for path in arguments.paths):
+        return _run_here(arguments, lambda value: value)
+    from hand_eye_calib.io.remote import local_copies
+
     with local_copies(arguments.paths) as (arguments.paths, as_given):
         return _run_here(arguments, as_given)
 

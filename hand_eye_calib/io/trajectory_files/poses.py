@@ -20,7 +20,6 @@ from hand_eye_calib.geometry.trajectory import (
     ROTATION_TOLERANCE,
     far_position,
 )
-from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
 from hand_eye_calib.io.trajectory_files.columns import MATRIX, QUATERNION, RATES, UNNAMED
 from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.stats import median
@@ -156,6 +155,8 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
             ),
         )
         height = _in_si(table, (up,), _LENGTHS)[:, 0] if up else positions[:, 2]
+        from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
+
         positions, to_first = LocalOrigin().local(lat, lon, height), rotations_to_first(lat, lon)
         table.guess("latitude and longitude became metres east and north of the first position")
     elif "x" in quantities:

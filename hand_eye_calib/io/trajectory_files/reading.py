@@ -15,7 +15,6 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
-from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.text import told_apart
 
 # Time between poses that have no stamps.
@@ -108,6 +107,7 @@ def read_trajectory(
                 "topic and tf are for bags: give one of them and none of the options of text files"
             )
         from hand_eye_calib.io.bags import PoseBag
+        from hand_eye_calib.io.transforms import TfSource
 
         with PoseBag(path) as bag:
             of = TfSource.parse(tf) if tf else topic or ""
