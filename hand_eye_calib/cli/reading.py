@@ -221,7 +221,7 @@ def _read_bags(
             if not calibrator.frame(stream):
                 calibrator.set_frame(stream, str(source).strip("/"))
         warnings = list(bag.warnings)
-        files = bag.files()
+        files = bag.files
     for text in warnings:
         note(text)
     inputs = {"bag": str(bag), **calibrator.inputs(sources)}

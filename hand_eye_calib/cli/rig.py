@@ -36,7 +36,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
             trajectories, notes = read_sources(bag, [(each, "auto") for each in sources])
             inputs: dict[str, Any] = {"bag": str(bag), "topics": topics}
             if arguments.out:
-                inputs["files"] = [fingerprint(file) for file in bag.files()]
+                inputs["files"] = [fingerprint(file) for file in bag.files]
     else:
         names = [*map(str, arguments.paths)]
         trajectories, notes = read_files(arguments, arguments.paths, {})

@@ -44,10 +44,8 @@ _is_limited = False
 
 
 def limit_memory() -> None:
-    """Limit the memory of reading from now on, where the system can (Linux).
-
-    The limit is one of the whole process: commands call this, a program that reads bags in one of
-    its threads may not want it.
+    """Limit the memory of reading from now on, where the system can (Linux). That is for commands:
+    the limit is one of the whole process, which may have other threads.
     """
     global _is_limited
     _is_limited = _STATM.exists()

@@ -5,7 +5,7 @@ transforms alone as xacro and as launch file.
 import hashlib
 import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -73,11 +73,9 @@ def save_rig(
     directory: str | Path,
     inputs: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write ``rig.yaml``, ``static_transform.launch.py`` with all transforms that may be used, and
-    a directory for each sensor with the files of :func:`save_result`; returns the first.
-
-    ``document`` is the rig in plain values, ``calibrations`` are all in the frame of one sensor;
-    the rest is as of :func:`save_result`.
+    """Write ``rig.yaml``, the rig in plain values, ``static_transform.launch.py`` with all
+    transforms that may be used, and a directory for each sensor with the files of
+    :func:`save_result`; returns the first.
     """
     folders: set[str] = set()
     for calibration in calibrations:
@@ -156,16 +154,7 @@ def fingerprint(path: str | Path) -> dict[str, Any]:
 
 
 def load_result(path: str | Path) -> Calibration:
-    """Read a calibration that :func:`save_result` wrote.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file, or the directory that holds it.
-
-    Returns
-    -------
-    Calibration
+    """Read a calibration that :func:`save_result` wrote: the file, or the directory that holds it.
 
     Raises
     ------
@@ -219,13 +208,26 @@ def _xacro_text(calibration: Calibration) -> str:
 """
 
 
+_NODE = """\
+            Node(
+                package='tf2_ros',
+                executable='static_transform_publisher',
+                arguments={},
+            ),
+"""
+
+
 def _launch_text(calibrations: Sequence[Calibration]) -> str:
     """A launch file that publishes extrinsics as static transforms."""
     comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
-    nodes = "".join(
-        _NODE.format("\n".join(f"{' ' * 20}{name!r}, {text!r}," for name, text in _arguments(each)))
-        for each in calibrations
-    )
+    nodes = ""
+    for calibration in calibrations:
+        frames = printable(calibration.mounting[0]), printable(calibration.child_frame)
+        arguments = ["--frame-id", frames[0], "--child-frame-id", frames[1]]
+        for name, value in calibration.usable_numbers().items():
+            text = value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
+            arguments += [f"--{name}", text]
+        nodes += _NODE.format(arguments)
     return f"""\
 # Publishes the extrinsic on /tf_static. Only if no robot description has this edge: a frame has one
 # parent and one publisher.
@@ -240,26 +242,6 @@ def generate_launch_description():
 {nodes}        ]
     )
 """
-
-
-_NODE = """\
-            Node(
-                package='tf2_ros',
-                executable='static_transform_publisher',
-                arguments=[
-{}
-                ],
-            ),
-"""
-
-
-def _arguments(calibration: Calibration) -> Iterator[tuple[str, str]]:
-    """The arguments of the node that publishes an extrinsic, and their values."""
-    for name, value in calibration.usable_numbers().items():
-        text = value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
-        yield f"--{name}", text
-    yield "--frame-id", printable(calibration.mounting[0])
-    yield "--child-frame-id", printable(calibration.child_frame)
 
 
 def _remarks(calibration: Calibration) -> list[str]:

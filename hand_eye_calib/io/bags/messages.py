@@ -101,10 +101,6 @@ def _pose(cursor: Cursor) -> Sequence[float]:
     return cursor.read("7d")
 
 
-def _point(cursor: Cursor) -> Sequence[float]:
-    return cursor.read("3d")
-
-
 def _imu(cursor: Cursor) -> Sequence[float]:
     """Orientation, scalar last, and angular rates (rad/s) of an Imu: NaN for what its covariance
     says it does not have.
@@ -149,7 +145,7 @@ _ROWS = (
     MessageType("geometry_msgs/msg/TransformStamped", _OF_POSES, _pose, has_child_frame=True),
     MessageType("sensor_msgs/msg/Imu", _OF_IMU, _imu),
     MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, _fix),
-    MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, _point),
+    MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, lambda cursor: cursor.read("3d")),
 )
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Those that carry whole poses.

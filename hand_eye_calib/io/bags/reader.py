@@ -70,10 +70,11 @@ class PoseBag:
     """One bag, or several of one recording, opened for reading; a context manager. They are read in
     the order of their times; those that were recorded at the same time are merged.
 
-    An InputError if there is no bag or it cannot be read. ``topics`` are in the order of their
-    names, ``start_ns`` and ``end_ns`` the bag times of the first and last message, if there are
-    any. ``shown`` passes on runs of messages, and may show how far they are; it takes the runs, the
-    number of all messages, what is being done, and the size of a run.
+    An InputError if there is no bag or it cannot be read. ``files`` are all that are read,
+    ``topics`` are in the order of their names, ``start_ns`` and ``end_ns`` the bag times of the
+    first and last message, if there are any. ``shown`` passes on runs of messages, and may show how
+    far they are; it takes the runs, the number of all messages, what is being done, and what gives
+    the size of a run.
     """
 
     def __init__(self, *paths: str | Path) -> None:
@@ -83,6 +84,7 @@ class PoseBag:
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
+        self.files = [storage.path for storage in self._storages]
         types, counts = defaultdict[str, set[str]](set), Counter[str]()
         for kind, count in chain(*(storage.counts.items() for storage in self._storages)):
             types[kind.topic].add(kind.type)
@@ -114,10 +116,6 @@ class PoseBag:
     def duration_s(self) -> float:
         """Time from the first message to the last; 0 if there is none."""
         return ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
-
-    def files(self) -> list[Path]:
-        """Paths of all files that are read."""
-        return [storage.path for storage in self._storages]
 
     # ---- topics
 
@@ -257,7 +255,7 @@ class PoseBag:
         if type_ == PATH_TYPE:
             return PathReading(stream, topic)
         if type_ == POINTS_TYPE:
-            return ScanReading(stream, topic, self.paths[0], self.files())
+            return ScanReading(stream, topic, self.paths[0], self.files)
         if topic in self.topics:
             return FieldReading(stream, topic, fields or FIELDS[type_])
         parts = zip(self._parts_of(topic), ("positions", "rotations"), strict=True)
