@@ -95,13 +95,13 @@ class Solved:
             floor = floor_of_pairs(self.pairs, self.weights, T_method, self.speed_m_s)
         odometries = [config.parent_kind, config.child_kind].count("odometry")
         return calibration_of(
+            found,
             fused,
             residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns),
+            self.stamps_ns,
             config,
-            status=fused.status(found.converged),
             T_method=T_method,
             floor=None if self.is_beside else odometries / 2 * floor,
-            objective=found.objective,
             proved_global=self.proved_global,
             method=self.method,
             method_reason=self.method_reason,
@@ -109,8 +109,6 @@ class Solved:
             reference_reason=self.reference_reason,
             noise=noise,
             backend=config.backend,
-            n_poses=len(self.stamps_ns),
-            stamp_ns=int(self.stamps_ns[-1]),
             time_offset_s=offset_s,
             time_offset_sigma_s=offset_sigma_s,
             clock_rate=offset.rate if offset else None,
@@ -122,13 +120,28 @@ class Solved:
 
 
 def calibration_of(
-    fused: Fused, residuals: Residuals, config: CalibratorConfig, **fields: Any
+    solution: Any,
+    fused: Fused,
+    residuals: Residuals,
+    stamps_ns: IntArray,
+    config: CalibratorConfig,
+    **fields: Any,
 ) -> Calibration:
-    """A result from what was fused with the prior, the residuals, and further fields."""
+    """A result from a solution with ``converged`` and ``objective``, what was fused with the prior,
+    the residuals, the stamps of the poses, and further fields.
+    """
+    values: dict[str, Any] = {
+        "status": fused.status(solution.converged),
+        "method": "adaptive",
+        "backend": "fast",
+        "stamp_ns": int(stamps_ns[-1]),
+    }
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
         observability=fused.assessment.observability,
+        objective=solution.objective,
+        n_poses=len(stamps_ns),
         n_pairs=len(residuals),
         n_inliers=int(residuals.is_inlier.sum()),
         contradictions=fused.contradictions,
@@ -136,7 +149,7 @@ def calibration_of(
         target_rotation=config.target_rotation,
         target_axes=parse_targets("target.axes", config.target_axes),
         motion_residuals=residuals,
-        **fields,
+        **values | fields,
     )
 
 

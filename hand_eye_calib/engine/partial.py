@@ -51,35 +51,6 @@ _DEGREES, _UNIT_WITHIN = float(np.degrees(1.0)), 0.2
 _POINT_M = 0.005
 
 
-def _calibration(
-    solution: AdaptiveSolution | LeverArmSolution,
-    fused: Fused,
-    residuals: Residuals,
-    pose_pairs: PosePairs,
-    config: CalibratorConfig,
-    **fields: Any,
-) -> Calibration:
-    """A result without frame names."""
-    is_of_positions = isinstance(solution, LeverArmSolution)
-    known = slice(0, 3) if is_of_positions else slice(3, 6)
-    return calibration_of(
-        fused,
-        residuals,
-        config,
-        status=fused.status(solution.converged, known),
-        objective=solution.objective,
-        method="adaptive",
-        reference="increments",
-        backend="fast",
-        n_poses=len(pose_pairs),
-        time_offset_sigma_s=solution.time_offset_sigma_s,
-        noise=solution.describe(pose_pairs.stamps_ns),
-        stamp_ns=int(pose_pairs.stamps_ns[-1]),
-        measured="positions" if is_of_positions else "rotations",
-        **fields,
-    )
-
-
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
     """Solve and assess synchronised poses and positions, on one clock: a result without frame names
     whose rotation is the identity, and unknown. Of the sensor that measures positions, orientations
@@ -126,15 +97,20 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
     offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
-    return _calibration(
+    return calibration_of(
         solution,
         fused,
         residuals,
-        pose_pairs,
+        stamps_ns,
         config,
+        status=fused.status(solution.converged, slice(0, 3)),
+        reference="increments",
+        measured="positions",
+        noise=solution.describe(stamps_ns),
         T_method=T,
         floor=2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
         time_offset_s=offset_s,
+        time_offset_sigma_s=solution.time_offset_sigma_s,
         scale=given * scale,
         scale_sigma=solution.scale_sigma * scale**2,
         findings=findings,
@@ -184,23 +160,28 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         se3.from_rotation_translation(Ts[:, :3, :3], np.zeros((len(Ts), 3)))
         for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
     )
+    stamps_ns = pose_pairs.stamps_ns
     has_rates = "rates" in (config.parent_measures, config.child_measures)
-    solution, Ts_cw_c = _rotation(pose_pairs.stamps_ns, Ts_pw_p, as_read, has_rates)
-    findings = _of_rotation(Ts_pw_p, Ts_cw_c, solution)
+    solution, Ts_cw_c = _rotation(stamps_ns, Ts_pw_p, as_read, has_rates)
+    T = solution.T_parent_child
+    findings = _of_rotation(Ts_pw_p, Ts_cw_c, T)
     if findings and has_rates:
         findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
-    fused = fuse(solution.T_parent_child, assess_rotation(Ts_pw_p, solution), config.prior())
-    pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
-    weights, stamps_ns = (~solution.jumps).astype(float), pose_pairs.stamps_ns
-    residuals = residuals_of(pairs, solution.T_parent_child, weights, stamps_ns)
-    return _calibration(
+    fused = fuse(T, assess_rotation(Ts_pw_p, solution), config.prior())
+    pairs, weights = motion_pairs(Ts_pw_p, Ts_cw_c, "B1"), (~solution.jumps).astype(float)
+    return calibration_of(
         solution,
         fused,
-        residuals,
-        pose_pairs,
+        residuals_of(pairs, T, weights, stamps_ns),
+        stamps_ns,
         config,
-        T_method=solution.T_parent_child,
+        status=fused.status(solution.converged, slice(3, 6)),
+        reference="increments",
+        measured="rotations",
+        noise=solution.describe(stamps_ns),
+        T_method=T,
         time_offset_s=float(config.time_offset) + solution.time_offset_s,
+        time_offset_sigma_s=solution.time_offset_sigma_s,
         rate_bias=_rate_bias(solution, config) if has_rates else None,
         findings=findings,
     )
@@ -244,12 +225,12 @@ def _rate_bias(solution: AdaptiveSolution, config: CalibratorConfig) -> RateBias
 
 
 def _of_rotation(
-    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, solution: AdaptiveSolution
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, T_parent_child: FloatArray
 ) -> tuple[Finding, ...]:
     """A finding if the rotations of one stream do not explain those of the other."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
-    left = np.linalg.norm(pairs.residuals(solution.T_parent_child)[1], axis=1)
+    left = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)
     turned = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
     most = turned >= np.quantile(turned, _TURNING)  # a sensor may stand still for long
     share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))

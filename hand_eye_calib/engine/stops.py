@@ -96,7 +96,7 @@ def calibrate_arm(
         (solve(Stops.of_one(poses, Ts_target_camera)), poses, parent, world)
         for poses, parent, world in ((robot, "hand", "base"), (se3.inverse(robot), "base", "hand"))
     ]
-    fit, poses, parent, world = max(fits, key=lambda each: each[0].log_likelihood)
+    fit, poses, parent, world = min(fits, key=lambda each: each[0].objective)
     frames = named[parent], named["camera"], named[world], named["target"]
     return _assessed(fit, poses, Ts_target_camera, config or CalibratorConfig(), frames, [])
 
@@ -122,16 +122,14 @@ def _assessed(
         end_ns=rows,
     )
     return calibration_of(
+        fit,
         fused,
         residuals,
+        rows,
         config,
-        status=fused.status(fit.converged),
         T_method=X,
-        objective=-fit.log_likelihood,
-        method="adaptive",
         reference="stops",
-        backend="fast",
-        n_poses=len(residuals),
+        stamp_ns=0,
         findings=tuple(findings),
         parent_frame=config.parent_frame or parent,
         child_frame=config.child_frame or child,

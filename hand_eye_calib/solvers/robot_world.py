@@ -99,7 +99,8 @@ class RobotWorld:
         Weight of each stop, 1 for the errors that the levels expect and less for larger ones.
     level_m, level_rad : float
         Standard deviations of the errors of a stop's position and rotation, per axis.
-    log_likelihood : float
+    objective : float
+        Negative log likelihood.
     converged : bool
     """
 
@@ -110,7 +111,7 @@ class RobotWorld:
     weights: FloatArray
     level_m: float
     level_rad: float
-    log_likelihood: float
+    objective: float
     converged: bool
 
     def undetermined(self, child: int = 0) -> FloatArray:
@@ -171,7 +172,7 @@ def _likelihood(fit: RobotWorld) -> float:
     """Of fits of one recording that left out different stops: those count as _OUTLIER."""
     left_out = float(np.sum(fit.weights == 0.0))
     levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
-    return fit.log_likelihood - 0.5 * left_out * (levels + _OUTLIER)
+    return -fit.objective - 0.5 * left_out * (levels + _OUTLIER)
 
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
@@ -324,6 +325,6 @@ def _fit(
         weights=np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0),
         level_m=float(np.sqrt(variances[0])),
         level_rad=float(np.sqrt(variances[1])),
-        log_likelihood=float(log_likelihood),
+        objective=-float(log_likelihood),
         converged=converged,
     )
