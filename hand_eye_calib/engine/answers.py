@@ -86,7 +86,7 @@ def other_answers(
         return found
 
     n_poses, own = len(pose_pairs), calibration.reference
-    stride = _stride(n_poses)
+    stride = max(-(-n_poses // _MOST_POSES), 1)
     others = [
         (f"B{n}", slice(None, None, stride))
         for n in _BASELINES
@@ -95,14 +95,10 @@ def other_answers(
     if not METHODS[calibration.method].uses_reference or own[0] not in "BC":
         own = f"B{_BASELINES[-2]}"
     half = n_poses // 2
-    stride = _stride(n_poses - half)
+    stride = max(-(-(n_poses - half) // _MOST_POSES), 1)
     edges = ((0, half), (half, n_poses))
     halves = [(_coarser(own, stride), slice(start, end, stride)) for start, end in edges]
     return answers(others), answers(halves)
-
-
-def _stride(count: int) -> int:
-    return max(-(-count // _MOST_POSES), 1)
 
 
 def _coarser(reference: str, stride: int) -> str:
@@ -119,7 +115,7 @@ def _unseen_by_all(calibration: Calibration, others: Sequence[Calibration]) -> l
     None for a method with a reference: it is chosen, or given, where the motion shows most, which
     others at shorter ones need not see.
     """
-    robust = [other for other in others if _is_sound(other)]
+    robust = _sound(others)
     if len(robust) < _MIN_OTHERS or METHODS[calibration.method].uses_reference:
         return []
     return [
@@ -134,24 +130,12 @@ def compare_answers(
     others: Sequence[Calibration] = (),
     halves: Sequence[Calibration] = (),
 ) -> CrossCheck:
-    """Compare a result with other answers to the same question.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The result.
-    others : sequence of Calibration
-        At other references. Only those count that do not reject half of the motion pairs: the
-        others disagree for a reason that says nothing about the result.
-    halves : sequence of Calibration
-        From the first and the second half of the recording, or fewer.
-
-    Returns
-    -------
-    CrossCheck
+    """Compare a result with other answers to the same question: at other references, of which only
+    those count that do not reject half of the motion pairs, and from the first and the second half
+    of the recording, or fewer.
     """
     sigmas, floor = calibration.sigmas, calibration.sigmas_of_floor
-    sound = [other for other in others if _is_sound(other)]
+    sound = _sound(others)
     pairs = [_apart(calibration, other) for other in sound]
     apart, joint = np.reshape(pairs, (-1, 2, 6)).swapaxes(0, 1)
     own = np.maximum(sigmas, _ROUNDING)
@@ -183,8 +167,8 @@ def compare_answers(
     }
 
 
-def _is_sound(other: Calibration) -> bool:
-    return other.n_inliers > _FEWEST_INLIERS * max(other.n_pairs, 1)
+def _sound(others: Sequence[Calibration]) -> list[Calibration]:
+    return [one for one in others if one.n_inliers > _FEWEST_INLIERS * max(one.n_pairs, 1)]
 
 
 def _apart(first: Calibration, second: Calibration) -> tuple[FloatArray, FloatArray]:

@@ -47,10 +47,8 @@ class Solved:
         Of the mount within the recording.
     stamps_ns, config, scale, time_offset
         What was solved; the time offset if it was estimated.
-    speed_m_s : float
-        Usual speed of the parent sensor.
-    is_beside : bool
-        It is only to be compared with a result: without a floor.
+    floor : (6, 6) array or None
+        Common-mode uncertainty; None if it is only to be compared with a result.
     """
 
     solution: Solution | AdaptiveSolution
@@ -69,8 +67,7 @@ class Solved:
     scale: float = 1.0
     scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
-    speed_m_s: float = 0.0
-    is_beside: bool = False
+    floor: FloatArray | None = None
 
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
         """The result without frame names; ``unseen`` axes count as unobservable whatever the method
@@ -84,16 +81,11 @@ class Solved:
         scale, scale_sigma = self.scale, self.scale_fit.scale_sigma if self.scale_fit else 0.0
         found, noise = self.solution, None
         if isinstance(found, AdaptiveSolution):
-            lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
-            floor = common_mode_floor(self.speed_m_s, math.hypot(*lasting))
             noise = found.describe(self.stamps_ns)
             offset_s += found.time_offset_s
             offset_sigma_s = found.time_offset_sigma_s or offset_sigma_s
             scale_sigma = scale * found.scale_sigma or scale_sigma
             scale *= found.scale
-        elif not self.is_beside:
-            floor = floor_of_pairs(self.pairs, self.weights, T_method, self.speed_m_s)
-        odometries = [config.parent_kind, config.child_kind].count("odometry")
         return calibration_of(
             found,
             fused,
@@ -101,7 +93,7 @@ class Solved:
             self.stamps_ns,
             config,
             T_method=T_method,
-            floor=None if self.is_beside else odometries / 2 * floor,
+            floor=self.floor,
             proved_global=self.proved_global,
             method=self.method,
             method_reason=self.method_reason,
@@ -178,21 +170,17 @@ def solve_poses(
     Parameters
     ----------
     pose_pairs : PosePairs
-        On one clock.
     config : CalibratorConfig
         With a time offset in seconds, which the poses already have.
     time_offset : TimeOffset, optional
         That offset, if it was estimated.
     is_beside : bool
-        The answer is only to be compared with a result: without a floor, or a proof that the
-        minimum is global.
+        The answer is only to be compared with a result: without a floor or a proof.
 
     Raises
     ------
-    ConfigError
-        If the method does not have the backend.
-    NotEnoughDataError
-        If there are too few poses for the reference or for the scale.
+    ConfigError, NotEnoughDataError
+        Without the backend, or with too few poses for the reference or for the scale.
     """
     scale, scale_fit = settle_scale(pose_pairs, config.scale)
     require_backend(config.method, config.backend)
@@ -201,30 +189,37 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config, is_beside=is_beside)
-    found = solved.solution
-    # A model with a time offset knows how uncertain that is.
-    is_known = isinstance(found, AdaptiveSolution) and found.time_offset_s
-    spread = _spread_by_alignment(scale_fit, None if is_known else time_offset)
+    found, of_offset = solved.solution, time_offset
+    if isinstance(found, AdaptiveSolution) and found.time_offset_s:
+        of_offset = None  # the model knows how uncertain that is
+    spread = _spread_by_alignment(scale_fit, of_offset)
     if solved.shift is not None:
         spread += solved.shift.spread
-    rotation = solved.solution.T_parent_child[:3, :3]
-    said = []
+    warnings = solved.warnings
     if scale_fit and config.scale == "auto":
-        said = [
-            f"the child's lengths are multiplied by {scale:.4f} +/- {scale_fit.scale_sigma:.4f}, "
-            "as estimated from the motion"
-        ]
+        times = f"{scale:.4f} +/- {scale_fit.scale_sigma:.4f}, as estimated from the motion"
+        warnings = (f"the child's lengths are multiplied by {times}", *warnings)
     return replace(
         solved,
-        assessment=widened(solved.assessment, rotation, spread),
+        assessment=widened(solved.assessment, found.T_parent_child[:3, :3], spread),
         config=config,
         scale=scale,
         scale_fit=scale_fit,
-        warnings=(*said, *solved.warnings),
+        warnings=warnings,
         time_offset=time_offset,
-        speed_m_s=usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3]),
-        is_beside=is_beside,
+        floor=None if is_beside else _floor(solved, pose_pairs, config),
     )
+
+
+def _floor(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
+    """Common-mode floor (6, 6) of the errors of the sensors that are odometries."""
+    found, odometries = solved.solution, [config.parent_kind, config.child_kind].count("odometry")
+    speed_m_s = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
+    if isinstance(found, AdaptiveSolution):
+        lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
+        return odometries / 2 * common_mode_floor(speed_m_s, math.hypot(*lasting))
+    T = found.T_parent_child
+    return odometries / 2 * floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
 
 
 def fixed_time_offset(config: CalibratorConfig) -> float:

@@ -63,15 +63,12 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     """
     stamps_ns, is_child = pose_pairs.stamps_ns, config.child_measures == "positions"
     given = 1.0 if isinstance(config.scale, str) else config.scale
-    poses, measured = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c.copy()
-    measured[:, :3, 3] *= given
-    if not is_child:
-        poses, measured = measured, poses
+    of_parent, of_child = pose_pairs.Ts_pw_p, pose_pairs.child_scaled(given).Ts_cw_c
+    poses, measured = (of_parent, of_child) if is_child else (of_child, of_parent)
     positions = measured[:, :3, 3]
+    with_scale = config.scale in ("auto", "estimate")
     try:
-        solution = of_positions.solve(
-            stamps_ns, poses, positions, config.scale in ("auto", "estimate")
-        )
+        solution = of_positions.solve(stamps_ns, poses, positions, with_scale)
     except np.linalg.LinAlgError:
         raise InputError(
             "no lever arm explains the positions: they may jump, or be of another body; look at "
@@ -81,18 +78,6 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
     fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
     findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child)
-    # The steps from each position to the next, along the axes of the sensor with poses.
-    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
-    residuals = Residuals(
-        translation=(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ along[:, :, None])[:, :, 0],
-        rotation=np.zeros((len(steps), 3)),
-        weights=(~(solution.jumps | solution.spikes[1:])).astype(float),
-        start_ns=stamps_ns[:-1],
-        end_ns=stamps_ns[1:],
-    )
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
@@ -100,7 +85,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     return calibration_of(
         solution,
         fused,
-        residuals,
+        _steps(solution, stamps_ns, poses, positions),
         stamps_ns,
         config,
         status=fused.status(solution.converged, slice(0, 3)),
@@ -114,6 +99,23 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         scale=given * scale,
         scale_sigma=solution.scale_sigma * scale**2,
         findings=findings,
+    )
+
+
+def _steps(
+    solution: LeverArmSolution, stamps_ns: IntArray, poses: FloatArray, positions: FloatArray
+) -> Residuals:
+    """Of the steps from each position to the next, along the axes of the sensor with poses."""
+    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
+    return Residuals(
+        translation=(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ along[:, :, None])[:, :, 0],
+        rotation=np.zeros((len(steps), 3)),
+        weights=(~(solution.jumps | solution.spikes[1:])).astype(float),
+        start_ns=stamps_ns[:-1],
+        end_ns=stamps_ns[1:],
     )
 
 

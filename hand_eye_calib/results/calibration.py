@@ -300,6 +300,7 @@ class Calibration(Result):
         JSON or YAML. None for what is infinite, and for each printed number of an axis that is
         not known; only a ``matrix`` has a number there, so that it can be read back.
         """
+        frames, child = (self.parent_frame, self.child_frame), self.child_frame
         document: dict[str, Any] = {
             "verdict": self.verdict,
             "headline": self.headline,
@@ -307,15 +308,13 @@ class Calibration(Result):
             "format": _FORMAT,
             "version": _VERSION,
             "parent_frame": self.parent_frame,
-            "child_frame": self.child_frame,
+            "child_frame": child,
             "T_parent_child": self._printed_dict(
-                self.T_parent_child, self.parent_frame, self.child_frame, sigmas_m=self.sigmas[:3]
+                self.T_parent_child, *frames, sigmas_m=self.sigmas[:3]
             ),
             "T_child_parent": self._inverse_dict(),
             "status": self.status,
-            "covariance": _matrix_of(
-                "error xi in T_parent_child @ exp(xi)", self.child_frame, self.covariance
-            )
+            "covariance": _matrix_of("error xi in T_parent_child @ exp(xi)", child, self.covariance)
             | {"order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]},
             "observability": [
                 vars(dof) | {"sigma_total": total, "frame": self.parent_frame}
@@ -323,26 +322,20 @@ class Calibration(Result):
             ],
         }
         if self.T_base_child is not None:
-            frames = self.base_frame, self.child_frame
-            document["T_base_child"] = self._printed_dict(self.T_base_child, *frames)
+            document["T_base_child"] = self._printed_dict(self.T_base_child, self.base_frame, child)
         if self.T_method is not None:
-            document["T_method"] = {
-                "of": "T_parent_child as the method solved it: nothing set, no prior added",
-                "matrix": self.T_method,
-            }
-        if self.T_world_world is not None and self.cov_world_world is not None:
-            frames, cov = (self.parent_world_frame, self.child_world_frame), self.cov_world_world
-            document |= {
-                "T_world_world": self._printed_dict(
-                    self.T_world_world, *frames, cov, np.zeros((6, 6))
-                ),
-                "cov_world_world": _matrix_of(
-                    "error xi in T_world_world @ exp(xi)", frames[1], cov
-                ),
-            }
+            of = "T_parent_child as the method solved it: nothing set, no prior added"
+            document["T_method"] = {"of": of, "matrix": self.T_method}
+        if (Z := self.T_world_world) is not None and (cov := self.cov_world_world) is not None:
+            worlds, of = (
+                (self.parent_world_frame, self.child_world_frame),
+                "T_world_world @ exp(xi)",
+            )
+            document["T_world_world"] = self._printed_dict(Z, *worlds, cov, np.zeros((6, 6)))
+            document["cov_world_world"] = _matrix_of(f"error xi in {of}", worlds[1], cov)
         if self.floor is not None:
             of = "errors of a whole recording, the same in every part; not in the covariance"
-            document["floor"] = _matrix_of(of, self.child_frame, self.floor)
+            document["floor"] = _matrix_of(of, child, self.floor)
         document["sigma_total"] = dict(zip(AXES, self.sigmas_with_floor, strict=True))
         document |= {
             name: getattr(self, name)
