@@ -151,10 +151,14 @@ _LARGEST_QUANTITY = 1e6
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
+def shortened(text: str, most: int = _MOST_SHOWN) -> str:
+    """A text for a message, which must not grow with it."""
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
 def shown_value(value: object) -> str:
-    """A value for a message, which must not grow with it."""
-    text = repr(value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+    """A value for a message."""
+    return shortened(repr(value))
 
 
 def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:

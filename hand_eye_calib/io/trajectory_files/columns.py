@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.text import shortened
 
 # Characters of a list of names that a message shows.
 _MOST_SHOWN = 600
@@ -180,6 +181,5 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names of columns for a message, which must not grow with the file."""
-    text = ", ".join(names)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+    """Names of columns for a message."""
+    return shortened(", ".join(names), _MOST_SHOWN)

@@ -33,6 +33,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     listed,
 )
 from hand_eye_calib.io.trajectory_files.foreign import rows_of
+from hand_eye_calib.text import shortened, shown_value
 
 _Path = str | Path
 # A line and its number, from 1.
@@ -42,8 +43,6 @@ Line = tuple[int, str]
 AUTO = "auto"
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
-# Characters of a line or of a reason that a message shows.
-_MOST_SHOWN = 100
 # A stamp in nanoseconds since 1970 has at least so many digits.
 _DIGITS_OF_NS = 17
 # A number, or a time as of ISO 8601.
@@ -247,17 +246,16 @@ class Table:
         for number, text in lines:
             cells = cells_of(text)
             if len(cells) != n_columns:
-                shown = text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
                 raise InputError(
                     f"{self.path}, line {number}: expected {self.expected}; found {len(cells)}: "
-                    f"{shown!r}"
+                    f"{shown_value(text)}"
                 )
             try:
                 if stamp_at:
                     self.stamps.append(_stamp([cells[index] for index in stamp_at]))
                 self.numbers.extend(float(cells[index]) for index in at)
             except ValueError as error:
-                reason = f"expected {self.expected}; {str(error)[:_MOST_SHOWN]}"
+                reason = f"expected {self.expected}; {shortened(str(error))}"
                 raise InputError(f"{self.path}, line {number}: {reason}") from None
             self.line_numbers.append(number)
         return self
