@@ -17,14 +17,13 @@ from hand_eye_calib.cli.console import (
     waiting_for,
 )
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.tables import summary
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
     amount,
     axes_in_words,
-    given_or_estimated,
     listing,
     printed_angle,
     with_sigma,
@@ -36,10 +35,6 @@ if TYPE_CHECKING:
 _EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
 _WIDTH = 100
 _ROTATIONS = ("roll", "pitch", "yaw")
-_PROOF = {
-    "yes": ", proved to be the global minimum over them",
-    "no": ", not proved to be the global minimum over them",
-}
 _SCATTER = {
     "of_methods": "scatter of other methods and references",
     "of_halves": "scatter of the two halves of the recording",
@@ -234,23 +229,8 @@ def _details(calibration: Calibration) -> Iterator[str]:
             each = [f"{axes_in_words([axis])} {amount(axis, known[axis])}" for axis in known]
             yield f"{title}: {', '.join(each)}"
     yield from _comparisons(calibration)
-    uses = METHODS[calibration.method].uses_reference
-    on = f"on reference {calibration.reference}" if uses else "on all poses"
-    yield (
-        f"solved with {calibration.method} ({calibration.backend}) {on}: {calibration.n_inliers} "
-        f"of {calibration.n_pairs} motion pairs are inliers, from {calibration.n_poses} poses; "
-        f"objective {calibration.objective:.6g}{_PROOF.get(calibration.proved_global, '')}"
-    )
-    if calibration.method_reason:
-        yield f"method {calibration.method_reason}"
-    if calibration.reference_reason:
-        yield f"reference {calibration.reference_reason}"
-    yield from calibration.noise.in_words if calibration.noise else ()
-    offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
-    scale = (calibration.scale, calibration.scale_sigma)
-    yield f"time offset {given_or_estimated(*offset, 's')}; scale {given_or_estimated(*scale, '')}"
-    if (rate := calibration.clock_rate) and rate.is_used:
-        yield f"the child's clock is {rate}: the time offset holds at {rate.at_ns * 1e-9:.3f} s"
+    for name, value in summary(calibration).items():
+        yield f"{name}: {value}"
 
 
 def _comparisons(calibration: Calibration) -> Iterator[str]:

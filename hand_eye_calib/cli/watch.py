@@ -95,24 +95,20 @@ class Session:
     def view(self) -> "View":
         """Do what was typed, and make the view."""
         now_s = time.monotonic()
-        buttons = self._board.view(now_s).buttons
         for key in self._keys():
-            self._press(key, now_s, buttons)
+            request = _KEYS.get(key, "")
+            if key in ("q", "\x03", "\x04"):
+                self.is_over = True
+            elif key == "p":
+                self.shows_code = not self.shows_code
+            elif request not in self._board.view(now_s).buttons:
+                continue
+            elif key in _SURE and (key != self._sure or now_s > self._sure_until_s):
+                self._sure, self._sure_until_s = key, now_s + _SURE_WITHIN_S
+                self._board.answer(request, False, f"{_SURE[key]}: press {key} again", now_s)
+            else:
+                self._requests.put(request)
         return self._board.view(now_s)
-
-    def _press(self, key: str, now_s: float, buttons: tuple[str, ...]) -> None:
-        request = _KEYS.get(key, "")
-        if key in ("q", "\x03", "\x04"):
-            self.is_over = True
-        elif key == "p":
-            self.shows_code = not self.shows_code
-        elif request not in buttons:
-            return
-        elif key in _SURE and (key != self._sure or now_s > self._sure_until_s):
-            self._sure, self._sure_until_s = key, now_s + _SURE_WITHIN_S
-            self._board.answer(request, False, f"{_SURE[key]}: press {key} again", now_s)
-        else:
-            self._requests.put(request)
 
 
 @contextlib.contextmanager
@@ -140,15 +136,16 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
         return
     code = qr_code(address)
     footer = f"{'p QR code   ' * bool(code)}phone: {address}" if address else ""
-    shown: list[tuple[object, ...]] = []
+    shown: tuple[object, ...] = ()
     with Live(screen=True, auto_refresh=False) as live:
 
         def show(view: "View", shows_code: bool) -> None:
+            nonlocal shown
             size = live.console.size
-            if shown != [(view, size, shows_code)]:
+            if shown != (view, size, shows_code):
                 of_view = screen(view, size.width, footer)
                 live.update(Text.from_ansi(code) if code and shows_code else of_view, refresh=True)
-                shown[:] = [(view, size, shows_code)]
+                shown = view, size, shows_code
 
         yield show
 

@@ -23,6 +23,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.tables import summary
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.text import (
     amount,
@@ -30,7 +31,6 @@ from hand_eye_calib.text import (
     counted,
     duration,
     fixed,
-    given_or_estimated,
     in_words,
     length,
     listing,
@@ -226,39 +226,18 @@ def _data(
 ) -> dict[str, Any]:
     """What the result comes from, for the template."""
     options = snapshot.config.to_options() if snapshot else {}
+    rows, kind = summary(calibration), "stops"
+    if evidence:
+        kind = f"synchronised pose pairs over {duration(evidence.times_s[-1])}"
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True)) if snapshot else {}
     names = [name for name in ("parent", "child") if name in streams or name in inputs]
     return {
         "labels": inputs.get("labels", {}),
-        "summary": _summary(calibration, evidence),
+        "summary": rows | {"Poses": f"{calibration.n_poses:,} {kind}"},
         "streams": [_stream(name, inputs, streams.get(name)) for name in names],
         "provenance": list(_provenance(inputs)),
         "options": {name: each for name, each in options.items() if each != ""},
     }
-
-
-def _summary(calibration: Calibration, evidence: Evidence | None) -> dict[str, str]:
-    """What was solved, as names and values."""
-    offset = (calibration.time_offset_s, calibration.time_offset_sigma_s)
-    scale = (calibration.scale, calibration.scale_sigma)
-    poses = f"{calibration.n_poses:,} stops"
-    if evidence:
-        span = duration(evidence.times_s[-1])
-        poses = f"{calibration.n_poses:,} synchronised pose pairs over {span}"
-    reason = calibration.method_reason
-    rows = {
-        "Method": f"{calibration.method} ({calibration.backend})" + (reason and f"; {reason}"),
-        "Reference": calibration.reference_reason or calibration.reference,
-        "Poses": poses,
-        "Motion pairs": f"{calibration.n_inliers:,} of {calibration.n_pairs:,} are inliers",
-        "Objective": f"{calibration.objective:.6g}",
-        "Time offset": given_or_estimated(*offset, "s")
-        + (f"; clock {rate}" if (rate := calibration.clock_rate) and rate.is_used else ""),
-        "Scale": given_or_estimated(*scale, ""),
-    }
-    if noise := calibration.noise:
-        rows["Noise"] = "; ".join(noise.in_words)
-    return rows
 
 
 def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, str]:
