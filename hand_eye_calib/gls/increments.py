@@ -251,39 +251,34 @@ def linearise(
     error : (N, 6) array, optional
         Errors that the poses were freed of.
     """
-    used = {*columns, *np.flatnonzero(parameters).tolist()}
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
-    step = turned(back_c, np.diff(course.path, axis=0))
+    step, metres = (
+        turned(back_c, np.diff(course.path, axis=0)),
+        back_c @ np.diff(course.along, axis=0),
+    )
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     by_child = motions(Ts_cw_c)
-    if used & {*PARAMETERS["rate"]}:
-        by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
+    by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
+    if parameters[RATE].any():
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
     by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
-    if used & {*PARAMETERS["bias"]}:
-        metres = back_c @ np.diff(course.along, axis=0)
-        by_child[:, :3, 3] -= metres @ parameters[BIAS]
+    by_child[:, :3, 3] -= metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-    by = np.zeros((len(step), 6, 6 + len(columns) + 1))
-    np.subtract(np.eye(6), adjoints, out=by[:, :, :6])
-    by_scale = np.zeros((len(step), 6, 1))
-    by_scale[:, :3, 0] = -turned(back[:, :3, :3], step)
-    for at, index in enumerate(columns, start=6):
-        if index == SCALE:
-            by[:, :, at] = by_scale[:, :, 0]
-        elif index in PARAMETERS["bias"]:
-            by[:, :3, at] = turned(back[:, :3, :3], metres[:, :, index - BIAS.start])
-        elif index == TIME:
-            by[:, :, at] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-        else:
-            by[:, 3:, at] = by_rate[:, :, index - RATE.start]
-    by[:, :, -1] = se3.log(back @ _as_child(streams.motions_p, T_parent_child))
+    by = np.zeros((len(step), 6, 6 + N_SYSTEMATIC + 1))
+    by_xi, by_parameter, residuals = by[:, :, :6], by[:, :, 6:-1], by[:, :, -1]
+    np.subtract(np.eye(6), adjoints, out=by_xi)
+    by_parameter[:, :3, SCALE] = -turned(back[:, :3, :3], step)
+    by_parameter[:, :3, BIAS] = back[:, :3, :3] @ metres
+    by_parameter[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+    by_parameter[:, 3:, RATE] = by_rate
+    residuals[:] = se3.log(back @ _as_child(streams.motions_p, T_parent_child))
     if error is not None:
-        by[:, :, -1] += error[1:] - turned(adjoints, error[:-1])
-    return Linearisation(by, adjoints, by_scale)
+        residuals += error[1:] - turned(adjoints, error[:-1])
+    asked = [*range(6), *(6 + column for column in columns), by.shape[2] - 1]
+    return Linearisation(np.take(by, asked, axis=2), adjoints, by_parameter[:, :, [SCALE]])
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:

@@ -71,8 +71,8 @@ class StateSpace:
         Variance of the walk over each increment, in units of a typical one.
     columns : (n, 6, p + 1) array
         J and, last, e.
-    ahead, behind : (n, 6, d) arrays
-        H1 and H0. H1 is the identity for the white error.
+    ahead, behind : (n, 6, d - 6) and (n, 6, d) arrays
+        H1 of the states behind the white error, for which it is the identity, and H0.
     white, walk : tuples of (1 or N, 6, 6) and (6, 6) arrays
         What log levels scale: the covariances are ``sum exp(level) basis``.
     twists : (N, 6) array
@@ -110,13 +110,7 @@ class StateSpace:
     @property
     def n_states(self) -> int:
         """d."""
-        return self.ahead.shape[2]
-
-    @cached_property
-    def slow_ahead(self) -> FloatArray | None:
-        """H1 (n, 6, d - 6) of the states behind the white error; None if it is zero."""
-        slow = self.ahead[:, :, WHITE:]
-        return slow if slow.any() else None
+        return self.behind.shape[2]
 
     @property
     def n_white(self) -> int:
@@ -150,16 +144,13 @@ class StateSpace:
 
     def ahead_times(self, blocks: FloatArray) -> FloatArray:
         """H1 of the increments times blocks (n, d, k): (n, 6, k)."""
-        if self.slow_ahead is None:
-            return blocks[:, :WHITE]
-        return blocks[:, :WHITE] + self.slow_ahead @ blocks[:, WHITE:]
+        return blocks[:, :WHITE] + self.ahead @ blocks[:, WHITE:]
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
         states = np.zeros((len(columns) + 1, self.n_states, columns.shape[2]))
         states[1:, :WHITE] = columns
-        if self.slow_ahead is not None:
-            states[1:, WHITE:] = transposed(self.slow_ahead) @ columns
+        states[1:, WHITE:] = transposed(self.ahead) @ columns
         states[:-1] -= transposed(self.behind) @ columns
         return states
 
@@ -221,6 +212,15 @@ class Posterior:
         Of the precision P of all states.
     log_determinant : float
         log|V|, increments that are no evidence left out.
+    whitened : (N, d, p + 1) array
+        Y of the space's columns.
+    products : (p + 1, p + 1) array
+        Products of J and, last, e, weighed with V^-1.
+    normal : NormalEquations
+        Solution for all parameters.
+    loss : float
+        Negative restricted log likelihood, constants left out (Patterson, Thompson, Biometrika 58,
+        1971).
 
     Raises
     ------
@@ -252,6 +252,12 @@ class Posterior:
             + 6 * np.log(space.relative[kept]).sum()
         )
         self.log_determinant = float(of_walk + self.factor.log_determinant - prior)
+        weighed, self.whitened = self.halves(space.columns)
+        products = multiplied(space.columns, weighed) - multiplied(self.whitened, self.whitened)
+        self.products = 0.5 * (products + products.T) + space.prior
+        self.normal = NormalEquations(self.products)
+        determinants = self.log_determinant + self.normal.log_determinant
+        self.loss = 0.5 * (determinants + self.normal.cost)
 
     def _blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d), of the m increments
@@ -259,19 +265,16 @@ class Posterior:
         """
         space, size = self.space, self.space.n_states
         part, here = slice(start, end), slice(1, None)
-        behind, weights = space.behind[part], self._weights[part]
+        ahead, behind, weights = space.ahead[part], space.behind[part], self._weights[part]
         n = len(behind)
         diagonal, below = np.zeros((n + 1, size, size)), np.zeros((n, size, size))
         diagonal[here, :WHITE, :WHITE] = weights
         weighed = weights @ behind
         np.negative(weighed, out=below[:, :WHITE])
-        if space.slow_ahead is not None:
-            slow = space.slow_ahead[part]
-            beside = weights @ slow
-            diagonal[here, :WHITE, WHITE:] = beside
-            diagonal[here, WHITE:, :WHITE] = transposed(beside)
-            diagonal[here, WHITE:, WHITE:] = transposed(slow) @ beside
-            below[:, WHITE:] = transposed(slow) @ below[:, :WHITE]
+        beside = weights @ ahead
+        diagonal[here, :WHITE, WHITE:], diagonal[here, WHITE:, :WHITE] = beside, transposed(beside)
+        diagonal[here, WHITE:, WHITE:] = transposed(ahead) @ beside
+        below[:, WHITE:] = transposed(ahead) @ below[:, :WHITE]
         diagonal[:-1] += transposed(behind) @ weighed
         diagonal[here, :WHITE, :WHITE] += self._of_poses(slice(start + 1, end + 1))
         for process in self.markov:
@@ -310,35 +313,6 @@ class Posterior:
         """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""
         weighed = self._weights @ columns
         return weighed, self.factor.whiten(self.space.gathered(weighed))
-
-    @cached_property
-    def _halves(self) -> tuple[FloatArray, FloatArray]:
-        """``Z' W Z`` (p + 1, p + 1) and Y of the space's columns."""
-        weighed, whitened = self.halves(self.space.columns)
-        return multiplied(self.space.columns, weighed), whitened
-
-    @property
-    def whitened(self) -> FloatArray:
-        """Y (N, d, p + 1) of the space's columns."""
-        return self._halves[1]
-
-    @cached_property
-    def products(self) -> FloatArray:
-        """(p + 1, p + 1) array: products of J and, last, e, weighed with V^-1."""
-        products = self._halves[0] - multiplied(self.whitened, self.whitened)
-        return 0.5 * (products + products.T) + self.space.prior
-
-    @cached_property
-    def normal(self) -> NormalEquations:
-        """Solution for all parameters."""
-        return NormalEquations(self.products)
-
-    @cached_property
-    def loss(self) -> float:
-        """Negative restricted log likelihood, constants left out (Patterson, Thompson, Biometrika
-        58, 1971).
-        """
-        return 0.5 * (self.log_determinant + self.normal.log_determinant + self.normal.cost)
 
     def with_weights(self, weights: FloatArray) -> Posterior:
         """The posterior at other weights (N,) of the white errors."""

@@ -25,9 +25,9 @@ def space_of(seed=1, cut=(4,)):
     adjoints = np.eye(6) + 0.2 * random.standard_normal((n, 6, 6))
     directions = random.standard_normal((N_POSES, 6, 9))
     directions[:, :, :3] = np.eye(6)[:, :3]
-    ahead, behind = np.zeros((2, n, 6, N_STATES))
-    ahead[:, :, :6], behind[:, :, :6] = np.eye(6), adjoints
-    ahead[:, :, 6:15], behind[:, :, 6:15] = directions[1:], adjoints @ directions[:-1]
+    ahead, behind = np.zeros((n, 6, N_STATES - 6)), np.zeros((n, 6, N_STATES))
+    behind[:, :, :6] = adjoints
+    ahead[:, :, :9], behind[:, :, 6:15] = directions[1:], adjoints @ directions[:-1]
     behind[:, :, 15] = random.standard_normal((n, 6))
     lever = random.standard_normal((3, 6))
     twists = random.standard_normal((N_POSES, 6))
@@ -78,7 +78,8 @@ def dense_covariance(space, levels):
             prior[:, state, :, state] = variances[group.variance] * np.exp(-apart)
     entries = np.zeros((n, 6, N_POSES, d))
     for i in range(n):
-        entries[i, :, i + 1], entries[i, :, i] = space.ahead[i], -space.behind[i]
+        entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = np.eye(6), space.ahead[i]
+        entries[i, :, i] = -space.behind[i]
     entries = entries.reshape(6 * n, -1)
     assert len(bases) == space.n_white == 3
     walk = variances[3] * space.walk[0] + variances[4] * space.walk[1]
