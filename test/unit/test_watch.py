@@ -36,8 +36,7 @@ from hand_eye_calib.results.records import (
 )
 from hand_eye_calib.watch import terminal
 from hand_eye_calib.watch.board import AXES, Board, Tone
-from hand_eye_calib.watch.html import fragment
-from hand_eye_calib.watch.web import WebServer
+from hand_eye_calib.watch.web import WebServer, fragment
 
 NODE = "/calibrator"
 INF = float("inf")
