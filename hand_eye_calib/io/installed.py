@@ -39,14 +39,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     text : str
         A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a file of
         another program, one of results/exports.py, a bag with ``/tf_static``, or
-        ``X Y Z ROLL PITCH YAW`` in m and rad.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    ConfigError
-        If it is neither a file nor six numbers.
+        ``X Y Z ROLL PITCH YAW`` in m and rad; an InputError if it cannot be read, a ConfigError if
+        it is neither a file nor six numbers.
     """
     path = Path(text)
     if not os.path.exists(text):

@@ -33,18 +33,9 @@ _Detector = Callable[[Any], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class Target:
-    """A flat target; lengths in metres.
-
-    Attributes
-    ----------
-    kind : str
-        "charuco" or "aprilgrid".
-    columns, rows : int
-        Squares of a ChArUco board, tags of an AprilGrid.
-    size, marker : float
-        Side of a square and of its marker; side of a tag and the gap between two of them.
-    dictionary : str
-        Of the markers, as OpenCV names it without ``DICT_``.
+    """A flat target of kind "charuco" or "aprilgrid": its columns and rows of squares or tags; the
+    sides (m) of a square and its marker, or of a tag and the gap between two; and OpenCV's name of
+    the markers without ``DICT_``.
     """
 
     kind: str
@@ -134,14 +125,8 @@ def read_images(paths: Iterable[Path]) -> Iterable[Any]:
 
 
 def poses_of_target(images: Iterable[Any], target: Target, camera: Camera) -> TargetPoses:
-    """Find the target in grey images, and its pose from its corners.
-
-    Raises
-    ------
-    InputError
-        If no image shows the target.
-    MissingDependencyError
-        If OpenCV is not installed.
+    """Find the target in grey images, and its pose from its corners; an InputError if no image
+    shows it.
     """
     cv2 = _opencv()
     markers = getattr(cv2.aruco, f"DICT_{target.dictionary}", None)

@@ -16,12 +16,8 @@ from hand_eye_calib.io.files import read_bytes
 
 
 def read_urdf(path: str | Path) -> FrameTree:
-    """The frames of a URDF file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, is no URDF, or has xacro in it; one line that says why.
+    """The frames of a URDF file; an InputError if it cannot be read, is no URDF, or has xacro in
+    it.
     """
     data = read_bytes(path)
     try:
@@ -31,8 +27,6 @@ def read_urdf(path: str | Path) -> FrameTree:
 
 
 def _frames(data: bytes) -> FrameTree:
-    if b"<!DOCTYPE" in data:
-        raise InputError("has a document type; expected a plain URDF file")
     if b"<xacro:" in data:
         raise InputError("has xacro macros; give the URDF that xacro makes of it")
     try:

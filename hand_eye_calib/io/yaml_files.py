@@ -49,16 +49,8 @@ class _Loader(_Base):
 
 
 def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
-    """Read a YAML file; ``expected`` is what an error says that it should be.
-
-    Returns
-    -------
-    dict, list, str, float, int, bool or None
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, is not YAML or exceeds a limit; one line that names the file.
+    """Read a YAML file; ``expected`` is what an error says that it should be. An InputError if it
+    cannot be read, is not YAML or exceeds a limit.
     """
     text = read_text(path, expected, LARGEST_YAML)
     # Comments of JSON, header and tag of OpenCV.

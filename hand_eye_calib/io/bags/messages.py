@@ -88,13 +88,6 @@ class Cursor:
             self.number()  # sequence number
         return self.stamp_ns(), self.name()
 
-    def count(self) -> int:
-        """Read the length of an array of poses, each with a header."""
-        count = self.number()
-        if count > len(self.data) // _POSE_SIZE:
-            raise ValueError(f"{count} poses do not fit into {len(self.data)} bytes")
-        return count
-
 
 def _pose(cursor: Cursor) -> Sequence[float]:
     """Position (m) and quaternion."""
@@ -260,7 +253,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> PoseColumns:
     """Unpack the poses of a nav_msgs/Path; raises MALFORMED."""
     cursor = Cursor(data, is_ros1)
     _, world_frame = cursor.header()
-    rows = [(cursor.header()[0], _pose(cursor)) for _ in range(cursor.count())]
+    rows = [(cursor.header()[0], _pose(cursor)) for _ in range(cursor.number())]
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64)
     poses = np.reshape([pose for _, pose in rows], (-1, 7))
     return PoseColumns.of_frames(stamps_ns, poses, world_frame)
@@ -269,7 +262,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> PoseColumns:
 def unpack_transforms(data: Buffer, is_ros1: bool) -> list[PoseFields]:
     """Unpack the transforms of a tf message, frames without a leading slash; raises MALFORMED."""
     cursor, found = Cursor(data, is_ros1), []
-    for _ in range(cursor.count()):
+    for _ in range(cursor.number()):
         stamp_ns, world_frame = cursor.header()
         frames = world_frame.lstrip("/"), cursor.name().lstrip("/")
         values = _pose(cursor)

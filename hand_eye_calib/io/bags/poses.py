@@ -32,26 +32,16 @@ class PoseColumns(NamedTuple):
         """All in the same frames."""
         return cls(stamps_ns, [world] * len(stamps_ns), [sensor] * len(stamps_ns), poses)
 
-    @classmethod
-    def nothing(cls) -> "PoseColumns":
-        """No messages."""
-        return cls(np.empty(0, dtype=np.int64), [], [], np.empty((0, 7)))
+
+NOTHING = PoseColumns(np.empty(0, dtype=np.int64), [], [], np.empty((0, 7)))
 
 
 @dataclass(frozen=True)
 class PoseTable:
-    """N poses of streams in columns, in the order of bag time.
+    """N poses of streams, "parent" or "child", in columns (N,), in the order of bag time.
 
-    Attributes
-    ----------
-    streams : (N,) array of str
-        "parent" or "child".
-    stamps_ns, bag_ns : (N,) int64 arrays
-        Of the header, and when the message was recorded.
-    world_frames, sensor_frames : (N,) arrays of str or None
-        None if the message type does not carry it.
-    poses : (N, 7) array
-        x y z qx qy qz qw.
+    ``stamps_ns`` are of the headers, ``bag_ns`` when the messages were recorded; frames are None if
+    the message type does not carry them; ``poses`` (N, 7) are x y z qx qy qz qw.
     """
 
     streams: NDArray[np.object_]

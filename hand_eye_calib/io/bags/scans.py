@@ -45,8 +45,8 @@ _LEAST_MATCHED = 0.3
 
 
 class Scan(NamedTuple):
-    """Points (N, 3) of one turn of a lidar, m, in its own frame; their times (N,) from 0, the first
-    one's, to 1, the last one's; and the stamp of the last.
+    """Points (N, 3) of one turn of a lidar, m, in its own frame; their times (N,) from 0 to 1, the
+    last one's; and the stamp of the last.
     """
 
     points: FloatArray

@@ -13,7 +13,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.fields import FieldReader
 from hand_eye_calib.io.bags.messages import MessageReader, Run, unpack_path, unpack_transforms
-from hand_eye_calib.io.bags.poses import PoseColumns, PoseTable, are_believable
+from hand_eye_calib.io.bags.poses import NOTHING, PoseColumns, PoseTable, are_believable
 from hand_eye_calib.io.bags.scans import ScanOdometry, unpack_scan
 from hand_eye_calib.io.transforms import TfSource, TfStream
 
@@ -23,8 +23,7 @@ Source = str | TfSource
 class Reading:
     """Reads one stream; there is a subclass for each kind of source.
 
-    ``topics`` are those whose messages it takes, ``notes`` what a person should know, complete with
-    :meth:`table`.
+    ``topics`` are those whose messages it takes, ``notes`` what a person should know in the end.
     """
 
     def __init__(self, stream: str, *topics: str) -> None:
@@ -51,7 +50,7 @@ class TopicReading(Reading):
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
         self._reader = MessageReader(message_type, measures)
-        self._tables = [PoseTable.of_columns(stream, PoseColumns.nothing(), [])]
+        self._tables = [PoseTable.of_columns(stream, NOTHING, [])]
 
     def take(self, run: Run) -> None:
         columns, keep = run.read(self._reader.columns)
@@ -112,7 +111,7 @@ class PathReading(Reading):
         (self._newest,) = run._replace(messages=run.messages[-1:]).each(unpack_path)
 
     def table(self) -> PoseTable:
-        path = self._newest or PoseColumns.nothing()
+        path = self._newest or NOTHING
         if len(path.stamps_ns) > 1 and not path.stamps_ns.any():
             raise InputError(
                 f"the poses of path {self.topics[0]} have no stamps: all are zero; use the "

@@ -24,22 +24,13 @@ from hand_eye_calib.io.bags.mcap_files import (
     reason_of,
     recovered_messages,
 )
-from hand_eye_calib.io.limits import (
-    BLOCK_BYTES,
-    LARGEST_RATIO,
-    SMALLEST_UNPACKED,
-    reading_memory,
-)
+from hand_eye_calib.io.limits import BLOCK_BYTES, LARGEST_RATIO, SMALLEST_UNPACKED, reading_memory
 
 # Messages that are unpacked at once.
 _BLOCK_SIZE = 2048
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
-_REPAIRS = {
-    ".mcap": "'mcap recover'",
-    ".db3": "sqlite3's '.recover'",
-    ".bag": "'rosbag reindex'",
-}
+_REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -111,12 +102,10 @@ class Storage:
         """Iterate over the messages of some topics in the order of bag time, many at once. Chunks
         of mcap that overlap come one after the other.
         """
-        blocks = message_blocks(self._messages(topics))
-        while True:
+        blocks, block = message_blocks(self._messages(topics)), None
+        while block != []:
             with self._guarded():
-                block = next(blocks, None)
-            if block is None:
-                return
+                block = next(blocks, [])
             yield block
 
     def _messages(self, topics: Collection[str]) -> Iterable[Message]:
@@ -143,17 +132,14 @@ class Storage:
         except MissingDependencyError:
             raise
         except Exception as error:
+            why = (
+                f"it is cut off, damaged or of an unsupported kind ({reason_of(error)}); repair it "
+                f"with {_REPAIRS[_suffix(self.path)]}, or record it again"
+            )
             # NoMemError is SQLite's, as rosbags uses it.
             if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
-                raise InputError(
-                    f"cannot read bag {self.path}: reading it takes more memory than any bag "
-                    "should; it is damaged, or was made to do harm"
-                ) from error
-            raise InputError(
-                f"cannot read bag {self.path}: it is cut off, damaged or of an unsupported kind "
-                f"({reason_of(error)}); repair it with {_REPAIRS[_suffix(self.path)]}, or record "
-                "it again"
-            ) from error
+                why = "reading it takes more memory than any bag should; it is damaged, or hostile"
+            raise InputError(f"cannot read bag {self.path}: {why}") from error
 
 
 def rosbags() -> tuple[Any, Any]:
