@@ -244,45 +244,27 @@ def add_noise(
     does not change the others.
     """
     gaussian, drift, jumps = rng.spawn(3)
-    Ts_pw_p, Ts_cw_c = (
-        add_gaussian(poses, noise.gaussian, gaussian, noise.rotation_per_metre)
-        for poses in (Ts_pw_p, Ts_cw_c)
-    )
-    Ts_cw_c = add_drift(Ts_cw_c, noise.drift, drift)
-    Ts_pw_p, Ts_cw_c = (add_jumps(poses, noise.outliers, jumps) for poses in (Ts_pw_p, Ts_cw_c))
-    return Ts_pw_p, Ts_cw_c
+    Ts_pw_p, Ts_cw_c = (_with_gaussian(Ts, noise, gaussian) for Ts in (Ts_pw_p, Ts_cw_c))
+    # So many metres per metre of each step are added to it, along one axis of the sensor.
+    axis = drift.integers(3)
+    lengths = np.linalg.norm(np.diff(Ts_cw_c[:, :3, 3], axis=0), axis=1)
+    steps = noise.drift * lengths[:, None] * Ts_cw_c[:-1, :3, axis]
+    Ts_cw_c[1:, :3, 3] += np.cumsum(steps, axis=0)
+    return _with_jumps(Ts_pw_p, noise.outliers, jumps), _with_jumps(Ts_cw_c, noise.outliers, jumps)
 
 
-def add_gaussian(
-    Ts_world_sensor: FloatArray,
-    level: float,
-    rng: np.random.Generator,
-    rotation_per_metre: float = NoiseConfig.rotation_per_metre,
+def _with_gaussian(
+    Ts_world_sensor: FloatArray, noise: NoiseConfig, rng: np.random.Generator
 ) -> FloatArray:
-    """Poses (N, 4, 4) with an independent error each, in the frame of the sensor: ``level`` is the
-    standard deviation of each translation component, m, and ``level * rotation_per_metre`` that of
-    ZYX Euler angles, rad.
-    """
-    angles = level * rotation_per_metre * rng.standard_normal((len(Ts_world_sensor), 3))
-    translation = level * rng.standard_normal((len(Ts_world_sensor), 3))
-    return Ts_world_sensor @ se3.from_rotation_translation(
-        Rotation.from_euler("ZYX", angles).as_matrix(), translation
-    )
+    """Poses (N, 4, 4) with an independent error each, in the frame of the sensor."""
+    shape = len(Ts_world_sensor), 3
+    angles = noise.gaussian * noise.rotation_per_metre * rng.standard_normal(shape)
+    rotations = Rotation.from_euler("ZYX", angles).as_matrix()
+    translation = noise.gaussian * rng.standard_normal(shape)
+    return Ts_world_sensor @ se3.from_rotation_translation(rotations, translation)
 
 
-def add_drift(Ts_world_sensor: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:
-    """Poses (N, 4, 4) with ``rate`` (m per m) times the length of each step added to it, along one
-    axis of the sensor drawn once.
-    """
-    axis = rng.integers(3)
-    lengths = np.linalg.norm(np.diff(Ts_world_sensor[:, :3, 3], axis=0), axis=1)
-    steps = rate * lengths[:, None] * Ts_world_sensor[:-1, :3, axis]
-    drifted = Ts_world_sensor.copy()
-    drifted[1:, :3, 3] += np.cumsum(steps, axis=0)
-    return drifted
-
-
-def add_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
+def _with_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
     """Poses (N, 4, 4) whose rest is shifted along the axes of the world at ``round(share * N)`` of
     them, drawn with replacement.
     """

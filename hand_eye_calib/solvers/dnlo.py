@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnl, quadratic_form
@@ -78,7 +78,9 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
     Solution
         ``objective`` is eq. (5) with the outliers' c included; ``weights`` are alpha.
     """
-    searched = pairs[_searched(len(pairs))]
+    searched = pairs
+    if len(pairs) > _MAX_SEARCHED:
+        searched = pairs[np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)]
     floor = min_inlier_fraction * len(searched)
     T = _Search(quadratic_form.condense(searched), threshold, floor).best(searched)
     return _improved(pairs, T, threshold, min_inlier_fraction * len(pairs))
@@ -122,8 +124,7 @@ def solve_without(
     """Solve again without some of the pairs, for resampling.
 
     A few pairs less may change the choice of the inliers and with it the answer. So the search
-    starts both at the full answer and by annealing. As in :func:`solve`, an even sample of many
-    pairs is searched, and the answers are then improved on all.
+    starts both at the full answer and by annealing.
 
     Parameters
     ----------
@@ -134,27 +135,13 @@ def solve_without(
     left_out : (B, K) bool array
         Pairs to leave out, for each of B answers (B, 4, 4).
     """
-    near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
-    condensed, some = quadratic_form.condense(pairs), _searched(len(pairs))
-    # Of all that is found near the full answer and by annealing: one row's answer may suit another
-    # row better than its own.
-    rows = left_out[:, some]
-    fewest = min_inlier_fraction * float((~rows).sum(axis=1).min())
-    search = _Search(condensed[some], threshold, fewest)
-    everything = near
+    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    search = _Search(quadratic_form.condense(pairs), threshold, fewest)
+    everything = near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
     for _ in range(_STEPS_OVER_ALL):
-        everything = search.refit((~rows).astype(float), everything)
-    starts, twice = np.concatenate([near, search.anneal(everything, rows)]), np.tile(rows, (2, 1))
-    candidates, _ = search.settle(starts, _SETTLED, twice)
-    costs = search.costs(candidates)
-    rival = candidates[[np.argmin(truncate(costs[:, ~row], threshold, fewest)[1]) for row in rows]]
-    # The sample may be wrong about which of two minima is lower: all pairs decide between the best
-    # and the one nearby.
-    whole = _Search(
-        condensed, threshold, min_inlier_fraction * float((~left_out).sum(axis=1).min())
-    )
-    rivals, twice = np.concatenate([near, rival]), np.tile(left_out, (2, 1))
-    answers, objectives = whole.settle(rivals, _CONVERGED, twice)
+        everything = search.refit((~left_out).astype(float), everything)
+    starts = np.concatenate([near, search.anneal(everything, left_out)])
+    answers, objectives = search.settle(starts, _CONVERGED, np.tile(left_out, (2, 1)))
     nearby, other = np.split(answers, 2)
     return np.where(np.less(*np.split(objectives, 2))[:, None, None], nearby, other)
 
@@ -180,13 +167,6 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
     return weights, np.einsum("...k,...k", weights, costs) + threshold * (
         costs.shape[-1] - weights.sum(axis=-1)
     )
-
-
-def _searched(n_pairs: int) -> slice | IntArray:
-    """Index of the pairs that are searched: all, or an even sample."""
-    if n_pairs <= _MAX_SEARCHED:
-        return slice(None)
-    return np.linspace(0, n_pairs - 1, _MAX_SEARCHED).astype(int)
 
 
 @dataclass(frozen=True)

@@ -110,19 +110,19 @@ class TestKeyframes:
         poses = np.array(poses)
         return PosePairs(np.arange(10) * 10**8, poses, poses)
 
-    def test_no_threshold_keeps_everything(self):
-        assert select_keyframes(self.straight_then_turning(), 0, 0, 0).tolist() == list(range(10))
-
-    def test_each_criterion_works_alone(self):
-        poses = self.straight_then_turning()
-        assert select_keyframes(poses, 0.199, 0, 0).tolist() == [0, 2, 4]
-        assert select_keyframes(poses, 0, 0.399, 0).tolist() == [0, 6, 8]
-        assert select_keyframes(poses, 0, 0, 0.3).tolist() == [0, 3, 6, 9]
-
-    def test_moving_or_turning_is_enough_but_the_interval_must_pass(self):
-        poses = self.straight_then_turning()
-        assert select_keyframes(poses, 0.199, 0.399, 0).tolist() == [0, 2, 4, 6, 8]
-        assert select_keyframes(poses, 0.199, 0.399, 0.4).tolist() == [0, 4, 8]
+    @pytest.mark.parametrize(
+        ("thresholds", "expected"),
+        [
+            ((0, 0, 0), list(range(10))),
+            ((0.199, 0, 0), [0, 2, 4]),
+            ((0, 0.399, 0), [0, 6, 8]),
+            ((0, 0, 0.3), [0, 3, 6, 9]),
+            ((0.199, 0.399, 0), [0, 2, 4, 6, 8]),
+            ((0.199, 0.399, 0.4), [0, 4, 8]),
+        ],
+    )
+    def test_moving_or_turning_is_enough_but_the_interval_must_pass(self, thresholds, expected):
+        assert select_keyframes(self.straight_then_turning(), *thresholds).tolist() == expected
 
     def test_selection_goes_on_where_it_stopped(self):
         poses = self.straight_then_turning()

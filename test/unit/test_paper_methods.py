@@ -9,11 +9,10 @@ from scipy.optimize import approx_fprime, check_grad, minimize
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.assessment.metrics import absolute_errors
-from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import ali, park, zhuang
-from reproduction import ali_as_published, published
+from reproduction import ali_as_published
 from reproduction.metrics import relative_errors
 
 TRUTH = se3.exp(np.array([0.4, -0.2, 0.7, 0.9, -0.5, 1.1]))
@@ -180,18 +179,3 @@ def test_ali_as_published_fits_a_matrix_that_is_no_rotation(noisy):
         squared_translation_residual(noisy, *split(TRUTH)), rel=1e-10
     )
     assert ali_as_published.solve(noisy).objective > ali.solve(noisy).objective
-
-
-# The reader of the published data
-
-
-HEADER = "algorithm,method,err_tr,err_R,abs_tr,abs_R,T\n"
-ROW = 'Park,B1,1,1,1,1,"[[1 0 0 0]\n [0 1 0 0]\n [0 0 1 0]\n [0 0 0 1]]"\n'
-
-
-def test_trajectories_that_do_not_go_with_the_results_are_told(tmp_path):
-    for name in ("published", "simulation_tests/mixture"):
-        (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "published" / "simulation_tests_mixture.csv").write_text(HEADER + ROW)
-    with pytest.raises(InputError, match=r"trajectories of mixture do not go .* \(found 0\)"):
-        published.load_simulated(tmp_path, ["mixture"])

@@ -16,7 +16,6 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.simulation import drive as noise
 from hand_eye_calib.simulation.drive import simulate_drive, surface
 from hand_eye_calib.simulation.options import (
     HILLY_DRIVE,
@@ -26,25 +25,6 @@ from hand_eye_calib.simulation.options import (
     DriveConfig,
     NoiseConfig,
 )
-
-N_PUBLISHED = 38
-
-
-def rng(seed=0):
-    return np.random.default_rng(seed)
-
-
-def still(count):
-    """Trajectory that does not move, with one orientation that is not the identity."""
-    rotation = Rotation.from_euler("ZYX", [0.4, -0.3, 1.1]).as_matrix()
-    return np.tile(se3.from_rotation_translation(rotation, [1.0, -2.0, 0.5]), (count, 1, 1))
-
-
-def errors_of(noisy, clean):
-    """Per-pose errors in the sensor's frame: translation and ZYX Euler angles."""
-    difference = se3.inverse(clean) @ noisy
-    return difference[:, :3, 3], Rotation.from_matrix(difference[:, :3, :3]).as_euler("ZYX")
-
 
 # --- the drive ------------------------------------------------------------------------
 
@@ -99,47 +79,6 @@ def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
 def test_impossible_options_are_refused():
     with pytest.raises(ConfigError, match="outliers"):
         NoiseConfig(outliers=1.5)
-
-
-# --- noise ----------------------------------------------------------------------------
-
-
-def test_gaussian_noise_has_standard_deviations_a_and_2a_and_is_white():
-    clean = still(20000)
-    translation, angles = errors_of(noise.add_gaussian(clean, 0.01, rng()), clean)
-    np.testing.assert_allclose(translation.std(axis=0), 0.01, rtol=0.03)
-    np.testing.assert_allclose(angles.std(axis=0), 0.02, rtol=0.03)
-    for values in (translation, angles):
-        assert np.abs(values.mean(axis=0)).max() < 5e-4
-        lagged = (values[1:] * values[:-1]).mean(axis=0) / values.var(axis=0)
-        assert np.abs(lagged).max() < 0.03
-
-
-def test_jumps_last_and_have_variance_002_along_world_axes():
-    clean = still(4000)
-    jumped = noise.add_jumps(clean, 0.05, rng())
-    np.testing.assert_array_equal(jumped[:, :3, :3], clean[:, :3, :3])
-    shifts = np.diff(jumped[:, :3, 3] - clean[:, :3, 3], axis=0, prepend=0.0)
-    jumping = np.abs(shifts).max(axis=1) > 1e-12
-    assert 185 <= jumping.sum() <= 200  # 200 draws, a few of them of the same pose
-    np.testing.assert_allclose(shifts[jumping].var(axis=0), 0.02, rtol=0.35)
-    assert noise.add_jumps(clean[:100], 0.0, rng()) == pytest.approx(clean[:100], abs=0)
-
-
-def test_drift_lengthens_every_step_along_one_axis_of_the_sensor():
-    poses = simulate_drive(3).child.poses
-    drifted = noise.add_drift(poses, 0.05, rng())
-    steps, drifted_steps = (
-        motion_pairs(stack, stack, "B1").Ts_parenti_parentj for stack in (poses, drifted)
-    )
-    np.testing.assert_allclose(drifted_steps[:, :3, :3], steps[:, :3, :3], atol=1e-12)
-    added = drifted_steps[:, :3, 3] - steps[:, :3, 3]
-    axis = np.argmax(np.abs(added).sum(axis=0))
-    np.testing.assert_allclose(
-        added[:, axis], 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1), rtol=1e-9
-    )
-    np.testing.assert_allclose(np.delete(added, axis, axis=1), 0.0, atol=1e-12)
-    np.testing.assert_array_equal(drifted[0], poses[0])
 
 
 # --- against the published trajectories -----------------------------------------------
