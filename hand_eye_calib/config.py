@@ -11,12 +11,7 @@ from typing import Any, Self
 
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.methods import BACKENDS, METHODS
-from hand_eye_calib.option import OptionField as OptionField
-from hand_eye_calib.option import OptionSet as OptionSet
-from hand_eye_calib.option import check_value as check_value
-from hand_eye_calib.option import did_you_mean as did_you_mean
-from hand_eye_calib.option import option as option
-from hand_eye_calib.option import option_name as option_name
+from hand_eye_calib.option import OptionSet, option
 from hand_eye_calib.text import (
     AXIS_UNITS,
     parse_prior,

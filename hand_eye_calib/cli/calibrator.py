@@ -5,7 +5,8 @@ import dataclasses
 import json
 import textwrap
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.option import option_name
 
 _INTERFACE = """\
 examples:

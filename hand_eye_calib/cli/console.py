@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from hand_eye_calib.config import CalibratorConfig, option_name
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import printable
+from hand_eye_calib.option import option_name
 
 _Item = TypeVar("_Item")
 

@@ -15,9 +15,9 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from hand_eye_calib.cli.console import as_typed, fail
-from hand_eye_calib.config import did_you_mean
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.limits import limit_memory
+from hand_eye_calib.option import did_you_mean
 from hand_eye_calib.text import shown_value
 
 EXIT_FAILED, EXIT_USAGE = 1, 2

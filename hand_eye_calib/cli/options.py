@@ -14,16 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.cli.console import OPTION_FIELDS, STREAMS, flag, note
-from hand_eye_calib.config import (
-    PAIR_BY,
-    STAMP_UNITS,
-    TRAJECTORY_FORMATS,
-    NodeConfig,
-    check_value,
-    did_you_mean,
-    option_name,
-)
+from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS, NodeConfig
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.option import check_value, did_you_mean, option_name
 from hand_eye_calib.text import split_frames
 
 Options = dict[str, Any]

@@ -13,15 +13,9 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from hand_eye_calib.config import (
-    CalibratorConfig,
-    NodeConfig,
-    OptionField,
-    check_value,
-    did_you_mean,
-    option_name,
-)
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.option import OptionField, check_value, did_you_mean, option_name
 
 FIELDS: dict[str, OptionField] = {
     option_name(field): field

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from hand_eye_calib.config import OptionSet, option
+from hand_eye_calib.option import OptionSet, option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import yaml
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.option import option_name
 
 PROJECT = Path(__file__).resolve().parents[2]
 HEADER = """\

@@ -31,9 +31,10 @@ from ros_harness import (
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import has_session
+from hand_eye_calib.option import option_name
 
 PROJECT = Path(__file__).resolve().parents[2]
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]

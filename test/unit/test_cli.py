@@ -26,11 +26,12 @@ from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.present import as_text
-from hand_eye_calib.config import CalibratorConfig, option_name
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result
+from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.records import Finding, Severity
 from hand_eye_calib.text import told_apart

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from hand_eye_calib.cli.main import COMMANDS, main, module_of
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, option_name
+from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.io import limits
+from hand_eye_calib.option import option_name
 
 ROOT = Path(__file__).resolve().parents[2]
 NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
