@@ -18,6 +18,7 @@ from hand_eye_calib.geometry.extrinsic import (
     sigmas_translation,
 )
 from hand_eye_calib.plain import plain
+from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.results.document import MATRICES, NOT_IN_FILES, values_of
 from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
@@ -30,7 +31,6 @@ from hand_eye_calib.results.status import (
     SolveStatus,
     by_hand,
 )
-from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
 from hand_eye_calib.upstairs import upstairs
 
@@ -407,8 +407,6 @@ class Calibration(Result):
                 f"expected format {_FORMAT}, version {_VERSION}; "
                 f"found format {found[0]}, version {found[1]}"
             )
-        # Version 0.1 had another name for it.
-        data = {"cross_check": data.get("consistency")} | dict(data)
         try:
             return cls(**values_of(cls, data))
         except KeyError as error:

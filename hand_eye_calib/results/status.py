@@ -27,13 +27,9 @@ class SolveStatus(str, Enum):
     @property
     def failure(self) -> str:
         """Why nothing of a result may be used; empty unless the solve failed."""
-        return _FAILURES.get(self, "")
-
-
-_FAILURES = {
-    SolveStatus.NOT_CONVERGED: "the solver did not converge",
-    SolveStatus.CONTRADICTED: "a prior contradicts the motion",
-}
+        if self is SolveStatus.NOT_CONVERGED:
+            return "the solver did not converge"
+        return "a prior contradicts the motion" if self is SolveStatus.CONTRADICTED else ""
 
 
 class DofVerdict(str, Enum):

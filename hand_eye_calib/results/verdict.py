@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.methods import METHODS
@@ -195,41 +196,31 @@ def _nothing_known(result: Result) -> Iterator[_Found]:
         yield text, "record motion with rotations about all axes", (), {}
 
 
-def _findings_of(severity: Severity) -> Callable[[Result], Iterator[_Found]]:
-    def find(result: Result) -> Iterator[_Found]:
-        for finding in result.findings:
-            if finding.severity is severity:
-                yield finding.what, finding.advice, (), finding.options
-
-    return find
+def _findings_of(severity: Severity, result: Result) -> Iterator[_Found]:
+    for finding in result.findings:
+        if finding.severity is severity:
+            yield finding.what, finding.advice, (), finding.options
 
 
-def _contradiction(kind: str) -> Callable[[Result], Iterator[_Found]]:
+def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
     """Other answers (``kind``: halves or methods) that lie farther away than they may."""
-
-    def find(result: Result) -> Iterator[_Found]:
-        told, sigmas = {}, []
-        for axis in _axes(result):
-            row = (result.cross_check or {}).get(axis.name)
-            scatter, excess = (getattr(row, f"{what}of_{kind}", None) for what in ("", "excess_"))
-            if row is None or scatter is None or not math.isfinite(axis.sigma):
-                continue
-            of_target = scatter / axis.target
-            if excess is None:  # in a file of version 0.1
-                excess = scatter / max(axis.sigma, 1e-12)
-            is_far = excess > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
-            if kind == "methods" and (row.excess_over_own or 0.0) > CONTRADICTED_SIGMAS:
-                is_far |= of_target > CONTRADICTED_TARGETS
-            if is_far:
-                told[axis.name] = f"about {axes_in_words([axis.name])} by "
-                told[axis.name] += amount(axis.name, scatter)
-                sigmas.append(f"+/- {amount(axis.name, axis.sigma)}")
-        if told:
-            who, advice = _OTHERS[kind]
-            differ = f"{who} disagree {listing([*told.values()])}"
-            yield f"{differ}; this result claims {listing(sigmas)}", advice, tuple(told), {}
-
-    return find
+    told, sigmas = {}, []
+    for axis in _axes(result):
+        row = (result.cross_check or {}).get(axis.name)
+        scatter, excess = (getattr(row, f"{what}of_{kind}", None) for what in ("", "excess_"))
+        if row is None or scatter is None or not math.isfinite(axis.sigma):
+            continue
+        of_target = scatter / axis.target
+        is_far = (excess or 0.0) > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
+        if kind == "methods" and (row.excess_over_own or 0.0) > CONTRADICTED_SIGMAS:
+            is_far |= of_target > CONTRADICTED_TARGETS
+        if is_far:
+            told[axis.name] = f"about {axes_in_words([axis.name])} by {amount(axis.name, scatter)}"
+            sigmas.append(f"+/- {amount(axis.name, axis.sigma)}")
+    if told:
+        who, advice = _OTHERS[kind]
+        differ = f"{who} disagree {listing([*told.values()])}"
+        yield f"{differ}; this result claims {listing(sigmas)}", advice, tuple(told), {}
 
 
 def _hidden(result: Result) -> Iterator[_Found]:
@@ -285,14 +276,10 @@ _OF_RECORDINGS = {
 }
 
 
-def _recordings(*kinds: str) -> Callable[[Result], Iterator[_Found]]:
+def _recordings(kinds: Sequence[str], result: Result) -> Iterator[_Found]:
     """Several recordings that belong together in one of these ways."""
-
-    def find(result: Result) -> Iterator[_Found]:
-        if result.together and result.together.kind in kinds:
-            yield result.together.sentence, _OF_RECORDINGS[result.together.kind], (), {}
-
-    return find
+    if result.together and result.together.kind in kinds:
+        yield result.together.sentence, _OF_RECORDINGS[result.together.kind], (), {}
 
 
 class _Axis(NamedTuple):
@@ -334,20 +321,11 @@ def _known(result: Result) -> str:
     )
 
 
-def _condition(kind: str) -> str:
-    text = (
-        f"{_OTHERS[kind][0]} differ by more than {CONTRADICTED_SIGMAS:g} joint "
-        f"standard deviations and {CONTRADICTED_SHARE:g} of the target"
-    )
-    if kind == "methods":
-        text += (
-            f"; or those about as certain by {CONTRADICTED_SIGMAS:g} of the result's own and "
-            f"{CONTRADICTED_TARGETS:g} targets"
-        )
-    return text
-
-
 _NEVER, _CARE = Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE
+_APART = (
+    f"differ by more than {CONTRADICTED_SIGMAS:g} joint standard deviations and "
+    f"{CONTRADICTED_SHARE:g} of the target"
+)
 
 RULES = (
     Rule("not_converged", _NEVER, "the solver did not converge", _not_converged),
@@ -358,24 +336,46 @@ RULES = (
         "lever arm of more than 50 m",
         _contradicted,
     ),
-    Rule("error_finding", _NEVER, "a stream check found an error", _findings_of(Severity.ERROR)),
+    Rule(
+        "error_finding",
+        _NEVER,
+        "a stream check found an error",
+        partial(_findings_of, Severity.ERROR),
+    ),
     Rule("nothing_known", _NEVER, "all six axes are unobservable", _nothing_known),
     Rule(
         "recordings_differ",
         _NEVER,
         "of several recordings two differ and there is no third, or the mount has moved between "
         "them",
-        _recordings("differ", "moved"),
+        partial(_recordings, ("differ", "moved")),
     ),
     Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
-    Rule("warning_finding", _CARE, "a stream check gave a warning", _findings_of(Severity.WARNING)),
+    Rule(
+        "warning_finding",
+        _CARE,
+        "a stream check gave a warning",
+        partial(_findings_of, Severity.WARNING),
+    ),
     Rule(
         "recordings",
         _CARE,
         "of several recordings one is off and left out, or all scatter more than usual",
-        _recordings("one off", "scatter"),
+        partial(_recordings, ("one off", "scatter")),
     ),
-    *(Rule(kind, _CARE, _condition(kind), _contradiction(kind)) for kind in _OTHERS),
+    Rule(
+        "halves",
+        _CARE,
+        f"the two halves of the recording {_APART}",
+        partial(_contradiction, "halves"),
+    ),
+    Rule(
+        "methods",
+        _CARE,
+        f"other methods and references {_APART}; or those about as certain by "
+        f"{CONTRADICTED_SIGMAS:g} of the result's own and {CONTRADICTED_TARGETS:g} targets",
+        partial(_contradiction, "methods"),
+    ),
     Rule(
         "outliers",
         _CARE,

@@ -71,9 +71,6 @@ def test_answers_to_good_data_agree_and_few_or_odd_ones_do_not_count(answers):
     kept = dataclasses.replace(calibration, cross_check=found)
     document = json.loads(json.dumps(kept.to_dict()))
     assert Calibration.from_dict(document).cross_check == found
-    # Version 0.1 called it otherwise.
-    document["consistency"] = document.pop("cross_check")
-    assert Calibration.from_dict(document).cross_check == found
 
 
 def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answers):

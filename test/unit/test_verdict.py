@@ -191,17 +191,6 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
     )
 
 
-def test_a_result_of_version_0_1_has_a_verdict():
-    document = good(cross_check=checked("x", 0.012, None, "halves")).to_dict()
-    for name in ("verdict", "headline", "reasons", "findings", "contradictions"):
-        del document[name]
-    for row in document["cross_check"].values():
-        for name in [name for name in row if name.startswith("excess")]:
-            del row[name]
-    read = Calibration.from_dict(document)
-    assert [reason.rule for reason in read.reasons] == ["halves"]
-
-
 def test_a_file_keeps_what_the_verdict_comes_from():
     result = good(**CASES["error_finding"] | CASES["target"])
     document = result.to_dict()
