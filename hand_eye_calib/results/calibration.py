@@ -18,7 +18,6 @@ from hand_eye_calib.geometry.extrinsic import (
     sigmas_translation,
 )
 from hand_eye_calib.plain import plain
-from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.results.document import MATRICES, NOT_IN_FILES, values_of
 from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
@@ -31,6 +30,7 @@ from hand_eye_calib.results.status import (
     SolveStatus,
     by_hand,
 )
+from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
 from hand_eye_calib.upstairs import upstairs
 
