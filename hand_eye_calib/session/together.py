@@ -156,20 +156,19 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         told = "; ".join(f"{name}: {why}" for name, why in unfit.items())
         raise InputError(f"no recording can be used: {told or 'there is none'}")
     found = agreement_of_results([*fit.values()])
-    names = [*fit]
+    names, unknown = [*fit], dict.fromkeys(results, np.full((2, 6), np.nan))
     unfit |= {names[index]: "it does not belong to the others" for index in found.apart}
     used = [each for name, each in fit.items() if name not in unfit]
-    unknown = dict.fromkeys(results, np.full(6, np.nan))
-    deviations = unknown | dict(zip(names, found.deviations, strict=True))
-    sigmas = unknown | dict(zip(names, found.sigmas, strict=True))
+    pairs = np.stack([found.deviations, found.sigmas], axis=1)
+    beside = unknown | dict(zip(names, pairs, strict=True))
     records = tuple(
         Recorded(
             name=name,
             verdict=each.verdict.value,
             headline=each.headline,
             left_out=unfit.get(name, ""),
-            deviations=_by_axis(deviations[name]),
-            sigmas=_by_axis(sigmas[name]),
+            deviations=_by_axis(beside[name][0]),
+            sigmas=_by_axis(beside[name][1]),
             time_offset_s=each.time_offset_s,
             scale=each.scale,
             n_poses=each.n_poses,
@@ -177,10 +176,11 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         )
         for name, each in results.items()
     )
-    evidence = {name: getattr(found, name) for name in ("chi2", "dof", "p_value")}
     record = Together(
-        **evidence,
         kind=found.kind,
+        chi2=found.chi2,
+        dof=found.dof,
+        p_value=found.p_value,
         sentence=found.sentence(names),
         scatter=_by_axis(found.scatter),
         recordings=records,
