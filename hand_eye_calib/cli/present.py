@@ -22,7 +22,6 @@ from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.tables import summary
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
-    amount,
     axes_in_words,
     listing,
     printed_angle,
@@ -35,10 +34,6 @@ if TYPE_CHECKING:
 _EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
 _WIDTH = 100
 _ROTATIONS = ("roll", "pitch", "yaw")
-_SCATTER = {
-    "of_methods": "scatter of other methods and references",
-    "of_halves": "scatter of the two halves of the recording",
-}
 
 
 def deliver(
@@ -220,14 +215,6 @@ def _details(calibration: Calibration) -> Iterator[str]:
         groups.setdefault(word, []).append(dof.name)
     told = "; ".join(f"{axes_in_words(names)} {words}" for words, names in groups.items())
     yield f"along and about the axes of {calibration.parent_frame}: {told}"
-    for kind, title in _SCATTER.items():
-        scatter = {
-            axis: getattr(row, kind) for axis, row in (calibration.cross_check or {}).items()
-        }
-        known = {axis: value for axis, value in scatter.items() if value is not None}
-        if known:
-            each = [f"{axes_in_words([axis])} {amount(axis, known[axis])}" for axis in known]
-            yield f"{title}: {', '.join(each)}"
     yield from _comparisons(calibration)
     for name, value in summary(calibration).items():
         yield f"{name}: {value}"

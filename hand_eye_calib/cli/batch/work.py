@@ -184,7 +184,7 @@ class Outcome(NamedTuple):
             row |= row_of_result(found) | {"warnings": "; ".join(found["warnings"])}
             row["findings"] = " ".join(finding.code for finding in result.findings)
         code = exit_code(result) if result and not error else 1
-        return cls(row, code, json.dumps(whole, separators=(",", ":")), page)
+        return cls(row, code, json.dumps(whole, separators=(",", ":")), as_given(page))
 
     @property
     def calibration(self) -> Calibration:
