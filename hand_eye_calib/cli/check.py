@@ -12,9 +12,7 @@ from hand_eye_calib.cli.options import (
     options_from,
     sources_from,
 )
-from hand_eye_calib.cli.present import wrapped
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.results.verdict import Verdict
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
@@ -116,6 +114,8 @@ def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -
 
 def _verdict(findings: "Sequence[Finding]") -> str:
     """What the findings mean for a calibration with these streams, in one sentence."""
+    from hand_eye_calib.results.verdict import Verdict
+
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:
         return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
@@ -132,6 +132,8 @@ def _verdict(findings: "Sequence[Finding]") -> str:
 
 def _table(findings: "Sequence[Finding]") -> Iterator[str]:
     """Lines of the findings, in their order."""
+    from hand_eye_calib.cli.present import wrapped
+
     if not findings:
         yield "No findings."
     for finding in findings:
