@@ -9,7 +9,6 @@ import contextlib
 import os
 import pickle
 import queue
-import select
 import signal
 import subprocess
 import sys
@@ -222,12 +221,14 @@ class SolvingProcess:
 
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
+            began_s = time.monotonic()
             try:
                 found = self._answer(job)
-            except (EOFError, OSError, pickle.UnpicklingError) as error:
+            except (EOFError, OSError, pickle.UnpicklingError):
                 if self._is_stopping:
                     return
-                found = Answer(job.session, 0.0, failure=self._restart(error))
+                failure = self._restart(time.monotonic() - began_s >= HANGS_AFTER_S)
+                found = Answer(job.session, 0.0, failure=failure)
             self._answers.put(found)
             if not self._is_stopping:
                 self._on_answer()
@@ -237,18 +238,21 @@ class SolvingProcess:
         to, back = self._process.stdin, self._process.stdout
         assert to is not None
         assert back is not None
-        pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
-        to.flush()
-        if not select.select([back], [], [], HANGS_AFTER_S)[0]:
-            raise TimeoutError
-        found: Answer = pickle.load(back)
+        killer = threading.Timer(HANGS_AFTER_S, self._process.kill)
+        killer.daemon = True
+        killer.start()
+        try:
+            pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
+            to.flush()
+            found: Answer = pickle.load(back)
+        finally:
+            killer.cancel()
         return found
 
-    def _restart(self, error: Exception) -> Failure:
-        """Start the process again; returns how it ended."""
-        hangs = isinstance(error, TimeoutError)
+    def _restart(self, hangs: bool) -> Failure:
+        """Start the process again, which has died or was killed; returns how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.0 if hangs else _LAST_BREATH_S)
+            self._process.wait(_LAST_BREATH_S)
         self._process.kill()
         self._process.communicate()
         code = self._process.returncode
