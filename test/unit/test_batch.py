@@ -192,6 +192,10 @@ def test_a_recording_of_which_workers_die_takes_no_other_along():
     assert found == dict.fromkeys(NAMES[:-1], "done")
 
 
+def test_where_all_is_done_no_worker_starts():
+    assert list(outcomes([], 2)) == []
+
+
 def ended(pidfd, within_s=120):
     """Wait for a process to end."""
     return bool(select.select([pidfd], [], [], within_s)[0])

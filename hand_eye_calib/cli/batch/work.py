@@ -237,7 +237,7 @@ def outcomes(
 
     If a worker dies, those tasks that may be to blame are done again one by one, and then the rest.
     """
-    waiting = [[*tasks]]
+    waiting = [[*tasks]] if tasks else []
     while waiting:
         some, lost = waiting.pop(0), dict[str, str]()
         with _cluster(dask) if dask else _processes(min(jobs, len(some))) as executor:
