@@ -246,14 +246,6 @@ def test_both_sensors_from_transforms(tmp_path):
     }
 
 
-def test_a_gap_in_a_chain_is_not_bridged(tmp_path):
-    holey = PARENT[(np.arange(120) < 40) | (np.arange(120) >= 60)]
-    steady = Trajectory(PARENT.stamps_ns[::2], np.repeat(np.eye(4)[None], 60, axis=0))
-    moving = [("base", "odom", holey), ("odom", "map", steady)]
-    path = write_messages(tmp_path / "bag", transforms(moving))
-    assert len(hec.read_trajectory(path, tf="map:base")) == 50
-
-
 @pytest.mark.parametrize(
     ("edges", "message"),
     [

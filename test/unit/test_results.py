@@ -156,9 +156,8 @@ def test_the_file_says_where_it_came_from(tmp_path):
 AWKWARD = {"parent_frame": 'li"dar & <${x}>', "child_frame": "caméra -- 'left' \\ side"}
 
 
-@pytest.mark.parametrize("frames", [{}, AWKWARD])
-def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path, frames):
-    written = good_calibration(**frames)
+def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path):
+    written = good_calibration(**AWKWARD)
     save_result(written, tmp_path)
     root = ElementTree.parse(tmp_path / "extrinsic.urdf.xacro").getroot()
     (joint,) = root
@@ -177,9 +176,8 @@ def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path, frames):
     np.testing.assert_array_equal(xyz, written.T_parent_child[:3, 3])
 
 
-@pytest.mark.parametrize("frames", [{}, AWKWARD])
-def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path, frames):
-    written = good_calibration(**frames)
+def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
+    written = good_calibration(**AWKWARD)
     save_result(written, tmp_path)
     text = (tmp_path / "static_transform.launch.py").read_text(encoding="utf-8")
     compile(text, "static_transform.launch.py", "exec")
@@ -260,12 +258,6 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
         save_result(calibration(objective=2.0), tmp_path)
     assert path.read_bytes() == before
     assert sorted(os.listdir(tmp_path)) == FILES
-
-
-def test_a_directory_that_cannot_be_made(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot write .*file"):
-        save_result(calibration(), tmp_path / "file")
 
 
 def edited(**changes):

@@ -6,7 +6,6 @@ from bag_making import TF, tf_message, write_messages
 
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import FrameTree
 from hand_eye_calib.io.installed import open_installed
 from hand_eye_calib.io.urdf import read_urdf
 
@@ -58,14 +57,6 @@ def test_what_is_not_understood_is_refused(urdf, old, new, frames, text):
     urdf.write_text(URDF.replace(old, new))
     with pytest.raises(InputError, match=text):
         read_urdf(urdf).pose(*frames)
-
-
-def test_a_loop_of_frames_is_refused():
-    loop = FrameTree()
-    loop.add("b", "a", np.eye(4))
-    loop.add("a", "b", np.eye(4))
-    with pytest.raises(InputError, match="form a loop"):
-        loop.pose("a", "b")
 
 
 def test_installed_from_numbers_and_descriptions(urdf):

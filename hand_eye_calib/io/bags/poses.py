@@ -72,7 +72,8 @@ class PoseTable:
         """The rows of one or more tables in the order of bag time."""
         columns = zip(*(vars(table).values() for table in tables), strict=True)
         whole: Any = [*map(np.concatenate, columns)]
-        return cls(*whole)[np.argsort(whole[-1], kind="stable")]
+        table, is_sorted = cls(*whole), (np.diff(whole[-1]) >= 0).all()
+        return table if is_sorted else table[np.argsort(whole[-1], kind="stable")]
 
     def trajectory(self) -> Trajectory:
         """Poses of one stream in the order of stamps; of those with equal stamps the first."""

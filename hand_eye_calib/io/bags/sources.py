@@ -64,12 +64,13 @@ class TopicReading(Reading):
                 f"{name}: {(~is_right).sum()} stamps jump away and back against the bag's own "
                 "time; their poses were left out, the bag may be damaged"
             )
+            table = table[is_right]
         if without := self._reader.n_left_out:
             self.notes.append(
                 f"{name}: {without} messages without a fix, or without what they were read for, "
                 "were left out"
             )
-        return table[is_right]
+        return table
 
 
 class JoinedReading(Reading):
