@@ -435,8 +435,6 @@ TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child
     ("argument", "told"),
     [
         ("respawn:=yes", "respawn must be true or false; got 'yes'"),
-        ("use_sim_time:=on", "use_sim_time must be true or false; got 'on'"),
-        ("report:=yes", "report must be true or false; got 'yes'"),
         ("min_pairs:=3.5", "min_pairs must be a whole number; got '3.5'"),
         ("method:=magic", "method must be one of "),
     ],
