@@ -126,7 +126,7 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     streams, posterior, columns = problem.streams, problem.posterior(fit), problem.columns
     normal = posterior.normal
     n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
-    misfit = normal.cost / max(streams.n_rows * n_evidence - 6 - len(columns), 1)
+    misfit = float(normal.cost) / max(streams.n_rows * n_evidence - 6 - len(columns), 1)
     # Steps smaller than predicted do not make what was learned over long baselines more certain.
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
@@ -150,6 +150,6 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
         part_products=posterior.part_products(),
-        objective=0.5 * (posterior.log_determinant + normal.cost),
+        objective=0.5 * (posterior.log_determinant + float(normal.cost)),
         converged=is_settled(problem, fit),
     )

@@ -27,6 +27,10 @@ class NormalEquations:
         Zero along these directions, too.
     is_complete : (...) bool array
         Whether there are none.
+    cost : (...) array
+        Weighted squared residual after the step.
+    log_determinant : (...) array
+        Of the information.
     """
 
     def __init__(self, products: FloatArray) -> None:
@@ -41,18 +45,8 @@ class NormalEquations:
         self.covariance = self._root @ transposed(self._root)
         self.is_complete = self._seen.all(axis=-1)
         self.step = -(self.covariance @ gradient[..., None])[..., 0]
-        self._costs = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
-        self._log_determinants = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(axis=-1)
-
-    @property
-    def cost(self) -> float:
-        """Weighted squared residual of one system after the step."""
-        return float(self._costs)
-
-    @property
-    def log_determinant(self) -> float:
-        """Of the information of one system."""
-        return float(self._log_determinants)
+        self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
+        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(axis=-1)
 
     @property
     def unseen(self) -> FloatArray:

@@ -320,7 +320,7 @@ def _solution(
 ) -> LeverArmSolution:
     normal = NormalEquations(selected(posterior.products, _SOLVED))
     n_evidence = len(state.boost) - int(state.left_out.sum())
-    misfit = normal.cost / max(3 * n_evidence - len(_SOLVED), 1)
+    misfit = float(normal.cost) / max(3 * n_evidence - len(_SOLVED), 1)
     # With the answer to acceleration, and by what it would move the lever arm.
     whole = posterior.normal
     covariance, shift = max(misfit, 1.0) * whole.covariance, (whole.step[:-1] - normal.step)[:3]
@@ -343,7 +343,7 @@ def _solution(
         spikes=state.outliers.spikes,
         part_products=selected(posterior.part_products(), _SOLVED),
         misfit=misfit,
-        objective=0.5 * (posterior.log_determinant + normal.cost),
+        objective=0.5 * (posterior.log_determinant + float(normal.cost)),
         converged=converged,
     )
 

@@ -131,11 +131,6 @@ class AdaptiveSolution(ModelSolution):
         return "+".join(name for name, at in PARAMETERS.items() if shown[at].any()) or "none"
 
     @property
-    def bias(self) -> FloatArray:
-        """(3,) array: error of the child's path per metre travelled, along its axes."""
-        return self.parameters[BIAS]
-
-    @property
     def rate_bias(self) -> FloatArray:
         """(2, 3) array: bias of the child's rates less that of the parent's, along the axes of the
         child, and its standard deviations, rad/s.
@@ -220,7 +215,7 @@ class AdaptiveSolution(ModelSolution):
         systematic = self.systematic.split("+")
         off, offset_ms = 100 * (self.scale - 1), 1000 * self.time_offset_s
         bias, sigmas = np.degrees(self.rate_bias)
-        along = ", ".join(f"{'xyz'[k]} {1000 * self.bias[k]:.2g}" for k in range(3))
+        along = ", ".join(f"{'xyz'[k]} {1000 * self.parameters[BIAS][k]:.2g}" for k in range(3))
         rates = ", ".join(f"{'xyz'[k]} {bias[k]:.3g} +/- {sigmas[k]:.1g}" for k in range(3))
         said = {
             "scale": f"the child's lengths are {abs(off):.2f} +/- {100 * self.scale_sigma:.2g} % "

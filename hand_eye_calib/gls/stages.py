@@ -202,7 +202,7 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
             is_there = [k in there or k >= RATE.start for k in range(N_SYSTEMATIC)]
             rival = replace(fit, sigmas=np.where(is_there, tuning.sizes, tuning.none))
             normal = NormalEquations(without + problem.known(rival))
-            loss = normal.cost + normal.log_determinant + 2.0 * float(np.log(rival.sigmas).sum())
+            loss = float(normal.cost + normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
             odds = [
                 tuning.certain if k == TIME and problem.is_clock_free else log_odds for k in there
             ]

@@ -257,7 +257,7 @@ class Posterior:
         self.products = 0.5 * (products + products.T) + space.prior
         self.normal = NormalEquations(self.products)
         determinants = self.log_determinant + self.normal.log_determinant
-        self.loss = 0.5 * (determinants + self.normal.cost)
+        self.loss = 0.5 * float(determinants + self.normal.cost)
 
     def _blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d), of the m increments

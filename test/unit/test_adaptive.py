@@ -343,7 +343,7 @@ def test_on_flat_ground_no_sideways_slip_is_assumed():
     # It could not be told from a child that is mounted askew; forwards and upwards it can.
     streams = systematic(planar_poses(400), "bias", [0.0, 0.05, 0.0])
     solution = estimator.solve(stamps(400), *with_noise(streams, 1))
-    assert abs(solution.bias[1]) < 1e-3
+    assert abs(solution.parameters[PARAMETERS["bias"][1]]) < 1e-3
 
 
 def test_poses_wrong_by_themselves_are_bridged():
