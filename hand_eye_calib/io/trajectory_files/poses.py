@@ -145,20 +145,7 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     quantities, positions, to_first = table.columns.quantities, np.zeros((len(table), 3)), None
     up = next((name for name in ("z", "height") if name in quantities), None)
     if "lat" in quantities:
-        lat, lon = _in_si(table, ("lat", "lon"), _ANGLES).T
-        table.refuse(
-            (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > _ANGLES[1]),
-            lambda row: (
-                f"found latitude {np.degrees(lat[row]):.7g} deg, longitude "
-                f"{np.degrees(lon[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps they "
-                "are swapped"
-            ),
-        )
-        height = _in_si(table, (up,), _LENGTHS)[:, 0] if up else positions[:, 2]
-        from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
-
-        positions, to_first = LocalOrigin().local(lat, lon, height), rotations_to_first(lat, lon)
-        table.guess("latitude and longitude became metres east and north of the first position")
+        positions, to_first = _on_earth(table, up)
     elif "x" in quantities:
         names = ("x", "y", up) if up else ("x", "y")
         positions[:, : len(names)] = _in_si(table, names, _LENGTHS)
@@ -178,6 +165,26 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
         in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
         quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
     return positions, quats_xyzw
+
+
+def _on_earth(table: Table, up: str | None) -> tuple[FloatArray, FloatArray]:
+    """Metres (N, 3) east, north and up of the first position, and the rotations (N, 3, 3) from the
+    axes of each position to those of the first.
+    """
+    from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
+
+    lat, lon = _in_si(table, ("lat", "lon"), _ANGLES).T
+    table.refuse(
+        (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > _ANGLES[1]),
+        lambda row: (
+            f"found latitude {np.degrees(lat[row]):.7g} deg, longitude "
+            f"{np.degrees(lon[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps they "
+            "are swapped"
+        ),
+    )
+    height = _in_si(table, (up,), _LENGTHS)[:, 0] if up else np.zeros(len(table))
+    table.guess("latitude and longitude became metres east and north of the first position")
+    return LocalOrigin().local(lat, lon, height), rotations_to_first(lat, lon)
 
 
 def _in_si(

@@ -348,16 +348,21 @@ def read_table(path: _Path, options: FileOptions) -> Table:
     measures = options.measures if format == "csv" else AUTO
     table = table_of(path, header or _UNNAMED, lines, cells_of, measures, expected)
     if format == "kitti" and times is not None:
-        stamps = Table(times, "a stamp", Columns([0], {}))
-        lines = lines_of(times, "stamps", after=0)
-        table.stamps = stamps.fill(lines, lambda text: text.split()[:1], 1).stamps
-        if len(table.stamps) != len(table):
-            raise InputError(
-                f"{path}: {len(table)} poses, but {times} has {len(table.stamps)} stamps; they "
-                "belong to different recordings"
-            )
+        table.stamps = _stamps_of(times, table)
     table.guesses, table.format = guesses, format
     return table
+
+
+def _stamps_of(times: _Path, poses: Table) -> list[Decimal]:
+    """The stamps of poses from a file of their own."""
+    table, lines = Table(times, "a stamp", Columns([0], {})), lines_of(times, "stamps", after=0)
+    table.fill(lines, lambda text: text.split()[:1], 1)
+    if len(table) != len(poses):
+        raise InputError(
+            f"{poses.path}: {len(poses)} poses, but {times} has {len(table)} stamps; they belong "
+            "to different recordings"
+        )
+    return table.stamps
 
 
 def table_of(
