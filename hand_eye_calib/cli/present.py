@@ -223,7 +223,8 @@ def _details(calibration: Calibration) -> Iterator[str]:
 def _comparisons(calibration: Calibration) -> Iterator[str]:
     """The recordings, the goal of the session, and the comparison with what is installed."""
     if calibration.together:
-        yield calibration.together.sentence
+        if calibration.together.sentence not in calibration.headline:
+            yield calibration.together.sentence
         for one in calibration.together.recordings:
             told = f"left out, {one.left_out}" if one.left_out else one.headline
             yield f"{one.name}: {told}"

@@ -196,4 +196,5 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
         print(listing([f"{count} {verdict}" for verdict, count in counts.items()]))
     for name, each in vehicles.items():
         sentence = each.together.sentence if each.together else ""
-        print("\n".join(wrapped(f"{name}: {each.headline}. {sentence}", "", "  ")))
+        told = each.headline if sentence in each.headline else f"{each.headline}. {sentence}"
+        print("\n".join(wrapped(f"{name}: {told}", "", "  ")))
