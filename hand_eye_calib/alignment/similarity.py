@@ -35,7 +35,7 @@ _MAX_STEPS, _STEP_TOLERANCE = 30, 1e-6
 _TUNING = 3.0
 
 # Blocks of time, for the jackknife and for a clock that drifts.
-N_BLOCKS = 10
+_N_BLOCKS = 10
 
 # A fit that leaves no more than this share of the motion unexplained ends the search for others.
 EXPLAINED = 0.03
@@ -51,9 +51,9 @@ _MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
 # Damping of directions that the motion does not determine, in balanced units.
 _DAMPING = 1e-10
 
-# Motions over these times (s) are compared for the scale; that with the smallest relative standard
-# deviation wins. Long motions show the scale best.
-_SCALE_LAGS_S, _MIN_PAIRS = (3.0, 1.0, 8.0), 20
+# Fewer motions are not compared. For the scale they are over these times (s); that with the smallest
+# relative standard deviation wins. Long motions show the scale best.
+MIN_PAIRS, _SCALE_LAGS_S = 20, (3.0, 1.0, 8.0)
 
 # A scale differs from 1 if it is off by more than this and by so many standard deviations, and if
 # the fit leaves less than this of the motion unexplained: many jumps could imitate a scale.
@@ -182,12 +182,12 @@ def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) ->
     fits: list[SimilarityFit] = []
     for lag_s in _SCALE_LAGS_S:
         pairs = pairs_over(pose_pairs, lag_s)
-        if len(pairs) >= _MIN_PAIRS:
+        if len(pairs) >= MIN_PAIRS:
             fits.append(fit_similarity(pairs, start=fits[-1] if fits else start))
     if not fits:
         raise NotEnoughDataError(
             f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "
-            f"{_MIN_PAIRS} of them are {min(_SCALE_LAGS_S):g} s apart; record longer, or give scale"
+            f"{MIN_PAIRS} of them are {min(_SCALE_LAGS_S):g} s apart; record longer, or give scale"
         )
     # By the relative standard deviation, plus the unexplained share if the fit does not hold.
     return min(
@@ -380,7 +380,7 @@ class _Problem:
         """The result, with its uncertainty."""
         parts, (sigma_translation, sigma_rotation) = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
-        blocks = np.array_split(rows, min(N_BLOCKS, len(rows)))
+        blocks = np.array_split(rows, min(_N_BLOCKS, len(rows)))
         moments = np.array([np.tensordot(each, each, axes=([0, 1], [0, 1])) for each in blocks])
         normal, gradient = moments[:, :-1, :-1], moments[:, :-1, -1]
         total = normal.sum(axis=0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
-from hand_eye_calib.alignment.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.alignment.similarity import MIN_PAIRS, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
@@ -18,10 +18,10 @@ from hand_eye_calib.pairing.synchronise import find_leap, synchronise
 from hand_eye_calib.results.records import ClockRate
 
 # Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
-# Short motions show the offset best. Motions needed, most that are compared, and if there is a rate
-# to be measured.
+# Short motions show the offset best. Most motions that are compared, and if there is a rate to be
+# measured.
 _LAGS_S = (1.0, 0.3, 3.0)
-_MIN_PAIRS, _PAIRS, _PAIRS_OF_RATE = 20, 800, 4_000
+_PAIRS, _PAIRS_OF_RATE = 800, 4_000
 
 # Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
 # intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
@@ -32,8 +32,8 @@ _LEAST_SPAN_S, _MOST_SPAN_S, _SPAN_INTERVALS, _SPAN_OF_NOISE = 0.05, 0.3, 2.0, 1
 _MAX_ROUNDS, _SETTLED_S = 8, 2e-5
 
 # A rate of the clock is known to this beforehand (75 ppm are usual for USB devices); one beyond so
-# many standard deviations is there. Over this many blocks of time it is a line.
-_RATE_PRIOR, _PLAIN_RATE, _LEAST_BLOCKS = 1e-4, 4.0, 5
+# many standard deviations is there.
+_RATE_PRIOR, _PLAIN_RATE = 1e-4, 4.0
 
 # Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
 # stream if those are longer.
@@ -164,7 +164,7 @@ def _fine_offset(
         shifted = child.shifted(offset_s, rate.used, rate.at_ns)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
         pairs = pairs_over(pose_pairs, lag_s, most_pairs)
-        if len(pairs) < _MIN_PAIRS:
+        if len(pairs) < MIN_PAIRS:
             return TimeOffset(offset_s, np.inf, correlation), None
         # Velocities of the child in its own frame, over less at the ends of the trajectory.
         at, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
@@ -201,12 +201,10 @@ def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRa
     time, of which the stamps (K,) of the pairs are on the parent's clock.
     """
     offsets_s, weights = fit.offsets_of_blocks
-    if len(offsets_s) < _LEAST_BLOCKS or weights.min() <= 0.0:
+    if weights.min() <= 0.0:
         return before
-    times_s = [
-        float(each.mean())
-        for each in np.array_split((stamps_ns - stamps_ns[0]) * 1e-9, len(offsets_s))
-    ]
+    blocks_s = np.array_split((stamps_ns - stamps_ns[0]) * 1e-9, len(offsets_s))
+    times_s = [float(each.mean()) for each in blocks_s]
     away_s = times_s - np.average(times_s, weights=weights)
     left_s = offsets_s - np.average(offsets_s, weights=weights)
     spread = float(weights @ away_s**2)

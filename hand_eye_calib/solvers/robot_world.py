@@ -264,6 +264,14 @@ def _linearise(
     return errors, jacobian
 
 
+def _information(rows: FloatArray, columns: IntArray, n_values: int) -> FloatArray:
+    """Information (n_values, n_values) of rows (N, 6, 12), which have values at columns (N, 12)."""
+    cells = n_values * columns[:, :, None] + columns[:, None]
+    products = np.swapaxes(rows, 1, 2) @ rows
+    whole = np.bincount(cells.ravel(), products.ravel(), n_values**2).astype(float)
+    return whole.reshape(n_values, n_values)
+
+
 def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) -> float:
     """Factor on the covariance, at least 1, for errors that last from stop to stop."""
     n, n_values = len(columns), len(information)
@@ -281,13 +289,6 @@ def _fit(
     n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
     blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
     columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
-    cells = n_values * columns[:, :, None] + columns[:, None]
-
-    def information_of(rows: FloatArray) -> FloatArray:
-        products = np.swapaxes(rows, 1, 2) @ rows
-        whole = np.bincount(cells.ravel(), products.ravel(), n_values**2).astype(float)
-        return whole.reshape(n_values, n_values)
-
     # Values that the errors are fitted with make them smaller.
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)
     weights, converged = np.ones(n), False
@@ -299,7 +300,7 @@ def _fit(
         weights = (tails + 6.0) / (tails + distance)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
         rows = scale[..., None] * jacobian
-        information = information_of(rows)
+        information = _information(rows, columns, n_values)
         gradients = np.einsum("nki,nk->ni", rows, scale * errors)
         gradient = np.bincount(columns.ravel(), gradients.ravel(), n_values)
         step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0]
@@ -311,7 +312,8 @@ def _fit(
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
     # modeling using the t distribution*, JASA 84, 1989, section 4.
     share = (tails + 6.0) / (tails + 8.0)
-    fisher = information_of(np.sqrt(share * np.repeat(1.0 / variances, 3))[:, None] * jacobian)
+    rows = np.sqrt(share * np.repeat(1.0 / variances, 3))[:, None] * jacobian
+    fisher = _information(rows, columns, n_values)
     weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), n_values // 6) / _UNKNOWN**2)
     log_likelihood = (
         -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
