@@ -51,7 +51,7 @@ _MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
 # Damping of directions that the motion does not determine, in balanced units.
 _DAMPING = 1e-10
 
-# Fewer motions are not compared. For the scale they are over these times (s); that with the smallest
+# Fewer motions are not compared. For the scale they are over these times (s); that of the smallest
 # relative standard deviation wins. Long motions show the scale best.
 MIN_PAIRS, _SCALE_LAGS_S = 20, (3.0, 1.0, 8.0)
 

@@ -144,8 +144,7 @@ class RigCalibration:
                 pulled[row] += sign * weight @ miss
                 information[row, :, at + 1] += sign * weight
                 information[row, :, at] -= sign * weight
-        size = 6 * K
-        steps = np.linalg.solve(information.reshape(size, size), pulled.ravel())
+        steps = np.linalg.solve(information.reshape(6 * K, 6 * K), pulled.ravel())
         return np.asarray(steps.reshape(K, 6))
 
     @cached_property
@@ -158,17 +157,14 @@ class RigCalibration:
         """
         of_first = [_moved(each, X) for each, X in zip(self.calibrations, self.Xs[1:], strict=True)]
         between = [_moved(each, X) for each, X in zip(self.neighbours, self.Xs[2:], strict=True)]
-        shared = np.mean(
-            [0.5 * (a + b - c) for a, b, c in zip(of_first, of_first[1:], between, strict=False)],
-            axis=0,
-        )
+        three = zip(of_first, of_first[1:], between, strict=False)
+        shared = np.mean([0.5 * (a + b - c) for a, b, c in three], axis=0)
         own = []
         for covariance in of_first:
             root = np.linalg.cholesky(covariance)
-            share = np.linalg.solve(root, np.linalg.solve(root, shared).T)
-            values, axes = np.linalg.eigh(share)
-            axes = root @ axes
-            own.append((axes * (1.0 - np.clip(values, 0.0, _MOST_SHARED))) @ axes.T)
+            values, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, shared).T))
+            axes, kept = root @ axes, 1.0 - np.clip(values, 0.0, _MOST_SHARED)
+            own.append((axes * kept) @ axes.T)
         return np.array([np.mean(np.array(of_first) - own, axis=0), *own])
 
     def T(self, first: str, second: str) -> FloatArray:
@@ -226,17 +222,16 @@ def _moved(calibration: Calibration, X: FloatArray) -> FloatArray:
 def closure(to_second: Calibration, on: Calibration, to_third: Calibration) -> Closure:
     """How the answers for a -> b, b -> c and a -> c close."""
     ahead = to_second.T_parent_child @ on.T_parent_child
-    error = ahead @ to_third.T_child_parent
     covariance = _moved(to_second, to_second.T_parent_child) + _moved(on, ahead)
     covariance += _moved(to_third, to_third.T_parent_child)
     variances, axes = np.linalg.eigh(covariance)
-    known = axes[:, variances < _UNKNOWN]
-    along = known.T @ se3.log(error)
-    miss = known @ along
+    is_known = variances < _UNKNOWN
+    along = axes[:, is_known].T @ se3.log(ahead @ to_third.T_child_parent)
+    miss = axes[:, is_known] @ along
     return Closure(
         sensors=(to_second.parent_frame, to_second.child_frame, to_third.child_frame),
         translation_m=float(np.linalg.norm(miss[:3])),
         rotation_rad=float(np.linalg.norm(miss[3:])),
-        chi2=float((along**2 / variances[variances < _UNKNOWN]).sum()),
-        dof=known.shape[1],
+        chi2=float((along**2 / variances[is_known]).sum()),
+        dof=int(is_known.sum()),
     )
