@@ -227,15 +227,6 @@ def squared_shift(H: FloatArray, S: FloatArray, ridge: float) -> FloatArray:
     return np.asarray((S * most_likely(H, S, ridge)).sum(axis=-1))
 
 
-def probability(log_ratios: FloatArray, before: float) -> float:
-    """Probability of a shift at one of several times, from its logarithmic likelihood ratio at each
-    and its probability before that.
-    """
-    most = log_ratios.max()
-    log_odds = most + np.log(np.exp(log_ratios - most).mean() * before / (1.0 - before))
-    return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN))))
-
-
 # ---------------------------------------------------------------- within a recording
 
 
@@ -345,31 +336,16 @@ def _inverse(H: FloatArray) -> FloatArray:
     return np.linalg.inv(H + 1e-6 * np.linalg.inv(shift_covariance()))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PossibleShift:
-    """A difference between the parts of a recording.
-
-    Attributes
-    ----------
-    probability : float
-        That the parts before and after some time have different answers, under their noise model.
-    share : float
-        Of the recording before it, where it is most likely.
-    xi : (6,) array
-        Shift there, as of a MountChange, if there is one.
-    spread : (6, 6) array
-        Covariance of xi in ``X exp(xi)`` because of it: an answer between both mounts is half of
-        the shift away from either.
-    warnings : tuple of str
-        One if something has moved, more likely than not: by more than recordings of one rig
-        scatter.
+    """A difference between the parts of a recording: the covariance (6, 6) of xi in ``X exp(xi)``
+    because of it, as an answer between both mounts is half of the shift away from either; and a
+    warning if something has moved, more likely than not, by more than recordings of one rig
+    scatter.
     """
 
-    probability: float
-    share: float
-    xi: FloatArray
     spread: FloatArray
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
 
 
 def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
@@ -381,7 +357,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        Of :func:`~hand_eye_calib.gls.state_space.Posterior.part_products`.
+        Of :func:`~hand_eye_calib.gls.state_space.part_products`.
     misfit : float
         Factor of the covariances.
     """
@@ -396,14 +372,16 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     H = np.linalg.inv(joint)
     S = (H @ steps[:, :, None])[:, :, 0]
     ratios = log_ratio(H, S)
-    found = probability(ratios, _MOVES)
+    found = _probability(ratios)
     if found < _LEAST_PROBABILITY:
         return None
-    beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
-    moved = probability(log_ratio(beside, (beside @ steps[:, :, None])[:, :, 0]), _MOVES)
     shifts = solve(H + np.linalg.inv(shift_covariance()), S)
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
+    spread = found * squared / 4.0
+    beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
+    if _probability(log_ratio(beside, (beside @ steps[:, :, None])[:, :, 0])) < 0.5:
+        return PossibleShift(spread, ())
     best = int(np.argmax(ratios))
     share, xi = int(cuts[known][best]) / len(products), shifts[best]
     sizes = length(float(np.linalg.norm(xi[:3]))), angle(float(np.linalg.norm(xi[3:])))
@@ -412,10 +390,11 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
         f"results ({', '.join(sizes)}). Perhaps a sensor moved, or an odometry got worse. The +/- "
         "values already include half of this."
     )
-    return PossibleShift(
-        probability=found,
-        share=share,
-        xi=xi,
-        spread=found * squared / 4.0,
-        warnings=(told,) if moved >= 0.5 else (),
-    )
+    return PossibleShift(spread, (told,))
+
+
+def _probability(log_ratios: FloatArray) -> float:
+    """Probability of a shift at one of several times, from its logarithmic likelihood ratios."""
+    most = log_ratios.max()
+    log_odds = most + np.log(np.exp(log_ratios - most).mean() * _MOVES / (1.0 - _MOVES))
+    return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN))))

@@ -1,6 +1,5 @@
 """``reference: auto``: the reference whose answer is nearest to the adaptive estimator's."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,7 @@ from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers.registry import Method
 
-CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
+_CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
 # Fewest poses from which the noise can be estimated; fewest pairs that say something.
 MIN_POSES, _MIN_PAIRS = 13, 6
@@ -21,16 +20,8 @@ MIN_POSES, _MIN_PAIRS = 13, 6
 
 @dataclass(frozen=True)
 class ReferenceChoice:
-    """A reference and why it was chosen.
-
-    Attributes
-    ----------
-    reference : str
-    distances : dict of str to float
-        Candidate to the distance of its answer from the adaptive estimator's, in standard
-        deviations of that.
-    model : AdaptiveSolution
-        The adaptive estimator's.
+    """A reference; by candidate, the distance of its answer from the adaptive estimator's, in
+    standard deviations of that; and the adaptive estimator's.
     """
 
     reference: str
@@ -48,10 +39,7 @@ class ReferenceChoice:
 
 
 def select_reference(
-    pose_pairs: PosePairs,
-    method: Method,
-    candidates: Sequence[str] = CANDIDATES,
-    solution: AdaptiveSolution | None = None,
+    pose_pairs: PosePairs, method: Method, solution: AdaptiveSolution | None = None
 ) -> ReferenceChoice:
     """Choose the reference for a method; ``solution`` is the adaptive estimator's for these poses,
     if it is known.
@@ -75,7 +63,7 @@ def select_reference(
     solution = solution or estimator.solve(pose_pairs.stamps_ns, *poses, quick=True)
     information = np.linalg.pinv(solution.cov_parent_child_in_child, hermitian=True)
     to_answer, distances = se3.inverse(solution.T_parent_child), {}
-    for reference in candidates:
+    for reference in _CANDIDATES:
         pairs = motion_pairs(*poses, reference)
         if len(pairs) >= _MIN_PAIRS:
             error = se3.log(to_answer @ method.solve(pairs).T_parent_child)

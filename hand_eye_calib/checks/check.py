@@ -12,6 +12,7 @@ wrong with them.
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,6 @@ from hand_eye_calib.checks.streams import (
     check_frozen,
     check_lengths,
     check_positions,
-    check_sampling,
     check_stamps,
     check_stream,
 )
@@ -136,13 +136,16 @@ def check_streams(
         # Nothing is said about the rates of a frozen stream.
         if not correlation.is_clear and not frozen:
             is_still = correlation.variation < MIN_VARIATION
-            findings += [finding("no_turning") if is_still else unrelated_rates(correlation)]
+            doubt = f"the angular rates agree at no clock offset: {correlation.doubt()}"
+            found = [finding("no_turning") if is_still else finding("unrelated", text=doubt)]
+            findings += found
         return CheckResult(gravest_first(findings), correlation)
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
-    findings = _with_lengths(findings, parent)
-    is_sound = not any(each.makes_unusable for each in findings)
+    if is_sound := not any(each.makes_unusable for each in findings):
+        findings += check_lengths(parent)
+        is_sound = not any(each.makes_unusable for each in findings)
     offset = _offset(streams, explanation, correlation)
     findings += check_offset(offset, time_offset_s)
     found, fit = _check_sizes(streams, explanation, correlation.offset_s, scale)
@@ -231,17 +234,13 @@ def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list
     """Findings about each of two streams, on one clock, of which one at least has only positions,
     rotations or rates: what there is to see before a solve.
     """
-    has_positions = parent.has_positions and child.has_positions
-    check = check_positions if has_positions else check_sampling
-    findings = _check_each(parent, child, max_gap_s, check)
-    if any(each.makes_unusable for each in findings):
-        return findings
-    if any(each.code == "coarse_positions" for each in findings):
-        return findings  # rounded positions stay the same while the sensor moves
-    findings = _with_lengths(findings, parent)
-    if not has_positions:
+    if not (parent.has_positions and child.has_positions):
         parent, child = parent.scaled(0.0), child.scaled(0.0)
-    return [*findings, *check_frozen(parent, child)]
+    findings = _check_each(parent, child, max_gap_s, check_positions)
+    # Rounded positions stay the same while the sensor moves.
+    if any(each.makes_unusable or each.code == "coarse_positions" for each in findings):
+        return findings
+    return [*findings, *check_lengths(parent), *check_frozen(parent, child)]
 
 
 def _check_each(
@@ -259,15 +258,6 @@ def _check_each(
     return findings
 
 
-def _with_lengths(findings: list[Finding], parent: Trajectory) -> list[Finding]:
-    """With what there is to say of the unit of length; not if something else explains the motion,
-    such as inverse poses.
-    """
-    if not parent.has_positions or any(each.makes_unusable for each in findings):
-        return findings
-    return findings + check_lengths(parent)
-
-
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
     """Whether two streams last so long, and rotate so far, that the checks mean something: to be
     asked during a session.
@@ -277,12 +267,6 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
         >= MIN_ROTATION_RAD
         for stream in (parent, child)
     )
-
-
-def unrelated_rates(correlation: Correlation, quantity: str = "angular rates") -> Finding:
-    """The finding that angular rates, or speeds, agree at no clock offset."""
-    doubt = correlation.doubt(quantity)
-    return finding("unrelated_rates", quantity=quantity, doubt=doubt)
 
 
 def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
@@ -325,22 +309,16 @@ def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | 
     the known one: the child's if it is below 1, otherwise the parent's; None if the scale is about
     that of no unit.
     """
-    is_child = scale < 1.0
+    smaller, stream, other = scale, "child", "parent"
+    if scale > 1.0:
+        smaller, stream, other = 1.0 / scale, "parent", "child"
     for factor, unit in _UNITS.items():
-        if abs(scale / (factor if is_child else 1.0 / factor) - 1.0) < _UNIT_TOLERANCE:
-            return finding(
-                "units",
-                "child" if is_child else "parent",
-                options=(
-                    {"scale": round(known * factor, 9)}
-                    if is_child
-                    else {"parent_scale": round(factor / known, 9)}
-                ),
-                other="parent" if is_child else "child",
-                scale=scale,
-                sigma=sigma,
-                unit=unit,
-            )
+        if abs(smaller / factor - 1.0) < _UNIT_TOLERANCE:
+            options = {"parent_scale": round(factor / known, 9)}
+            if stream == "child":
+                options = {"scale": round(known * factor, 9)}
+            told: dict[str, Any] = {"other": other, "scale": scale, "sigma": sigma, "unit": unit}
+            return finding("units", stream, options=options, **told)
     return None
 
 

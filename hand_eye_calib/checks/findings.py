@@ -30,8 +30,6 @@ class _Row:
     code: str = ""
 
 
-_ONE_BODY = "check that both are on one rigid body, {units}, and the clocks (time_offset estimate)"
-
 _ROWS = {
     # ------------------------------------------------------------------ of one stream
     "disorder": _Row("{text}", "repair the source of the stamps", severity=_NOTE),
@@ -84,11 +82,10 @@ _ROWS = {
         "such as lengths in millimetres",
     ),
     # ------------------------------------------------------------------ of both together
-    "unrelated_rates": _Row(
-        "the {quantity} of the two streams do not agree at any clock offset: {doubt}",
-        "check that both sensors are on one rigid body, that the topics are of the same recording, "
-        "and that neither is derived from another body",
-        code="unrelated",
+    "unrelated": _Row(
+        "{text}",
+        "check that both sensors are on one rigid body, that the streams are those of the sensors, "
+        "of the same recording and in known units, and the clocks (time_offset estimate)",
     ),
     "no_turning": _Row(
         "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
@@ -96,15 +93,6 @@ _ROWS = {
         "rotate about several axes (a vehicle: curves, and slopes if there are any)",
     ),
     "too_short": _Row("{text}", "record longer"),
-    "not_one_body": _Row(
-        "no extrinsic, scale or usual mistake explains both streams: {share:.0%} of the motion "
-        "stays unexplained",
-        "check that both sensors are on one rigid body and that the poses are those of the sensors",
-        code="unrelated",
-    ),
-    "unrelated_parts": _Row(
-        "{share:.0%} of the {part} is not that of the {other}", _ONE_BODY, code="unrelated"
-    ),
     "not_independent": _Row(
         "The two streams are not independent: one seems to be computed from the other. This result "
         "only repeats the transform that was used for it.",

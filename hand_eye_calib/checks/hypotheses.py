@@ -237,7 +237,9 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
         attributed = _attributed(best, streams)
         findings = (*attributed.findings, finding("noisy", share=unexplained))
         return replace(attributed, findings=findings, limit=_NOISY)
-    return replace(best, findings=(finding("not_one_body", share=min(unexplained, 1.0)),))
+    share = min(unexplained, 1.0)
+    text = f"no extrinsic, scale or usual mistake explains {share:.0%} of the motion"
+    return replace(best, findings=(finding("unrelated", text=text, share=share),))
 
 
 def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanation:

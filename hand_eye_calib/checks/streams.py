@@ -117,9 +117,16 @@ def check_stream(
 
 def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of one stream, and about its positions without its orientations."""
-    findings = check_sampling(trajectory, stream, max_gap_s)
-    if any(finding.severity is Severity.ERROR for finding in findings):
-        return findings
+    if len(trajectory) < 4:
+        text = f"the {stream} stream has {len(trajectory)} poses"
+        return [finding("too_short", stream, text=text)]
+    if leap := find_leap(trajectory.stamps_ns):
+        return [finding("leap", stream, text=leap[0], remedy=leap[1])]
+    intervals_s, findings = np.diff(trajectory.stamps_ns) * 1e-9, []
+    if (gaps := are_gaps(intervals_s, max_gap_s)).any():
+        share = float(intervals_s[gaps].sum() / intervals_s.sum())
+        longest_s, n_gaps = float(intervals_s.max()), int(gaps.sum())
+        findings = [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
@@ -130,22 +137,6 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
             severity = Severity.ERROR
         findings.append(finding("coarse_positions", stream, severity, step_m=step_m))
     return findings
-
-
-def check_sampling(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
-    """Findings about the stamps of one stream, whatever it measures: too few, a leap, gaps."""
-    if len(trajectory) < 4:
-        text = f"the {stream} stream has {len(trajectory)} poses"
-        return [finding("too_short", stream, text=text)]
-    if leap := find_leap(trajectory.stamps_ns):
-        return [finding("leap", stream, text=leap[0], remedy=leap[1])]
-    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    gaps = are_gaps(intervals_s, max_gap_s)
-    if not gaps.any():
-        return []
-    share = float(intervals_s[gaps].sum() / intervals_s.sum())
-    longest_s, n_gaps = float(intervals_s.max()), int(gaps.sum())
-    return [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
 
 
 def _interleaved(trajectory: Trajectory) -> float:

@@ -8,7 +8,6 @@ it finds for the rotation does not depend on the rest. Of both: the time offset.
 
 import contextlib
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -144,11 +143,9 @@ def _of_path(
             found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
             if left < _UNRELATED_PATH and found:
                 return (found,)
-    what: dict[str, Any] = {"part": "motion of the positions", "other": "odometry"}
-    units = "the units, the scale, the order of the coordinates"
-    return (
-        finding("unrelated_parts", severity=severity, share=min(share, 1.0), units=units, **what),
-    )
+    share = min(share, 1.0)
+    text = f"{share:.0%} of the motion of the positions is not that of the odometry"
+    return (finding("unrelated", severity=severity, share=share, text=text),)
 
 
 def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
@@ -238,12 +235,9 @@ def _of_rotation(
     share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
     if share < _UNRELATED_ROTATION:
         return ()
-    what: dict[str, Any] = {
-        "part": "rotation of one sensor",
-        "other": "other",
-        "units": "the unit of the rates",
-    }
-    return (finding("unrelated_parts", share=min(share, 1.0), **what),)
+    share = min(share, 1.0)
+    text = f"{share:.0%} of the rotation of one sensor is not that of the other"
+    return (finding("unrelated", share=share, text=text),)
 
 
 def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:
