@@ -69,7 +69,7 @@ _WINDOWS, _LEAST_WINDOWS = (8, 16), 2
 _LEAST_WINDOW_S = 3.0
 
 # Log likelihood ratio from which on a shift is significant.
-SIGNIFICANT = 14.0
+SIGNIFICANT = 24.0
 
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
 # recording before and after that. A smaller probability is none.
