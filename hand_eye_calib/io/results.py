@@ -106,9 +106,8 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         write_atomically(kept)
-        for name in texts:
-            if directory / name not in kept:
-                (directory / name).unlink(missing_ok=True)
+        for path in {directory / name for name in texts} - kept.keys():
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or directory}: {error.strerror}; choose another "

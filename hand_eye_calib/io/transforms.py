@@ -134,7 +134,8 @@ class TfStream:
         if len(self._moving) == 1:  # the usual case, for which nothing has to wait
             self._slowest = frame
         elif not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
-            self._slowest = max(self._moving, key=self._interval_ns)
+            stamps_ns = {name: [row[0] for row in each] for name, each in self._moving.items()}
+            self._slowest = max(stamps_ns, key=lambda name: np.median(np.diff(stamps_ns[name])))
         if not self._slowest:
             return
         # The poses at the waiting stamps of the slowest edge that no other edge keeps waiting.
@@ -146,9 +147,6 @@ class TfStream:
             known = {name: each for name, each in rows.items() if each is not None}
             if len(known) == len(rows):
                 yield at_ns, {self._slowest: row, **known}
-
-    def _interval_ns(self, frame: str) -> float:
-        return float(np.median(np.diff([stamp_ns for stamp_ns, _ in self._moving[frame]])))
 
 
 def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:

@@ -28,7 +28,6 @@ from hand_eye_calib.io.transforms import PoseFields
 MALFORMED = (struct.error, ValueError)
 Errors = type[Exception] | tuple[type[Exception], ...]
 
-Buffer = bytes | memoryview
 T = TypeVar("T")
 
 _NS_PER_S = STAMP_UNITS["s"]
@@ -47,7 +46,7 @@ _START, _CDR = 4, b"\x00\x01"
 class Cursor:
     """Reads the parts of a message one after the other."""
 
-    def __init__(self, data: Buffer, is_ros1: bool) -> None:
+    def __init__(self, data: bytes, is_ros1: bool) -> None:
         if not is_ros1 and bytes(data[:2]) != _CDR:
             raise ValueError(f"expected plain CDR, found encoding 0x{bytes(data[:2]).hex()}")
         self.data, self.is_ros1, self.position = data, is_ros1, 0 if is_ros1 else _START
@@ -177,7 +176,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
 # ---- unpacking
 
 
-def unpack_stamp_ns(data: Buffer) -> int:
+def unpack_stamp_ns(data: bytes) -> int:
     """Unpack the stamp of a message in CDR that begins with a header; raises MALFORMED."""
     return Cursor(data, is_ros1=False).stamp_ns()
 
@@ -211,7 +210,7 @@ class Run(NamedTuple):
 _Unpacked = tuple[int, str, str | None, Sequence[float], int]
 
 
-def _unpack(row: MessageType, is_ros1: bool, data: Buffer) -> _Unpacked:
+def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     """Stamp in ns, the header's frame, the sensor's behind it, values, and where these end."""
     cursor = Cursor(data, is_ros1)
     stamp_ns, frame = cursor.header()
@@ -219,7 +218,7 @@ def _unpack(row: MessageType, is_ros1: bool, data: Buffer) -> _Unpacked:
     return stamp_ns, frame, sensor_frame, row.unpack(cursor), cursor.position
 
 
-def unpack_poses(messages: Sequence[Buffer], message_type: str, is_ros1: bool) -> PoseColumns:
+def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseColumns:
     """Unpack one or more messages of one of MESSAGE_TYPES, poses together if they differ only in
     stamps and values; raises MALFORMED.
     """
@@ -249,7 +248,7 @@ def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatAr
     return seconds * _NS_PER_S + nanoseconds, poses
 
 
-def unpack_path(data: Buffer, is_ros1: bool) -> PoseColumns:
+def unpack_path(data: bytes, is_ros1: bool) -> PoseColumns:
     """Unpack the poses of a nav_msgs/Path; raises MALFORMED."""
     cursor = Cursor(data, is_ros1)
     _, world_frame = cursor.header()
@@ -259,7 +258,7 @@ def unpack_path(data: Buffer, is_ros1: bool) -> PoseColumns:
     return PoseColumns.of_frames(stamps_ns, poses, world_frame)
 
 
-def unpack_transforms(data: Buffer, is_ros1: bool) -> list[PoseFields]:
+def unpack_transforms(data: bytes, is_ros1: bool) -> list[PoseFields]:
     """Unpack the transforms of a tf message, frames without a leading slash; raises MALFORMED."""
     cursor, found = Cursor(data, is_ros1), []
     for _ in range(cursor.number()):
@@ -288,7 +287,7 @@ class MessageReader:
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
-    def columns(self, messages: Sequence[Buffer], is_ros1: bool) -> tuple[PoseColumns, BoolArray]:
+    def columns(self, messages: Sequence[bytes], is_ros1: bool) -> tuple[PoseColumns, BoolArray]:
         """The next messages, and which of them have what is measured; the others are not finite.
 
         Raises as :func:`unpack_poses`, and InputError at a latitude beyond 90 deg.
@@ -325,7 +324,7 @@ class MessageReader:
         lat, lon = np.radians(values[rows, :2]).T
         return self._origin.local(lat, lon, values[rows, 2])
 
-    def __call__(self, data: Buffer) -> PoseFields:
+    def __call__(self, data: bytes) -> PoseFields:
         """The next message, in CDR, as it arrives; an InputError if it cannot be unpacked, or lacks
         what is measured.
         """

@@ -17,7 +17,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import Buffer, Cursor
+from hand_eye_calib.io.bags.messages import Cursor
 
 # numpy's name of each datatype of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -55,7 +55,7 @@ class Scan(NamedTuple):
     frame: str
 
 
-def unpack_scan(data: Buffer, is_ros1: bool) -> Scan:
+def unpack_scan(data: bytes, is_ros1: bool) -> Scan:
     """Points and times of a PointCloud2 message; a ValueError if it is damaged, or has no x, y and
     z. Without times of its points, a scan counts as taken at once.
     """
@@ -126,6 +126,7 @@ class ScanOdometry:
         with suppress(Exception), np.load(self.place, allow_pickle=False) as kept:
             if np.array_equal(kept["files"], self._state):
                 self.kept = Odometry(*(kept[name] for name in Odometry._fields))
+                return
         try:
             import small_gicp
         except ImportError:

@@ -197,7 +197,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
             lost = _unpack(file, readable)
         storage = Storage(file, readable)
         opened.callback(storage.close)
-        storage.losses[:0] = filter(None, [lost])
+        storage.losses[:0] = [lost] * bool(lost)
         found.append(storage)
     return sorted(found, key=attrgetter("span_ns"))
 
