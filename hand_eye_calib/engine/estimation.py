@@ -2,6 +2,7 @@
 assess, add the prior, judge.
 """
 
+import contextlib
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -16,9 +17,8 @@ from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adap
 from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs, usual_speed
 from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
-from hand_eye_calib.assessment.reference_selection import MIN_POSES, select_reference
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
@@ -255,14 +255,16 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         is_clock_free=is_clock_free,
     )
     works = solution.converged and not solution.is_drowned
-    if not is_auto or works or len(pose_pairs) < MIN_POSES:
-        reason = "auto: adaptive, because its noise model works here" if is_auto else ""
-        return _of_model(pose_pairs, config, solution, reason)
-    why = "single poses are noisier than the motion between them"
-    why = why if solution.is_drowned else "the adaptive estimator did not converge"
-    dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
-    reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
-    return replace(dnlo, method_reason=reason)
+    reason = "auto: adaptive, because its noise model works here" if is_auto else ""
+    if is_auto and not works:
+        why = "single poses are noisier than the motion between them"
+        why = why if solution.is_drowned else "the adaptive estimator did not converge"
+        with contextlib.suppress(NotEnoughDataError):
+            dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
+            reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"
+            return replace(dnlo, method_reason=reason)
+        reason = f"auto: adaptive, although {why}: there are too few poses for dnlo"
+    return _of_model(pose_pairs, config, solution, reason)
 
 
 def _of_model(
@@ -306,6 +308,8 @@ def _solve_pairs(
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
     reference, reason, shift = config.reference, "", None
     if reference == "auto":
+        from hand_eye_calib.assessment.reference_selection import select_reference
+
         choice = select_reference(pose_pairs, replace(method, backend="fast"), solution=solution)
         reference, reason, model = choice.reference, choice.reason(), choice.model
         if model.converged and not model.unseen.size:
