@@ -263,8 +263,7 @@ def linearise(
     by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
     if parameters[RATE].any():
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
-    by_child[:, :3, 3] *= 1.0 + parameters[SCALE]
-    by_child[:, :3, 3] -= metres @ parameters[BIAS]
+    by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
     by = np.zeros((len(step), 6, 6 + N_SYSTEMATIC + 1))
