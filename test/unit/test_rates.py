@@ -301,7 +301,7 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     assert document["inputs"]["options"]["child_measures"] == "rates"
     assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
     assert "/imu has messages of type" in capsys.readouterr().err
-    with_itself = ["--parent-topic", "/imu", "--child-topic", "/imu_again"]
+    with_itself = ["--parent-topic", "/imu", "--child-topic", "/imu_again", "--child-frame", "b"]
     assert main(["check", parts[1], *with_itself, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["streams"]["child"]["path_m"] is None
