@@ -351,13 +351,18 @@ def _verdicts(
     rotation_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
 ) -> tuple[DofObservability, ...]:
     """Verdicts for the axes of the parent sensor's frame."""
-    to_parent = np.kron(np.eye(2), rotation_parent_child)
-    sigmas = np.sqrt(np.maximum(np.diag(to_parent @ covariance @ to_parent.T), 0.0))
-    unknown_shares = ((to_parent @ unknown) ** 2).sum(axis=1)
+    sigmas = sigmas_in_parent(rotation_parent_child, covariance)
+    unknown_shares = ((np.kron(np.eye(2), rotation_parent_child) @ unknown) ** 2).sum(axis=1)
     return tuple(
         judged(name, float("inf") if share > HIDDEN_SHARE else sigma)
         for name, sigma, share in zip(AXES, sigmas.tolist(), unknown_shares, strict=True)
     )
+
+
+def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (6,) along and about the parent's axes."""
+    to_parent = np.kron(np.eye(2), rotation_parent_child)
+    return np.sqrt(np.maximum(np.diag(to_parent @ covariance @ to_parent.T), 0.0))
 
 
 def judged(axis: str, sigma: float) -> DofObservability:

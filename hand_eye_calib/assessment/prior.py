@@ -19,6 +19,7 @@ from hand_eye_calib.assessment.covariance import (
     UNKNOWN_TRANSLATION,
     Assessment,
     judged,
+    sigmas_in_parent,
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
@@ -109,12 +110,13 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
     if not prior and not unknown.shape[1]:
         return Fused(T_parent_child, assessment, contradictions)
     root, inverse_root, targets = _whitened(T_parent_child, covariance, unknown)
-    T = T_parent_child
+    T, back = T_parent_child, T_parent_child[:3, :3].T
     for _ in range(_MAX_STEPS):
         residuals, jacobian = _prior_residuals(T, prior)
         jacobian = jacobian @ root
         normal = np.eye(6) + jacobian.T @ jacobian
-        deviations = inverse_root @ _difference(T_parent_child, T) - targets
+        apart = back @ (T[:3, 3] - T_parent_child[:3, 3]), se3.rotation_log(back @ T[:3, :3])
+        deviations = inverse_root @ np.concatenate(apart) - targets
         step = -root @ np.linalg.solve(normal, deviations + jacobian.T @ residuals)
         T = _moved(T, step)
         if np.abs(step).max() < _STEP_TOLERANCE:
@@ -122,8 +124,8 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
     if not prior:
         return Fused(T, assessment, contradictions)
     posterior = root @ np.linalg.inv(normal) @ root.T
-    sigmas = _sigmas_in_parent(T[:3, :3], posterior).tolist()
-    before = _sigmas_in_parent(T_parent_child[:3, :3], covariance)
+    sigmas = sigmas_in_parent(T[:3, :3], posterior).tolist()
+    before = sigmas_in_parent(T_parent_child[:3, :3], covariance)
     verdicts = [judged(axis, sigma) for axis, sigma in zip(AXES, sigmas, strict=True)]
     for k, (axis, sigma) in enumerate(zip(AXES, sigmas, strict=True)):
         is_known = verdicts[k].verdict is not DofVerdict.UNOBSERVABLE
@@ -138,7 +140,7 @@ def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) ->
     """
     if not spread.any():
         return assessment
-    added = _sigmas_in_parent(rotation, spread)
+    added = sigmas_in_parent(rotation, spread)
     observability = tuple(
         dof
         if dof.verdict is DofVerdict.UNOBSERVABLE
@@ -174,14 +176,6 @@ def _whitened(
     targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
     targets = np.concatenate([np.zeros(len(variances)), targets])
     return directions * sigmas, (directions / sigmas).T, targets
-
-
-def _difference(T_from: FloatArray, T_to: FloatArray) -> FloatArray:
-    """Deviation (rho, phi) of one transform from another."""
-    rotation = T_from[:3, :3].T
-    return np.r_[
-        rotation @ (T_to[:3, 3] - T_from[:3, 3]), se3.rotation_log(rotation @ T_to[:3, :3])
-    ]
 
 
 def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
@@ -245,9 +239,3 @@ def _contradictions(
             else axis in TRANSLATIONS and abs(value) > _MAX_LEVER_ARM
         )
     }
-
-
-def _sigmas_in_parent(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (6,) along and about the parent's axes."""
-    to_parent = np.kron(np.eye(2), rotation)
-    return np.sqrt(np.diag(to_parent @ covariance @ to_parent.T))

@@ -10,12 +10,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change
 from hand_eye_calib.checks.findings import Finding, Severity, finding
-from hand_eye_calib.checks.response import (
-    Fitted,
-    Regression,
-    delays,
-    response,
-)
+from hand_eye_calib.checks.response import Fitted, Regression, delays, response
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between, pairs_over
@@ -62,14 +57,12 @@ _MAX_ROTATION = 2.8
 # A coordinate explains why streams disagree if it takes away this share of the squared residuals.
 _MOST = 0.3
 
-# Delays and smoothing are looked for in motions over this time (s), so many at most. Smallest delay
-# (s), and smoothing (s^2), that count; that of interpolation is a share of the squared interval.
+# Delays and smoothing are looked for in motions over this time (s), so many at most, and speeds are
+# over it, so that noise is no speed. Smallest delay (s), and smoothing (s^2), that count; that of
+# interpolation is a share of the squared interval.
 _SHORT_S, _MOST_SHORT = 0.5, 6000
 _DELAY_S = 0.003
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
-
-# Speeds are over about this time (s), so that noise is no speed.
-_SPEED_SPAN_S = 0.4
 
 # A world moves if it does so at this share of the sensor's speed: its direction is then off by half
 # the usual target of a rotation.
@@ -152,19 +145,15 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
     if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
         size = f"{length(distance_m)} and {angle(angle_rad)}"
-        severity = _severity(distance_m < max(_SAME_M, _WITHIN * sigma_m))
-        return [finding("same_frame", severity=severity, size=size, translation_m=distance_m)]
+        is_same = distance_m < max(_SAME_M, _WITHIN * sigma_m)
+        return [_found("same_frame", "both", is_same, size=size, translation_m=distance_m)]
     size = f"{length(distance_m)} +/- {length(sigma_m)}"
-    severity = _severity(upper_m < _SAME_POSITION_M)
-    return [finding("same_position", severity=severity, size=size, translation_m=distance_m)]
-
-
-def _severity(is_error: bool | np.bool_) -> Severity:
-    return Severity.ERROR if is_error else Severity.WARNING
+    is_same = upper_m < _SAME_POSITION_M
+    return [_found("same_position", "both", is_same, size=size, translation_m=distance_m)]
 
 
 def _found(key: str, stream: str, is_error: bool | np.bool_, **values: Any) -> Finding:
-    return finding(key, stream, _severity(is_error), **values)
+    return finding(key, stream, Severity.ERROR if is_error else Severity.WARNING, **values)
 
 
 def _rotation_gain(fitted: Fitted, axes: FloatArray) -> _Suspect:
@@ -257,24 +246,28 @@ def _delays(fast: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
     one axis of its world.
     """
     for stream, columns in (("child", 0), ("parent", 3)):
-        fitted = fast.fit(f"late_{stream}")
-        delay_s, sigma_s = float(fitted.values[0]), float(fitted.sigmas[0])
-        shift_m = abs(delay_s) * _rms(speeds)
-        if abs(delay_s) > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-            parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
-            values: dict[str, Any] = {"part": parts[0], "others": parts[1]}
-            values |= {"delay_s": abs(delay_s), "sigma_s": sigma_s, "shift_m": shift_m}
-            is_error = shift_m > _SHIFTS_M[1]
-            yield fitted.share, _found("late", stream, is_error, code="position_clock", **values)
-        fitted = fast.fit(f"late_axes_{stream}")
-        k, off_s, sigma_s = _odd_one(fitted)
-        shift_m = abs(off_s) * float(np.sqrt(np.mean(speeds[:, columns + k] ** 2)))
-        # The other stream's coordinate cannot be early.
-        if off_s > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
-            values = {"part": f"{'xyz'[k]} coordinates", "others": "others"}
-            values |= {"delay_s": off_s, "sigma_s": sigma_s, "shift_m": shift_m}
-            is_error = shift_m > _SHIFTS_M[1]
-            yield fitted.share, _found("late", stream, is_error, code="axis_lag", **values)
+        whole, by_axis = fast.fit(f"late_{stream}"), fast.fit(f"late_axes_{stream}")
+        k, off_s, off_sigma_s = _odd_one(by_axis)
+        delay_s, along = float(whole.values[0]), speeds[:, columns + k]
+        parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
+        for fitted, late_s, sigma_s, speed, code, names in (
+            (whole, abs(delay_s), float(whole.sigmas[0]), _rms(speeds), "position_clock", parts),
+            # The other stream's coordinate cannot be early.
+            (
+                by_axis,
+                off_s,
+                off_sigma_s,
+                float(np.sqrt(np.mean(along**2))),
+                "axis_lag",
+                (f"{'xyz'[k]} coordinates", "others"),
+            ),
+        ):
+            shift_m = late_s * speed
+            if late_s > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
+                values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
+                told = {"part": names[0], "others": names[1]}
+                is_error = shift_m > _SHIFTS_M[1]
+                yield fitted.share, _found("late", stream, is_error, **values, **told)
 
 
 def _smoothing(fast: Regression, more_s2: float, speeds: FloatArray) -> Iterator[_Suspect]:
@@ -297,7 +290,7 @@ def _speeds(pose_pairs: PosePairs) -> FloatArray:
     left out.
     """
     positions = np.concatenate([pose_pairs.Ts_cw_c[:, :3, 3], pose_pairs.Ts_pw_p[:, :3, 3]], axis=1)
-    step = max(1, round(_SPEED_SPAN_S / max(median(np.diff(pose_pairs.stamps_ns)) * 1e-9, 1e-9)))
+    step = max(1, round(_SHORT_S / max(median(np.diff(pose_pairs.stamps_ns)) * 1e-9, 1e-9)))
     seconds = (pose_pairs.stamps_ns[step:] - pose_pairs.stamps_ns[:-step]) * 1e-9
     velocities = (positions[step:] - positions[:-step]) / seconds[:, None]
     sizes = np.linalg.norm(velocities[:, 3:], axis=1)
