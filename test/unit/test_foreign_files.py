@@ -32,23 +32,12 @@ def joined(rows, separator=" "):
     return "".join(separator.join(map(str, row)) + "\n" for row in rows)
 
 
-def minutes(degrees, n_digits):
-    """Degrees as NMEA has them."""
-    return f"{int(degrees):0{n_digits}d}{degrees % 1 * 60:012.9f}"
-
-
 def of_nmea():
+    lat, lon = ([100 * (each // 1) + each % 1 * 60 for each in deg] for deg in (LAT, LON))
     return "".join(
-        f"$GPRMC,{clock},A,,,,,,,{day},,*00\r\n$GNGGA,{clock},{minutes(lat, 2)},N,"
-        f"{minutes(lon, 3)},E,4,12,0.8,{height - 45.0:.6f},M,45.0,M,,*00\r\n"
-        for clock, day, lat, lon, height in zip(
-            [each[:-4] for each in dates("%H%M%S.%f")],
-            dates("%d%m%y"),
-            LAT,
-            LON,
-            HEIGHT,
-            strict=True,
-        )
+        f"$GPRMC,{clock[:-4]},A,,,,,,,{day},,*00\r\n$GNGGA,{clock[:-4]},{lat[k]:014.9f},N,"
+        f"{lon[k]:015.9f},E,4,12,0.8,{HEIGHT[k] - 45.0:.6f},M,45.0,M,,*00\r\n"
+        for k, (clock, day) in enumerate(zip(dates("%H%M%S.%f"), dates("%d%m%y"), strict=True))
     )
 
 
@@ -87,10 +76,10 @@ def of_colmap():
     return head + "# POINTS2D[] as (X, Y, POINT3D_ID)\n" + "".join(rows)
 
 
-def of_nerfstudio():
+def of_nerfstudio(names=TRUTH.stamps_ns, poses=TRUTH.poses):
     frames = [
-        {"file_path": f"images/{stamp}.png", "transform_matrix": (pose @ OPENGL).tolist()}
-        for stamp, pose in zip(TRUTH.stamps_ns, TRUTH.poses, strict=True)
+        {"file_path": f"images/{name}.png", "transform_matrix": (pose @ OPENGL).tolist()}
+        for name, pose in zip(names, poses, strict=True)
     ]
     return json.dumps({"camera_model": "OPENCV", "frames": frames})
 
@@ -137,7 +126,7 @@ def of_decimal_comma():
 def of_csv(unit, per_metre, time, per_second):
     """In the units that the header names."""
     names = ",".join(f"{axis} [{unit}]" for axis in "xyz")
-    head = f"time [{time}],{names},q_w,q_x,q_y,q_z\n"
+    head = f"# by hand\n# time [{time}],{names},q_w,q_x,q_y,q_z\n"
     stamps = (f"{stamp * per_second // 10**9}" for stamp in TRUTH.stamps_ns.tolist())
     rows = zip(stamps, P * per_metre, Q[:, [3, 0, 1, 2]], strict=True)
     return head + joined(([t, *p, *q] for t, p, q in rows), ",")
@@ -149,12 +138,11 @@ def of_euroc():
 
 
 FORMATS = {
-    "tum": (joined(np.c_[SECONDS, P, Q].tolist()), ""),
+    "tum": ("# of a program of eight words or so\n" + joined(np.c_[SECONDS, P, Q].tolist()), ""),
     "kitti": (joined(TRUTH.poses[:, :3].reshape(-1, 12)), "stamps read from"),
     "euroc": (of_euroc(), "looks like format euroc"),
     "csv_mm_ms": (of_csv("mm", 1e3, "ms", 1000), ""),
     "csv_cm_us": (of_csv("cm", 1e2, "us", 10**6), ""),
-    "csv_m_ns": (of_csv("m", 1.0, "ns", 10**9), ""),
     "iso": (of_iso(), ""),
     "decimal_comma": (of_decimal_comma(), ""),
     "colmap": (of_colmap(), ""),
@@ -204,18 +192,10 @@ def test_arrays_and_graphs(tmp_path):
     assert "numbers of its vertices are taken for seconds" in found.guesses[0]
 
 
-def images(names, poses):
-    frames = [
-        {"file_path": f"images/{name}.png", "transform_matrix": (pose @ OPENGL).tolist()}
-        for name, pose in zip(names, poses, strict=True)
-    ]
-    return json.dumps({"frames": frames})
-
-
 def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_path, capsys):
     names = [f"{chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(N)]
-    (tmp_path / "a.json").write_text(images(names, TRUTH.poses))
-    (tmp_path / "b.json").write_text(images(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1]))
+    (tmp_path / "a.json").write_text(of_nerfstudio(names))
+    (tmp_path / "b.json").write_text(of_nerfstudio(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1]))
     for name, poses in (("a.kitti", TRUTH.poses), ("b.kitti", TRUTH.poses @ MOUNT)):
         (tmp_path / name).write_text(joined(poses[:, :3].reshape(-1, 12)))
     for kind, by in (("json", "name"), ("kitti", "row")):
@@ -278,13 +258,7 @@ def test_a_log_of_px4_is_turned_to_east_north_up(tmp_path, monkeypatch):
         (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
         (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),
         (b'{"frames":' * 100_000, "recursion|expected|JSON"),
-        (b"%  GPST  latitude(deg) longitude(deg)\n1\n", "list index out of range|expected"),
         (b"Format Version,1\nTime (Seconds)\n", "Motive|list index"),
-        (
-            b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, "
-            b"'shape': (10000000000, 8), }" + b" " * 42 + b"\n",
-            "cannot read",
-        ),
     ],
 )
 def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message):

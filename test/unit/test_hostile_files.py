@@ -14,7 +14,6 @@ from result_making import calibration
 from hand_eye_calib.cli.batch.run import stored
 from hand_eye_calib.cli.batch.work import Task
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import load_result, save_result
 from hand_eye_calib.io.trajectory_files import read_trajectory_file, write_trajectory
 
@@ -53,19 +52,13 @@ HOSTILE_YAML = {
 }
 
 
-@pytest.mark.parametrize(
-    ("command", "kind"),
-    [("config", each) for each in HOSTILE_YAML] + [("info", "aliases")],
-)
-def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, command, kind):
+@pytest.mark.parametrize("kind", HOSTILE_YAML)
+def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, kind):
     text, message = HOSTILE_YAML[kind]
     path = tmp_path / "file.yaml"
     path.write_text(text)
-    arguments = {
-        "info": ["info", path],
-        "config": ["replay", tmp_path, "--config", path],
-    }[command]
-    code, out, err = run(*arguments)
+    is_result = kind == "aliases"
+    code, out, err = run(*(["info", path] if is_result else ["replay", ".", "--config", path]))
     assert (code in (1, 2), out) == (True, "")
     (line,) = err.splitlines()
     assert message in line
@@ -132,15 +125,6 @@ def test_a_name_that_is_too_long_for_a_file_is_one_line(run, tmp_path, command):
 # ---- batches
 
 
-@pytest.fixture
-def bag(tmp_path):
-    write_bag(
-        tmp_path / "bag",
-        {"/a": (PARENT, "nav_msgs/msg/Odometry"), "/b": (CHILD, "nav_msgs/msg/Odometry")},
-    )
-    return tmp_path / "bag"
-
-
 @pytest.mark.parametrize("state", ["5", "[" * 100_000, '{"key": 1}\n{}', '{"key": "K"}\n{}'])
 def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
     task = Task(name="a", bags=("absent",))
@@ -161,20 +145,6 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
         one_line(caught)
     with pytest.raises(InputError, match="is not a regular file"):
         load_result(path)
-
-
-@pytest.mark.parametrize(
-    ("format", "end"), [("auto", "#\n"), ("csv", "\n"), ("csv", "#\n"), ("euroc", "\r\n")]
-)
-def test_empty_lines_take_no_memory_beside_that_of_the_text(tmp_path, format, end):
-    path = tmp_path / "empty.txt"
-    path.write_bytes(end.encode() * 50_000)
-    tracemalloc.start()
-    with pytest.raises(InputError, match="no poses in it"):
-        read_trajectory_file(path, format)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 4 * path.stat().st_size
 
 
 def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix(tmp_path):
@@ -202,17 +172,23 @@ def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
         one_line(caught)
 
 
-@pytest.mark.parametrize("format", ["tum", "kitti", "euroc", "csv"])
+@pytest.mark.parametrize(
+    ("format", "row"),
+    [
+        ("tum", "{t} {x} 0 0 0 0 0 1"),
+        ("tum", "{t} 0 0 0 {w} 0 0 {w}"),
+        ("kitti", "1 0 0 {x} 0 1 0 0 0 0 1 0"),
+        ("kitti", "{w} 0 0 0 0 {w} 0 0 0 0 1 0"),
+        ("euroc", "{t}000000000,{x},0,0,1,0,0,0"),
+        ("csv", "{t},{x},0,0,0,0,0,1"),
+    ],
+)
 @pytest.mark.parametrize("value", ["1e154", "-1e200", "1.7e308", "1e9", "1e999", "nan", "0x10"])
-def test_a_position_out_of_this_world_is_named(tmp_path, format, value):
-    rows = {
-        "tum": "{t} {x} 0 0 0 0 0 1",
-        "kitti": "1 0 0 {x} 0 1 0 0 0 0 1 0",
-        "euroc": "{t}000000000,{x},0,0,1,0,0,0",
-        "csv": "{t},{x},0,0,0,0,0,1",
-    }
+def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     lines = ["t,x,y,z,qx,qy,qz,qw"] if format == "csv" else []
-    lines += [rows[format].format(t=t, x=value if t == 3 else t) for t in range(1, 9)]
+    of_one = {True: "1", False: "0.7071067811865476"}["{x}" in row or format == "kitti"]
+    for t in range(1, 9):
+        lines.append(row.format(t=t, x=value if t == 3 else t, w=value if t == 3 else of_one))
     path, times = tmp_path / "parent", tmp_path / "times"
     path.write_text("\n".join(lines))
     times.write_text("\n".join(map(str, range(1, 9))))
@@ -220,18 +196,6 @@ def test_a_position_out_of_this_world_is_named(tmp_path, format, value):
     with pytest.raises(InputError, match=f"parent, line {3 + (format == 'csv')}: ") as caught:
         read_trajectory_file(path, format, **options)
     one_line(caught)
-
-
-@pytest.mark.parametrize("value", ["1e154", "1e308", "-1e200", "1e60"])
-def test_rotations_out_of_this_world_are_named(tmp_path, value):
-    path, times = tmp_path / "parent", tmp_path / "times"
-    times.write_text("1\n2\n")
-    path.write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{value} 0 0 0 0 {value} 0 0 0 0 1 0\n")
-    with pytest.raises(InputError, match="parent, line 2: the 3x3 part is not a rotation matrix"):
-        read_trajectory_file(path, "kitti", times=times)
-    path.write_text(f"1 0 0 0 0 0 0 1\n2 0 0 0 {value} 0 0 {value}\n")
-    with pytest.raises(InputError, match="parent, line 2: found a quaternion of length"):
-        read_trajectory_file(path, "tum")
 
 
 # ---- results
