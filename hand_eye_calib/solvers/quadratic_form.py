@@ -55,6 +55,7 @@ def _tables() -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
 
 
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
+_MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 _TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
 _TRIANGLE[_ROWS, _COLUMNS] = _TRIANGLE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
 _GENERATORS = se3.skew(np.eye(3))
@@ -118,9 +119,9 @@ def monomials(T_parent_child: FloatArray) -> FloatArray:
     """Products ``x_i x_j`` (..., 91) of two variables of transforms (..., 4, 4), doubled off the
     diagonal, which map condensed forms to costs.
     """
-    x = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,)).take(_X_IN_T, axis=-1)
-    doubled = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
-    return x.take(_ROWS, axis=-1) * (x.take(_COLUMNS, axis=-1) * doubled)
+    entries = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
+    first = entries.take(_X_IN_T[_ROWS], axis=-1)
+    return first * (entries.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY)
 
 
 def expand(condensed: FloatArray) -> FloatArray:
