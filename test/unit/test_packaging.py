@@ -17,6 +17,7 @@ from hand_eye_calib.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "hand_eye_calib"
+WHERE = "import hand_eye_calib; print(hand_eye_calib.__file__)"
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 
 # Library imported: (requirement in setup.py, key in package.xml); None where that side has no say,
@@ -70,13 +71,8 @@ def run(command, **options):
 
 def clean_environment(**extra):
     """The environment without what a parent's ROS wheels or another workspace put there."""
-    dropped = {
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-        "LD_LIBRARY_PATH",
-        "PYTHONPATH",
-        "AMENT_PREFIX_PATH",
-        "COLCON_PREFIX_PATH",
-    }
+    dropped = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH"}
+    dropped |= {"AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"}
     kept = {name: value for name, value in os.environ.items() if name not in dropped}
     # As in an activated virtual environment: installed commands take the interpreter on PATH.
     kept["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), kept.get("PATH", "")])
@@ -184,11 +180,7 @@ def test_pip_install_gives_the_commands(source, tmp_path):
         "replay",
     ]
     assert not (target / "lib" / PACKAGE).exists()
-    where = run(
-        [sys.executable, "-c", "import hand_eye_calib; print(hand_eye_calib.__file__)"],
-        env=environment,
-        cwd=tmp_path,
-    )
+    where = run([sys.executable, "-c", WHERE], env=environment, cwd=tmp_path)
     assert Path(where.stdout.strip()).is_relative_to(site)
     assert (site / PACKAGE / "report" / "templates" / "report.html").is_file()
     for command, said in (
@@ -215,17 +207,9 @@ def install_space(source, tmp_path_factory):
     workspace = tmp_path_factory.mktemp("workspace")
     colcon = [sys.executable, "-m", "colcon", "--log-base", workspace / "log", "build"]
     options = ["--base-paths", source, "--packages-select", PACKAGE]
-    run(
-        [*colcon, *options, "--event-handlers", "console_direct+"],
-        env=clean_environment(),
-        cwd=workspace,
-    )
+    options += ["--event-handlers", "console_direct+"]
+    run([*colcon, *options], env=clean_environment(), cwd=workspace)
     return workspace / "install"
-
-
-def in_install_space(install_space, command):
-    """A shell command after sourcing the install space, in the interpreter's environment."""
-    return ["bash", "-c", f"source '{install_space}/setup.bash' && exec {command}"]
 
 
 def test_colcon_lays_out_the_install_space(install_space):
@@ -235,37 +219,17 @@ def test_colcon_lays_out_the_install_space(install_space):
     assert set(executables) == {PACKAGE, *COMMANDS}
     for path in executables.values():
         assert path.read_text(encoding="utf-8").splitlines()[0] == "#!/usr/bin/env python3"
-    where = in_install_space(
-        install_space,
-        f"{sys.executable} -c 'import hand_eye_calib; print(hand_eye_calib.__file__)'",
-    )
-    package = Path(run(where, env=clean_environment(), cwd=install_space).stdout.strip()).resolve()
+    program = f"source '{install_space}/setup.bash' && {sys.executable} -c '{WHERE}'"
+    where = run(["bash", "-c", program], env=clean_environment(), cwd=install_space)
+    package = Path(where.stdout.strip()).resolve()
     assert package.is_relative_to(prefix)
 
 
-# Runs installed programs one after the other as a shell does, without an interpreter for each.
-EVERY_HELP = """
-import runpy, sys
-for path in sys.argv[1:]:
-    sys.argv = [path, "--help"]
-    try:
-        runpy.run_path(path, run_name="__main__")
-    except SystemExit as end:
-        assert not end.code, path
-"""
-
-
-def test_colcon_installed_commands_run(install_space, tmp_path):
+def test_colcon_installed_commands_run(install_space):
     folder = install_space / PACKAGE / "lib" / PACKAGE
-    program = tmp_path / "every_help.py"
-    program.write_text(EVERY_HELP)
-    paths = " ".join(f"'{folder}/{command}'" for command in COMMANDS)
-    one_by_one = in_install_space(install_space, f"{sys.executable} '{program}' {paths}")
-    said = run(one_by_one, env=clean_environment(), cwd=install_space).stdout
+    each = f"for each in {' '.join(COMMANDS)}; do '{folder}'/$each --help; done"
+    program = f"source '{install_space}/setup.bash' && {each} && '{folder}/{PACKAGE}' --version"
+    said = run(["bash", "-c", program], env=clean_environment(), cwd=install_space).stdout
     for command in COMMANDS:
         assert f"usage: hand_eye_calib {command}" in said
-    version = in_install_space(install_space, f"'{folder}/{PACKAGE}' --version")
-    assert (
-        MANIFEST.findtext("version")
-        in run(version, env=clean_environment(), cwd=install_space).stdout
-    )
+    assert MANIFEST.findtext("version") in said

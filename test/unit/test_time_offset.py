@@ -139,27 +139,16 @@ class TestClockRate:
 
 
 class TestInTheEngine:
-    def test_result_carries_the_offset_and_its_uncertainty(self):
-        parent, child = drive(shift_s=123.456, noise=0.0005)
-        result = calibrate(parent, child, time_offset="estimate", reference="B5")
-        assert result.time_offset_s == pytest.approx(123.456, abs=0.002)
-        assert 0 < result.time_offset_sigma_s < 0.002
-        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
-        document = result.to_dict()
-        assert document["time_offset_sigma_s"] == result.time_offset_sigma_s
-        assert type(result).from_dict(document).time_offset_sigma_s == result.time_offset_sigma_s
-
     def test_uncertainty_of_the_offset_enters_that_of_the_extrinsic(self):
         parent, child = drive(noise=0.0005)
         estimated = calibrate(parent, child, time_offset="estimate", reference="B5")
+        assert 0 < estimated.time_offset_sigma_s < 0.002
+        again = type(estimated).from_dict(estimated.to_dict())
+        assert again.time_offset_sigma_s == estimated.time_offset_sigma_s
         given = calibrate(parent, child, time_offset=estimated.time_offset_s, reference="B5")
         np.testing.assert_array_equal(given.T_parent_child, estimated.T_parent_child)
         assert given.time_offset_sigma_s == 0.0
         assert np.linalg.eigvalsh(estimated.covariance - given.covariance)[-1] > 0
-        assert any(
-            one.sigma > other.sigma
-            for one, other in zip(estimated.observability, given.observability, strict=True)
-        )
 
     def test_long_sessions_settle_it_when_a_buffer_is_full(self):
         parent, child = drive(seconds=120, shift_s=0.2)

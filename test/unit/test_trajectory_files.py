@@ -56,7 +56,6 @@ def assert_is_the_trajectory(found, stamps_ns=TRAJECTORY.stamps_ns):
     ("text", "stamp_ns"),
     [
         ("1317375625.661736", 1317375625661736000),
-        ("1317375625.661736123", 1317375625661736123),
         ("1317375625.6617361234", 1317375625661736123),  # a tenth digit is rounded
         (".5", 500_000_000),
         ("-0.000000001", -1),
@@ -88,10 +87,8 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ([], "no poses in it"),
         (["0 1 2 3 0 0 0 1 9"], "line 1: expected 8 numbers, .* found 9"),
         ([f"0 {POSE}", "", "1 1 2 3"], "line 3: expected 8 numbers, .* found 4: '1 1 2 3'"),
-        ([f"0,{POSE.replace(' ', ',')}"], "line 1: expected 8 numbers"),
         (["0 1 2 x 0 0 0 1"], "line 1: expected 8 numbers, .* 'x'"),
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),
-        ([f"1e999999999 {POSE}"], "line 1: .* timestamp"),
         ([f"13173756256617361230 {POSE}"], "line 1: .* 1.31738e.19 is too large for ns; name its"),
         ([f"{t} {POSE}" for t in (0, 33, 66)], "is unclear; read as s, the poses are 33 s apart"),
         ([f"0 {POSE}", "1 nan 2 3 0 0 0 1"], "line 2: found a value that is not finite"),
@@ -144,32 +141,27 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
             hec.read_trajectory(path, "kitti", times=beside)
 
 
-MESSAGE = ".pose.pose.position.{}".format
-TURN = ".pose.pose.orientation.{}".format
-
-
 @pytest.mark.parametrize(
-    ("header", "order", "separator"),
+    ("header", "separator"),
     [
         (
-            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
-            "q_RS_y [], q_RS_z []",
-            "wxyz",
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y, p_RS_R_z, q_RS_w [], q_RS_x, q_RS_y, q_RS_z",
             ", ",
         ),
-        ("timestamp; tx; ty; tz; qw; qx; qy; qz", "wxyz", ";"),
-        ("# time px py pz q_w q_x q_y q_z", "wxyz", " "),
-        ("Stamp [ns],Pos_X [m],Pos_Y [m],Pos_Z [m],rot_w,rot_x,rot_y,rot_z", "wxyz", ","),
+        ("timestamp; tx; ty; tz; qw; qx; qy; qz", ";"),
+        ("# time px py pz q_w q_x q_y q_z", " "),
+        ("Stamp [ns],Pos_X [m],Pos_Y [m],Pos_Z [m],rot_w,rot_x,rot_y,rot_z", ","),
     ],
 )
-def test_csv_finds_its_columns_by_their_names(file, header, order, separator):
-    path = file([header, *rows(TRAJECTORY.stamps_ns, order, separator)])
+def test_csv_finds_its_columns_by_their_names(file, header, separator):
+    path = file([header, *rows(TRAJECTORY.stamps_ns, "wxyz", separator)])
     assert_is_the_trajectory(hec.read_trajectory(path, "csv"))
 
 
 def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
     names = ["time", ".header.stamp.secs", ".header.stamp.nsecs", ".child"]
-    names += [*map(MESSAGE, "xyz"), *map(TURN, "xyzw"), ".covariance"]
+    names += [f".pose.pose.position.{axis}" for axis in "xyz"]
+    names += [*(f".pose.pose.orientation.{axis}" for axis in "xyzw"), ".covariance"]
     lines = []
     for number, row in enumerate(rows(TRAJECTORY.stamps_ns)):
         stamp, _, pose = row.partition(",")
