@@ -118,8 +118,9 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
         assert pip_name is None or pip_name in requirements, (
             f"{name} is imported; setup.py does not require {pip_name}"
         )
-    # The saved launch file and the printed command run an executable of it.
-    assert keys - {DECLARED_AS[name][1] for name in imported} == {"tf2_ros"}
+    # The saved launch file and the printed command run an executable of one; messages are imported
+    # by the names of their types.
+    assert keys - {DECLARED_AS[name][1] for name in imported} == {"tf2_ros", "sensor_msgs"}
 
 
 @pytest.mark.parametrize(

@@ -105,8 +105,7 @@ class TestOptionsOfCalibrate:
         result = hec.calibrate(parent, child, reference="B1", max_pairs=20)
         assert result.n_poses <= 20
         assert offline_config(parent, child, {}).max_pairs == 60
-
-    def test_of_two_files_of_a_million_poses_one_in_ten_is_used(self):
+        # Of two files of a million poses one in ten is used.
         poses = np.broadcast_to(np.eye(4), (1_000_000, 4, 4))
         long = hec.Trajectory(np.arange(1_000_000), poses)
         config = offline_config(long, long, {})

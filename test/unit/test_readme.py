@@ -122,12 +122,9 @@ def test_limits_are_those_of_the_code():
     assert limits_table() in PAGES["docs/limits.md"], f"docs/limits.md must have this table; {HINT}"
 
 
-def test_readme_is_short():
-    assert FEWEST_WORDS <= len(PAGES["README.md"].split()) <= MOST_WORDS
-
-
-def test_readme_names_its_two_commands_and_shows_the_report():
+def test_readme_is_short_names_its_two_commands_and_shows_the_report():
     readme = PAGES["README.md"]
+    assert FEWEST_WORDS <= len(readme.split()) <= MOST_WORDS
     assert "`make demo`" in readme
     assert "`make test`" in readme
     assert (ROOT / "docs" / "images" / "report.png").stat().st_size < 200_000
@@ -180,12 +177,20 @@ def test_every_command_has_its_line():
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_launch_arguments_exist(page):
+def test_launch_arguments_make_targets_and_files_exist(page):
+    """Pages name files of the package from its root, such as ``solvers/ipopt.py``."""
     launch_file = (ROOT / "launch" / "calibrator.launch.py").read_text(encoding="utf-8")
     lines = [line for line in PAGES[page].splitlines() if line.startswith("ros2 launch")]
     names = {name for line in lines for name in re.findall(r"(\w+):=", line)}
     parameters = {*CalibratorConfig().to_options(), *NodeConfig().to_options()}
     assert {name for name in names - parameters if f'"{name}"' not in launch_file} == set()
+    code = "\n".join(re.findall(r"`[^`\n]+`|```bash\n.*?```", PAGES[page], re.DOTALL))
+    mentioned = set(re.findall(r"(?:^|`)make ([a-z-]+)", code, re.MULTILINE))
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert mentioned <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
+    names = re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.py)(?::\d+)?`", PAGES[page])
+    folders = (ROOT, ROOT / "hand_eye_calib")
+    assert [name for name in names if not any((top / name).exists() for top in folders)] == []
 
 
 def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
@@ -228,14 +233,6 @@ def test_relative_link_leads_somewhere(page, target):
         assert anchor in anchors(found.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_make_targets_exist(page):
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    code = "\n".join(re.findall(r"`[^`\n]+`|```bash\n.*?```", PAGES[page], re.DOTALL))
-    mentioned = set(re.findall(r"(?:^|`)make ([a-z-]+)", code, re.MULTILINE))
-    assert mentioned <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
-
-
 def test_every_package_has_its_line():
     packages = PAGES["docs/architecture.md"].partition("## Packages")[2].partition("\n## ")[0]
     first = " ".join(re.findall(r"^\| (`[^|]*) \|", packages, re.MULTILINE))
@@ -243,14 +240,6 @@ def test_every_package_has_its_line():
     source = ROOT / "hand_eye_calib"
     found = [f"{path.parent.name}/" for path in source.glob("*/__init__.py")]
     assert sorted(table) == sorted([*found, *(path.name for path in source.glob("*.py"))])
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_files_of_the_package_exist(page):
-    """Pages name files of the package from its root, such as ``solvers/ipopt.py``."""
-    names = re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.py)(?::\d+)?`", PAGES[page])
-    folders = (ROOT, ROOT / "hand_eye_calib")
-    assert [name for name in names if not any((top / name).exists() for top in folders)] == []
 
 
 def with_tables_of_the_code(text):

@@ -24,9 +24,7 @@ child = hec.Trajectory(np.arange(3), np.repeat(np.eye(4)[None], 3, axis=0))
 result = hec.calibrate(parent, child, method="dnlo", reference="B5", time_offset="estimate")
 result = hec.calibrate(parent, child, prior={"z": (1.85, 0.02)}, keyframe_min_translation=0.1)
 hec.calibrate(parent, child, metod="dnlo")  # wrong
-hec.calibrate(1, 2)  # wrong
 hec.calibrate(parent, child, "dnlo")  # wrong
-hec.calibrate(parent, child, threshold="small")  # wrong
 hec.calibrate(parent, child, prior={"z": 1.85})  # wrong
 hec.calibrat(parent, child)  # wrong
 inliers = int(result.residuals().is_inlier.sum())
@@ -37,26 +35,21 @@ path = hec.save(result, "results")
 again: hec.Calibration = hec.load(path)
 again.T_child_paren  # wrong
 config = hec.CalibratorConfig(method="dnl", max_gap=1.0)
-hec.CalibratorConfig(methd="dnl")  # wrong
 calibrator = hec.Calibrator(config)
 version: str = hec.__version__
 child = hec.read_trajectory(np.zeros((3, 8)), columns="t,x,y,z,qw,qx,qy,qz")
 child = hec.read_trajectory(np.zeros((3, 4, 4)), times=np.arange(3.0))
-child = hec.read_trajectory(np.zeros((3, 4, 4)), time=np.arange(3.0))  # wrong
 child = hec.read_trajectory(5)  # wrong
 hec.calibrate(parent, child, progress=lambda share, step: print(f"{share:.0%} {step}"))
 hec.calibrate(parent, child, progress="done")  # wrong
-hec.calibrate(parent, child, checks=False)
 rig: hec.RigCalibration = hec.calibrate_rig({"a": parent, "b": child}, time_offset="estimate")
 hec.calibrate_rig([parent, child])  # wrong
 hec.write_trajectory("moved.tum", parent)
 hec.plot(result).savefig("result.png")
 hec.calibrate("lidar.tum", np.zeros((3, 8)), method="dnl", scale=1.0)
 hec.calibrate(parent, child, method="dnlp")  # wrong
-hec.calibrate(parent, child, time_offset="estimat")  # wrong
 back: hec.Calibration = result.inverse()
 truth = hec.simulate(3, poses=100).T_parent_child
-hec.plot(parent)  # wrong
 part = parent[:10].shifted(0.5).scaled(2.0).at(np.array([5]))
 """
 
