@@ -7,10 +7,10 @@ changed outside the directory of the results.
 import contextlib
 import functools
 import io
-import os
 import tempfile
 from pathlib import Path
 
+import pytest
 from fuzz import text_inputs
 from fuzz.chaos import Chaos
 
@@ -163,18 +163,14 @@ def exercise(name, seed, folder):
     (case / "mine").write_text("mine")
     for outside in ("tmp", "home"):
         (case / outside).mkdir()
-    kept = {key: os.environ.get(key) for key in ("TMPDIR", "HOME")}
-    os.environ["MPLCONFIGDIR"] = str(Path(folder).parent)  # its list of fonts is written once
-    os.environ |= {"TMPDIR": str(case / "tmp"), "HOME": str(case / "home")}
-    tempfile.tempdir = None
     (case / "inside").mkdir()
     before = snapshot(case)
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MPLCONFIGDIR", str(Path(folder).parent))  # its list of fonts is written once
+        patch.setenv("TMPDIR", str(case / "tmp"))
+        patch.setenv("HOME", str(case / "home"))
+        patch.setattr(tempfile, "tempdir", None)
         code = FORMATS[name](Chaos(f"{name} {seed}"), case / "inside")
-    finally:
-        for key, value in kept.items():
-            os.environ.pop(key) if value is None else os.environ.update({key: value})
-        tempfile.tempdir = None
     changed = {path for path in snapshot(case) if "/inside/" not in path} - before.keys()
     changed |= {path for path in before if snapshot(case).get(path) != before[path]}
     inputs = ("bag", "a%31#?.db3", "parent", "child", "times", "file.yaml", "extrinsic.yaml",

@@ -15,7 +15,6 @@ from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-QOS_OF_PARENT = "qos_overrides./parent_odom.subscription.reliability"
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 
 

@@ -6,7 +6,6 @@ from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.assessment.covariance import (
     assess,
-    jackknife_covariance,
     judged,
     model_covariance,
 )
@@ -70,19 +69,6 @@ def test_the_model_alone_is_right_for_independent_pairs():
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.mean(sigmas, axis=0)
     assert (ratio > 0.75).all()
     assert (ratio < 1.3).all()
-
-
-def test_jackknife_of_a_mean_is_its_standard_error():
-    values = np.random.default_rng(1).normal(size=1000)
-
-    def mean_without(left_out):
-        means = [values[~row].mean() for row in left_out]
-        return se3.exp(np.c_[means, np.zeros((len(means), 5))])
-
-    covariance = jackknife_covariance(
-        1000, se3.exp(np.r_[values.mean(), np.zeros(5)]), mean_without
-    )
-    assert np.sqrt(covariance[0, 0]) == pytest.approx(values.std() / np.sqrt(1000), rel=0.5)
 
 
 @pytest.mark.parametrize("kind", ["white", "drift"])

@@ -16,7 +16,6 @@ import hand_eye_calib as hec
 from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine import estimation
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.verdict import Verdict
@@ -83,18 +82,6 @@ class TestWhichAnswerStands:
         np.testing.assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
         assert (result.method, result.reference) == ("dnlo", "B3")
         assert result.method_reason == "auto: dnlo, because the user set reference B3"
-
-    def test_the_estimator_is_solved_once(self, monkeypatch):
-        solves = []
-        solve = estimator.solve
-        monkeypatch.setattr(
-            estimator,
-            "solve",
-            lambda *poses, **options: solves.append(len(poses[0])) or solve(*poses, **options),
-        )
-        streams = noisy_streams()
-        whole_snapshot(offline_config(*streams, {"method": "auto"}), *streams).estimate()
-        assert solves == [150]
 
 
 def test_the_reference_whose_answer_is_nearest_is_chosen():

@@ -22,7 +22,6 @@ import yaml
 from motions import disturbed, write_pair
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.present import as_text
@@ -34,7 +33,6 @@ from hand_eye_calib.io.results import load_result
 from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.records import Finding, Severity
-from hand_eye_calib.text import told_apart
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -420,14 +418,6 @@ def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, 
 # ---- the program around the commands
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_every_command_is_there_and_explains_itself(run, name):
-    code, out, err = run(name, "--help")
-    assert (code, err) == (0, "")
-    assert f"usage: hand_eye_calib {name} " in out
-    assert cli.COMMANDS[name] in " ".join(out.split())
-
-
 def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     seen = []
     monkeypatch.setattr("hand_eye_calib.ros.node.main", lambda args: seen.append(args) or 5)
@@ -512,20 +502,6 @@ def test_messages_name_options_as_they_are_typed(capsys):
         "hand_eye_calib: note: give --scale or --child-columns, not `this`\n"
         "hand_eye_calib: error: --keyframe-min-interval: no scale\n"
     )
-
-
-@pytest.mark.parametrize(
-    ("paths", "names"),
-    [
-        (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a/monday", "b/monday", "b/tuesday"]),
-        (["bag", "deep/bag"], ["bag", "deep"]),
-        (["a/bag", "a/bag"], ["bag", "bag"]),
-        (["a/bag"], ["bag"]),
-        ([], []),
-    ],
-)
-def test_paths_are_told_apart_without_what_they_share(paths, names):
-    assert told_apart(paths) == names
 
 
 def test_control_characters_in_names_do_not_reach_the_terminal(capsys):

@@ -206,10 +206,8 @@ class TestLeverArm:
 def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, capsys):
     parent, child = streams
     lat, lon, height = geodetic(child.poses[:, :3, 3], (60.0, 25.0, 40.0))
-    rows = [
-        f"{stamp},{a:.11f},{b:.11f},{c:.5f}"
-        for stamp, a, b, c in zip(child.stamps_ns.tolist(), lat, lon, height, strict=True)
-    ]
+    places = zip(child.stamps_ns.tolist(), lat, lon, height, strict=True)
+    rows = [f"{stamp},{a:.11f},{b:.11f},{c:.5f}" for stamp, a, b, c in places]
     hec.write_trajectory(tmp_path / "lidar.tum", parent)
     (tmp_path / "gnss.csv").write_text("\n".join(["t_ns,latitude,longitude,altitude", *rows]))
     code = main(["calibrate", str(tmp_path / "lidar.tum"), str(tmp_path / "gnss.csv")])

@@ -14,17 +14,14 @@ from motions import (
     disturbed,
     feed,
     messages,
-    planar_poses,
     wandering_poses,
 )
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.snapshot import downsample
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
 
 # 10 s at 10 Hz, so that a short drive outgrows the buffers many times; half a second for late
 # arrivals.
@@ -125,16 +122,6 @@ def test_the_informative_pairs_are_kept_not_the_newest():
     assert (stamps_ns <= parent.stamps_ns[1199]).sum() > 900
     result = calibrator.estimate()
     np.testing.assert_allclose(result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3)
-
-
-def test_downsampling_keeps_both_ends_and_the_limit():
-    poses = planar_poses(3000)
-    pairs = PosePairs(np.arange(3000), poses, child_of(poses))
-    for limit in (10, 100, 2999, 3000):
-        left = downsample(pairs, limit)
-        assert len(left) <= limit
-        assert (left.stamps_ns[0], left.stamps_ns[-1]) == (0, 2999)
-        assert (np.diff(left.stamps_ns) > 0).all()
 
 
 def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):

@@ -22,19 +22,14 @@ TWIST = "geometry_msgs/msg/TwistStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
 GEO = "geographic_msgs/msg/GeoPoseStamped"
-JAZZY.register(
-    get_types_from_msg(
-        "uint64 timestamp\nuint64 timestamp_sample\nfloat32[3] position\nfloat32[4] q\n", PX4
-    )
-    | get_types_from_msg(
-        "float64 latitude\nfloat64 longitude\nfloat64 altitude", "geographic_msgs/msg/GeoPoint"
-    )
-    | get_types_from_msg(
-        "geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation",
-        "geographic_msgs/msg/GeoPose",
-    )
-    | get_types_from_msg("std_msgs/Header header\ngeographic_msgs/GeoPose pose", GEO)
-)
+POINT, POSE = "geographic_msgs/msg/GeoPoint", "geographic_msgs/msg/GeoPose"
+for name, fields in {
+    PX4: "uint64 timestamp\nuint64 timestamp_sample\nfloat32[3] position\nfloat32[4] q\n",
+    POINT: "float64 latitude\nfloat64 longitude\nfloat64 altitude",
+    POSE: "geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation",
+    GEO: "std_msgs/Header header\ngeographic_msgs/GeoPose pose",
+}.items():
+    JAZZY.register(get_types_from_msg(fields, name))
 
 
 def made(name, *values, **more):
@@ -46,10 +41,7 @@ def messages():
     lat, lon, height = geodetic(P - P[0], (48.1, 11.5, 550.0))
     steps = se3.log(se3.inverse(TRUTH.poses[:-1]) @ TRUTH.poses[1:]) / 0.05
     twists = np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
-    status = made(
-        "sensor_msgs/msg/NavSatStatus",
-        *((0, 1, 0)[: len(JAZZY.fielddefs["sensor_msgs/msg/NavSatStatus"][1])]),
-    )
+    status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
     types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
     found = {key: [] for key in types.items()}
     zero, nine = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9)
@@ -57,14 +49,14 @@ def messages():
         head, quaternion = header(JAZZY, stamp_ns, "sensor"), made("Quaternion", *Q[k])
         linear, angular = (made("Vector3", *part) for part in (twists[k, :3], twists[k, 3:]))
         pose = made("Pose", made("Point", *P[k]), quaternion)
-        point = made("geographic_msgs/msg/GeoPoint", lat[k], lon[k], height[k])
+        point = made(POINT, lat[k], lon[k], height[k])
         each = {
             TWIST: (head, made("Twist", linear, angular)),
             FIX: (head, status, lat[k], lon[k], height[k], nine, 0),
             IMU: (head, quaternion, nine, zero, nine, zero, nine),
             PX4: (0, stamp_ns // 1000, P[k].astype("f4"), np.roll(Q[k], 1).astype("f4")),
             ARRAY: (head, [pose, pose]),
-            GEO: (head, made("geographic_msgs/msg/GeoPose", point, quaternion)),
+            GEO: (head, made(POSE, point, quaternion)),
         }
         for key in found:
             found[key].append(made(key[1], *each[key[1]]))
@@ -128,11 +120,8 @@ def test_messages_of_json(tmp_path):
             sec, nsec = divmod(stamp_ns, 10**9)
             parts = (("position", dict(zip("xyz", P[k], strict=True))),
                      ("orientation", dict(zip("xyzw", Q[k], strict=True))))  # fmt: skip
-            message = {
-                "timestamp": {"sec": sec, "nsec": nsec},
-                "frame_id": "map",
-                "pose": dict(parts),
-            }
+            message = {"timestamp": {"sec": sec, "nsec": nsec}, "pose": dict(parts)}
+            message["frame_id"] = "map"
             writer.add_message(channel, stamp_ns, json.dumps(message).encode(), stamp_ns)
         writer.finish()
     found = read_bag_trajectory(path, "/pose")

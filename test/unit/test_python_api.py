@@ -63,35 +63,17 @@ class TestOptionsOfCalibrate:
         )
         solved = SimpleNamespace(calibration=result_making.calibration(), snapshot=None)
         monkeypatch.setattr("hand_eye_calib.engine.offline.run", lambda *_, **__: solved)
-        given = dict(
-            method="dnl",
-            reference="C7",
-            backend="ipopt",
-            threshold=0.25,
-            min_inlier_fraction=0.125,
-            min_pairs=4,
-            max_pairs=77,
-            keyframe_min_translation=0.5,
-            keyframe_min_rotation=0.25,
-            keyframe_min_interval=2.0,
-            max_gap=3.0,
-            time_offset="estimate",
-            scale=2.0,
-            parent_scale=0.5,
-            parent_invert="poses",
-            child_invert="orientations",
-            parent_quaternion="wxyz",
-            child_quaternion="wxyz",
-            parent_measures="rates",
-            child_measures="rotations",
-            parent_kind="exact",
-            child_kind="exact",
-            target_translation=0.5,
-            target_rotation=0.25,
-            target_axes="z=0.1",
-            parent_frame="lidar",
-            child_frame="camera",
-        )
+        numbers = ["threshold", "min_inlier_fraction", "max_gap", "scale", "parent_scale"]
+        numbers += [f"keyframe_min_{each}" for each in ("translation", "rotation", "interval")]
+        numbers += ["target_translation", "target_rotation"]
+        given = {name: 0.0625 * k for k, name in enumerate(numbers, 1)}
+        given |= dict(method="dnl", reference="C7", backend="ipopt", min_pairs=4, max_pairs=77)
+        given |= dict(time_offset="estimate", target_axes="z=0.1")
+        given |= dict(parent_invert="poses", child_invert="orientations")
+        given |= dict(parent_measures="rates", child_measures="rotations")
+        given |= dict(parent_frame="lidar", child_frame="camera")
+        for stream in ("parent", "child"):
+            given |= {f"{stream}_quaternion": "wxyz", f"{stream}_kind": "exact"}
         assert set(given) | {"prior", "progress", "checks"} == set(self.keywords())
         hec.calibrate(*streams(), **given, prior={"z": (1.85, 0.02)})
         (config,) = seen

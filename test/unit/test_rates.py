@@ -19,7 +19,6 @@ from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.bags.messages import (
     MessageReader,
-    measured_as,
     unpack_poses,
 )
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
@@ -332,9 +331,3 @@ class TestMessages:
         read = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
         with pytest.raises(InputError, match="^found latitude 139.7"):
             read(fix(0, latitude=139.7))
-
-    def test_what_a_type_does_not_have_is_refused(self):
-        assert measured_as("sensor_msgs/msg/Imu", "auto", "/imu") == "rates"
-        assert measured_as("nav_msgs/msg/Odometry", "positions", "/odom") == "positions"
-        with pytest.raises(ConfigError, match="/fix has messages of type"):
-            measured_as("sensor_msgs/msg/NavSatFix", "rates", "/fix")

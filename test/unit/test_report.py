@@ -70,14 +70,13 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.elements if name == tag]
 
 
-def simulated(planar=False, poses=200, frames=("lidar", "camera"), **options):
+def simulated(seed=3, poses=200, frames=("lidar", "camera"), options=None, **motion):
     """Snapshot and calibration of a simulated drive."""
-    flat = {"terrain_height": 0.0} if planar else {}
     names = dict(zip(("parent_frame", "child_frame"), frames, strict=True))
-    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=poses, **flat, **names), REALISTIC)
-    snapshot = whole_snapshot(
-        offline_config(drive.parent, drive.child, options), drive.parent, drive.child
-    )
+    config = dataclasses.replace(DRIVE, poses=poses, **motion, **names)
+    drive = simulate_drive(seed, config, REALISTIC)
+    streams = drive.parent, drive.child
+    snapshot = whole_snapshot(offline_config(*streams, options or {}), *streams)
     return snapshot, snapshot.estimate()
 
 
@@ -97,7 +96,7 @@ def hilly():
 
 @pytest.fixture(scope="module")
 def planar():
-    snapshot, calibration = simulated(planar=True)
+    snapshot, calibration = simulated(terrain_height=0.0)
     return snapshot, calibration, *page_of(snapshot, calibration)
 
 
@@ -264,11 +263,7 @@ def test_hostile_names_stay_text():
     ],
 )
 def test_any_result_gets_a_page(tmp_path, motion, options):
-    drive = simulate_drive(1, dataclasses.replace(DRIVE, **({"poses": 60} | motion)), REALISTIC)
-    snapshot = whole_snapshot(
-        offline_config(drive.parent, drive.child, options), drive.parent, drive.child
-    )
-    calibration = snapshot.estimate()
+    snapshot, calibration = simulated(1, **({"poses": 60} | motion), options=options)
     write_report(tmp_path, calibration, snapshot, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
@@ -395,11 +390,7 @@ AGAINST = r"do not trust|not settled|record longer|more than chance|disagree|can
 def test_no_sentence_speaks_against_a_green_verdict():
     green = 0
     for seed, poses in ((1, 120), (3, 200), (4, 160)):
-        drive = simulate_drive(seed, dataclasses.replace(DRIVE, poses=poses), REALISTIC)
-        snapshot = whole_snapshot(
-            offline_config(drive.parent, drive.child, {}), drive.parent, drive.child
-        )
-        calibration = snapshot.estimate()
+        snapshot, calibration = simulated(seed, poses)
         if calibration.verdict is Verdict.USE:
             green += 1
             assert not re.findall(AGAINST, Page(render(calibration, snapshot)).text.lower())

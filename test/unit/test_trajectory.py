@@ -57,20 +57,6 @@ def test_unusable_input_names_the_first_offender(stamps, poses, message):
         Trajectory(stamps, poses)
 
 
-@pytest.mark.parametrize(
-    ("quat", "message"),
-    [
-        ((0, 0, 0, 0.9), "length 0.9"),
-        ((0, 0, 0, 0), "length 0,"),
-        ((0, 0, np.nan, 1), "not finite"),
-    ],
-)
-def test_unusable_quaternions_are_refused(quat, message):
-    quats = np.array([(0, 0, 0, 1), quat, (0, 0, 0, 1)])
-    with pytest.raises(InputError, match=message):
-        Trajectory.from_quat_xyzw(STAMPS, np.zeros((3, 3)), quats)
-
-
 def test_shift_and_scale_keep_everything_else():
     trajectory = Trajectory(STAMPS, POSES, "lidar", "odom")
     shifted, scaled = trajectory.shifted(-0.000000003), trajectory.scaled(2.0)
