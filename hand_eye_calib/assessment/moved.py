@@ -14,12 +14,14 @@ both divided before by how much more S scatters than H predicts.
 Answers of one rig scatter from recording to recording by more than each of them states, as no
 recording shows its own constant errors: that belongs to C (docs/session.md has the measurements).
 
-Against an installed extrinsic X0, a motion pair has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,).
-If the mount has moved by xi, ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I - Ad(B^-1)``.
-With C the covariance of noise, each second has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1 e``;
-both add over time. The noise of motions that follow each other is correlated: the long-run variance
-of S in units of H says how much. Errors that wander over minutes, of a map that bends or a bias,
-give a large ratio, too: the stream checks compare how well a world that moves explains the motion.
+Within a recording, a motion pair has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,) at an
+extrinsic X0. If the mount has moved by xi, ``X0 exp(xi)``, then ``e = -J xi + noise`` with
+``J = I - Ad(B^-1)``. With C the covariance of the noise, each second has ``H = sum J' C^-1 J`` and
+``S = -sum J' C^-1 e``; both add over time. Large residuals have less weight, so that a large shift
+comes out too small: take the information again at the extrinsic that it leads to. The noise of
+motions that follow each other is correlated: the long-run variance of S in units of H says how
+much. Errors that wander over minutes, of a map that bends or a bias, give a large ratio, too: the
+stream checks compare how well a world that moves explains the motion.
 """
 
 from collections.abc import Sequence
@@ -28,10 +30,11 @@ from enum import Enum
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
+from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import (
     CHI2,
@@ -60,6 +63,10 @@ _UNKNOWN_SHARE = 0.1
 # Log odds beyond these are certain.
 _CERTAIN = 50.0
 
+# Motions over this time (s) are compared, so many a second at most; what they show is added up over
+# seconds (ns).
+_LAG_S, _MOTIONS_PER_S, _BLOCK_NS = 1.0, 20.0, 1_000_000_000
+
 _ROUNDS = 4
 _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
 
@@ -69,7 +76,7 @@ _WINDOWS, _LEAST_WINDOWS = (8, 16), 2
 _LEAST_WINDOW_S = 3.0
 
 # Log likelihood ratio from which on a shift is significant.
-SIGNIFICANT = 24.0
+SIGNIFICANT = 12.0
 
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
 # recording before and after that. A smaller probability is none.
@@ -232,16 +239,16 @@ def squared_shift(H: FloatArray, S: FloatArray, ridge: float) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True)
 class MountChange:
-    """A shift (6,) of the mount within a recording, m and rad, from the motion of an index on; its
-    covariance (6, 6) with the long-run variance; the logarithm of the likelihood ratio of this
-    shift against none; and by how much less the squared residuals add up to.
+    """A shift of the mount within a recording, at a stamp of the parent's clock: afterwards the
+    extrinsic is ``X exp(xi)``, with X from before, and xi (6,) = (rho, phi) in the child sensor's
+    frame, m and rad; its covariance (6, 6) with the long-run variance; and the logarithm of the
+    likelihood ratio of this shift against none.
     """
 
-    index: int
-    shift: FloatArray
+    at_ns: int
+    xi: FloatArray
     covariance: FloatArray
     log_ratio: float
-    squared: float
 
 
 def residuals_and_jacobians(
@@ -270,7 +277,7 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     return covariance, weights
 
 
-def find_change(H: FloatArray, S: FloatArray, duration_s: float) -> MountChange | None:
+def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChange | None:
     """The most likely shift of the mount within a recording; None if it is too short to tell.
 
     The answers of both sides of every possible time are compared. What each side scatters about its
@@ -279,12 +286,14 @@ def find_change(H: FloatArray, S: FloatArray, duration_s: float) -> MountChange 
 
     Parameters
     ----------
-    H, S : (K, 6, 6) array, (K, 6) array
-        Information and scores of motions in order of time.
-    duration_s : float
+    pose_pairs : PosePairs
+        On one clock and in one unit of length.
+    T_parent_child : (4, 4) array
+        X0, near the extrinsic.
     """
+    starts_ns, H, S = _by_second(pose_pairs, T_parent_child)
     S = _about_answer(H, S)
-    cuts = [np.arange(n) * len(S) // n for n in _WINDOWS if duration_s >= n * _LEAST_WINDOW_S]
+    cuts = [np.arange(n) * len(S) // n for n in _WINDOWS if len(S) >= n * _LEAST_WINDOW_S]
     if not cuts:
         return None
     long_run = 1.0
@@ -300,21 +309,36 @@ def find_change(H: FloatArray, S: FloatArray, duration_s: float) -> MountChange 
     # The common answer is free.
     contrast = before_H - before_H @ _inverse(H.sum(axis=0)) @ before_H
     ratios = log_ratio(contrast / long_run, before_S / long_run)
-    n_edge = max(len(S) * _LEAST_WINDOWS // max(_WINDOWS), 1)
+    n_edge = max(int(len(S) * _LEAST_WINDOWS / max(_WINDOWS)), 1)
     ratios[: n_edge - 1] = ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
     cov_before, cov_after = _inverse(before_H[best]), _inverse(after_H[best])
-    shift, covariance = (
-        cov_after @ after_S[best] - cov_before @ before_S[best],
-        cov_before + cov_after,
-    )
     return MountChange(
-        index=best + 1,
-        shift=shift,
-        covariance=long_run * covariance,
+        at_ns=int(starts_ns[best + 1]),
+        xi=cov_after @ after_S[best] - cov_before @ before_S[best],
+        covariance=long_run * (cov_before + cov_after),
         log_ratio=float(ratios[best]),
-        squared=float(shift @ np.linalg.solve(covariance, shift)),
     )
+
+
+def _by_second(
+    pose_pairs: PosePairs, T_parent_child: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Starts (N,) of the seconds of a recording, H (N, 6, 6) and S (N, 6) of each."""
+    stamps_ns = pose_pairs.stamps_ns
+    duration_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
+    lag_s = max(_LAG_S, median(np.diff(stamps_ns)) * 1e-9)
+    pairs = pairs_over(pose_pairs, lag_s, max(int(duration_s * _MOTIONS_PER_S), 2))
+    residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
+    covariance, weights = noise_covariance(residuals)
+    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(covariance) * weights[:, None, None]
+    middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
+    blocks = (middles_ns - stamps_ns[0]) // _BLOCK_NS
+    n_blocks = int((stamps_ns[-1] - stamps_ns[0]) // _BLOCK_NS) + 1
+    H, S = np.zeros((n_blocks, 6, 6)), np.zeros((n_blocks, 6))
+    np.add.at(H, blocks, whitened @ jacobians)
+    np.add.at(S, blocks, -np.einsum("kij,kj->ki", whitened, residuals))
+    return stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS, H, S
 
 
 def _about_answer(H: FloatArray, S: FloatArray) -> FloatArray:

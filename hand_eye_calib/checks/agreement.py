@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.checks.response import Fitted, Regression, delays, response
 from hand_eye_calib.geometry import se3
@@ -103,14 +103,16 @@ def check_agreement(
     """
     if same := check_same(*known):
         return same
-    slow, axes = response(pose_pairs, motions, T_parent_child)
+    change = find_change(pose_pairs, T_parent_child)
+    slow, axes = response(pose_pairs, motions, T_parent_child, change.at_ns if change else None)
     speeds = _speeds(pose_pairs)
     drift = slow.fit("drift")
     tried = [(drift.share, _world_drift(drift, pose_pairs, speeds))]
     tried += [_rotation_gain(slow.fit("gain"), axes)]
     tried += [_turned(slow, stream) for stream in (*_STREAMS, "both")]
     tried += [_axis_gain(slow, stream) for stream in _STREAMS]
-    tried += [_moved_mount(slow, pose_pairs.stamps_ns, motions)]
+    if change:
+        tried += [_moved_mount(slow, change, int(pose_pairs.stamps_ns[0]))]
     suspects = [max(tried, key=lambda each: each[0])]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
     if fast := delays(pose_pairs, motions, T_parent_child):
@@ -205,22 +207,16 @@ def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     return fitted.share, _found("axis_scale", stream, abs(off) > _AXIS_GAINS[1], **values)
 
 
-def _moved_mount(slow: Regression, stamps_ns: IntArray, motions: MotionPairs) -> _Suspect:
+def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspect:
     """A mount that has moved."""
-    duration_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
-    H, S, squared = slow.of_mount
-    change = find_change(H, S, duration_s)
-    if change is None:
-        return 0.0, None
-    sigmas, share = np.sqrt(np.diag(change.covariance)), change.squared / max(squared, 1e-300)
-    known = np.where(np.abs(change.shift) > 2.0 * sigmas, change.shift, 0.0)
+    share, sigmas = slow.fit("moved").share, np.sqrt(np.diag(change.covariance))
+    known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
     if change.log_ratio < SIGNIFICANT or (moved_m < _MOVED_M[0] and moved_rad < _MOVED_RAD[0]):
         return share, None
     is_large = moved_m > _MOVED_M[1] or moved_rad > _MOVED_RAD[1]
     size = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
-    at_ns = (stamps_ns[motions.i] + stamps_ns[motions.j])[change.index] // 2
-    values = {"size": size, "at_s": float(at_ns - stamps_ns[0]) * 1e-9}
+    values = {"size": size, "at_s": (change.at_ns - start_ns) * 1e-9}
     is_error = is_large and change.log_ratio > 2.0 * SIGNIFICANT
     return share, _found("mount_moved", "both", is_error, **values)
 

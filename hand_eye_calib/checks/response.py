@@ -79,7 +79,6 @@ class Regression:
             squared = (lengths / self._sigma) ** 2 / (target.shape[1] * _TUNING**2)
             weights = 1.0 / (1.0 + squared) ** 2
         self._weight = float(weights.sum())
-        self._rows = known * np.sqrt(weights)[:, None, None] / self._sigma
         parts = np.array_split(flat, _BLOCKS), np.array_split(weights, _BLOCKS)
         self._blocks = np.stack(
             [
@@ -113,17 +112,6 @@ class Regression:
             biases=self._sigma**2 * self._weight / powers,
             share=1.0 - costs[1] / max(costs[0], 1e-300),
         )
-
-    @property
-    def of_mount(self) -> tuple[FloatArray, FloatArray, float]:
-        """Information (K, 6, 6) and scores (K, 6) of each motion about a change of lever arm and
-        rotation, with what is known beside; and the sum of squared residuals.
-        """
-        products = np.swapaxes(self._rows, 1, 2) @ self._rows
-        total, known = products.sum(axis=0), list(range(products.shape[1] - 1))
-        values = _solved(total, known)
-        scores = products[:, :6, -1] - products[:, :6, 6:-1] @ values[6:]
-        return products[:, :6, :6], scores, float(total[-1, -1] - total[known, -1] @ values)
 
 
 def _solved(products: FloatArray, columns: list[int]) -> FloatArray:
@@ -198,7 +186,10 @@ class _Differences:
 
 
 def response(
-    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
+    pose_pairs: PosePairs,
+    motions: MotionPairs,
+    T_parent_child: FloatArray,
+    moved_at_ns: int | None = None,
 ) -> tuple[Regression, FloatArray]:
     """Regression of motions over some seconds, and the principal axes of the rotations (columns,
     parent's frame).
@@ -207,7 +198,8 @@ def response(
     orientations, a rotation vector in the stream's world, of both in the parent's; ``axes_child``,
     ``axes_parent``: factors, less 1, of the coordinates of a stream's positions; ``drift``:
     velocity and angular rate of the child's world; ``gain``: factors, less 1, of the child's
-    rotations about the principal axes.
+    rotations about the principal axes; ``moved``: lever arm and rotation of X after a time, if one
+    is given.
     """
     parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
     child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
@@ -237,6 +229,13 @@ def response(
         ),
         "gain": (none, (x @ axes)[:, None, :] * axes[None]),
     }
+    if moved_at_ns is not None:
+        stamps_ns = pose_pairs.stamps_ns
+        middles_ns = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2
+        after = (middles_ns >= moved_at_ns)[:, None, None]
+        of_t = np.concatenate([parent.chords, se3.skew(child.moved)], axis=2)
+        of_r = np.concatenate([none, child.rotations - np.eye(3)], axis=2)
+        groups["moved"] = after * of_t, after * of_r
     return _regression(parent, child, T_parent_child, groups, ()), axes
 
 
