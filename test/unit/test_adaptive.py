@@ -18,11 +18,9 @@ from hand_eye_calib.gls.increments import (
     linearise,
 )
 from hand_eye_calib.gls.noise_model import CENTRES
-from hand_eye_calib.gls.outliers import Outliers, judged
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict
-from hand_eye_calib.stats import chi_square_quantile
 
 VALUES = {
     "none": np.zeros(0),
@@ -318,21 +316,6 @@ def test_a_camera_that_sees_a_target_swings_about_it(centre):
         assert solution.noise.rotation_turns_about == centre
         distances.append(squared_distance(solution))
     assert 2.0 < np.median(distances) < 11.0
-
-
-@pytest.mark.parametrize(("heavy_tails", "found"), [(False, True), (True, False)])
-def test_a_step_above_the_level_of_false_alarms_is_a_jump_unless_tails_are_heavy(
-    heavy_tails, found
-):
-    random = np.random.default_rng(3)
-    of_walk, of_white = random.chisquare(6, 200), random.chisquare(6, 201)
-    if heavy_tails:
-        of_walk *= np.where(random.random(200) < 0.2, 4.0, 0.5)
-    of_walk[120] = 1.5 * chi_square_quantile(0.01 / 201)
-    none = Outliers(np.zeros(200, dtype=bool), np.zeros(201, dtype=bool))
-    jumps = judged(none, of_walk, of_white, with_spikes=True).jumps
-    assert jumps[120] == found
-    assert jumps.sum() == found
 
 
 def test_jumps_of_either_sensor_are_found_at_their_places():

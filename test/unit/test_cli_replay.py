@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import json
-import re
 
 import numpy as np
 import pytest
@@ -130,20 +129,6 @@ def test_wrong_usage(run, arguments, message):
     code, out, err = run(*arguments)
     assert (code, out) == (2, "")
     assert message in err
-
-
-def test_a_bag_cut_off_gives_what_came_before_and_a_warning(run, bag):
-    file = bag / "drive.mcap"
-    file.write_bytes(file.read_bytes()[:-60])
-    code, out, err = run(bag, *STREAMS, "--json")
-    assert code in (0, 3)
-    (warning,) = [text for text in json.loads(out)["warnings"] if "recovered" in text]
-    assert re.search(
-        r"cut off or damaged .* lost; recovered are \d+ messages "
-        r"covering [\d.]+ s",
-        warning,
-    )
-    assert f"hand_eye_calib: note: {warning}\n" in err
 
 
 # ---- several bags

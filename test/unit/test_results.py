@@ -98,7 +98,7 @@ def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
     assert_same(load_result(path), written)
 
 
-def test_a_rotation_that_is_not_known_has_no_quaternion(tmp_path):
+def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robot(tmp_path):
     yaw = DofVerdict.UNOBSERVABLE
     dofs = tuple(
         DofObservability(name, yaw if name == "yaw" else DofVerdict.OBSERVED, sigma)
@@ -115,6 +115,10 @@ def test_a_rotation_that_is_not_known_has_no_quaternion(tmp_path):
     assert transform["rpy_deg"][2] is None
     np.testing.assert_allclose(transform["rpy_deg"][:2], [0, 0], atol=1e-9)
     assert_same(load_result(tmp_path), written)
+    xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
+    assert re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
+    assert "'--yaw', 'MEASURE_YAW_BY_HAND'" in launch
+    assert "--qx" not in launch
 
 
 @pytest.mark.parametrize("words", [["info"], ["info", "--json"], ["compare", "--json"]])
@@ -209,18 +213,6 @@ def test_an_unknown_axis_is_nothing_that_a_robot_takes(tmp_path):
     assert xyz[2] == "MEASURE_Z_BY_HAND"
     assert list(map(float, xyz[:2])) == calibration().T_parent_child[:2, 3].tolist()
     assert "'--z', 'MEASURE_Z_BY_HAND'" in launch
-
-
-def test_an_unknown_rotation_is_nothing_that_a_robot_takes(tmp_path):
-    known = good_calibration()
-    unknown = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
-    changes = {"T_parent_child": np.eye(4), "covariance": np.diag([1e-6] * 5 + [np.inf])}
-    changes["observability"] = (*known.observability[:5], unknown)
-    save_result(dataclasses.replace(known, **changes), tmp_path)
-    xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
-    assert re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
-    assert "'--yaw', 'MEASURE_YAW_BY_HAND'" in launch
-    assert "--qx" not in launch
 
 
 def test_under_do_not_use_there_is_nothing_for_a_robot(tmp_path):
