@@ -78,7 +78,7 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message.header.frame_id = calibration.parent_frame
     T, pose = calibration.T_parent_child, message.pose.pose
     _put(T, pose.position, pose.orientation)
-    covariance = covariance_about_parent_axes(T, calibration.covariance)
+    covariance = covariance_about_parent_axes(T, calibration.covariance_with_floor)
     message.pose.covariance = covariance.ravel().tolist()
     return message
 

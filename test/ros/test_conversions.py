@@ -1,5 +1,7 @@
 """Between messages and numbers, without a node."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
@@ -82,6 +84,9 @@ def test_messages_carry_frames_stamp_and_transform():
     assert conversions.to_ns(transform.header.stamp) == 1_700_000_000_123_456_789
     pose = conversions.to_pose_with_covariance(calibration(np.eye(6)))
     assert pose.header == transform.header
+    total = dataclasses.replace(calibration(np.eye(6)), floor=np.eye(6))
+    total = conversions.to_pose_with_covariance(total).pose.covariance
+    np.testing.assert_allclose(np.reshape(total, (6, 6)), 2.0 * np.eye(6), atol=1e-12)
     for place, turn in (
         (transform.transform.translation, transform.transform.rotation),
         (pose.pose.pose.position, pose.pose.pose.orientation),
