@@ -22,7 +22,8 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
-    from hand_eye_calib.arrays import FloatArray
+    from numpy.typing import NDArray
+
     from hand_eye_calib.results.calibration import Calibration
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
@@ -134,7 +135,7 @@ def _document(drive: "SimulatedDrive", offline: "Calibration", online: Any) -> d
 
     units = ("translation_m", "rotation_rad")
 
-    def apart(T_parent_child: "FloatArray", other: "FloatArray") -> dict[str, float]:
+    def apart(T_parent_child: "NDArray[Any]", other: "NDArray[Any]") -> dict[str, float]:
         return dict(zip(units, absolute_errors(T_parent_child, other), strict=True))
 
     document: dict[str, Any] = {

@@ -10,6 +10,7 @@ import faulthandler
 import json
 import os
 import re
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 from backports import zstd
 from bag_making import (
+    JAZZY,
     ODOMETRY,
     POSE_STAMPED,
     STORAGES,
@@ -35,7 +37,7 @@ from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
-from hand_eye_calib.io.bags.writer import write_streams
+from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
 
 MIB = 1 << 20
 # What a command may take: LARGEST_GROWTH, the interpreter and its libraries.
@@ -250,6 +252,13 @@ def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, dat
         all_poses(tmp_path / "bag")
 
 
+@pytest.mark.parametrize("name", ["run#1.db3", "run%41.db3", "what?.db3", "a?mode=rw&b.db3"])
+def test_a_path_is_not_read_as_an_address(tmp_path, name):
+    write_bag(tmp_path / "bag", STREAMS, "sqlite3")
+    storage_file(tmp_path / "bag").rename(tmp_path / name)
+    assert len(all_poses(tmp_path / name)) == 120
+
+
 # ---- bags made to do harm
 
 # Three gigabytes of zeros, in frames.
@@ -307,3 +316,37 @@ def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
     path.write_bytes(zstd.compress(bytes(300 * MIB)))
     with pytest.raises(InputError, match="unpacks to more than 256 times .* not believable"):
         PoseBag(path)
+
+
+def database(path, rows):
+    connection = sqlite3.connect(path)
+    connection.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+        " serialization_format TEXT, offered_qos_profiles TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+        " data BLOB);"
+    )
+    connection.execute("INSERT INTO topics VALUES(1, '/a', ?, 'cdr', '')", (ODOMETRY,))
+    connection.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)", rows)
+    connection.commit()
+    connection.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def odometry():
+    """Bytes of a message."""
+    ((_, message),) = stamped_messages(JAZZY.types, STREAMS["/a"][0][:1], ODOMETRY, is_ros1=False)
+    return bytes(JAZZY.serialize_cdr(message, ODOMETRY))
+
+
+@pytest.mark.parametrize("bad", [(5, "text"), (5, None), ("five", b""), (-5, b""), None])
+def test_values_of_other_types_are_refused(tmp_path, odometry, bad):
+    """Without an index of times, the rest is read in the order of these."""
+    rows = [(9, odometry), bad or (5, odometry), (1, odometry)]
+    path = database(tmp_path / "bag.db3", rows)
+    if bad:
+        with pytest.raises(InputError, match=r"^[^\n]+$"):
+            all_poses(path, child=None)
+    else:
+        assert [pose.bag_ns for pose in all_poses(path, child=None)] == [1, 5, 9]

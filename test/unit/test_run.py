@@ -15,6 +15,7 @@ from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import review, run, with_options
+from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
@@ -222,6 +223,26 @@ class TestClearOffset:
     def test_a_clock_that_the_user_set_stays(self, late, options):
         other = replace(late, config=replace(late.config, given=options, **options))
         assert run(other).snapshot is other
+
+    def test_two_solves_at_most(self, late, monkeypatch):
+        solved = []
+        estimate = Snapshot.estimate
+
+        def counted(*given, **more):
+            solved.append(1)
+            return estimate(*given, **more)
+
+        monkeypatch.setattr(Snapshot, "estimate", counted)
+        run(late)
+        assert len(solved) == 1
+        spread = replace(with_options(late, {"time_offset": "estimate"}).resolved.time_offset)
+        unclear = replace(spread, spread_s=0.4)
+        monkeypatch.setattr(
+            "hand_eye_calib.engine.run.refine_time_offset", lambda *given, **more: unclear
+        )
+        found = run(late)
+        assert len(solved) == 3
+        assert found.calibration.time_offset_s == pytest.approx(0.05, abs=0.003)
 
 
 def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
