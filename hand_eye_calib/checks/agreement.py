@@ -68,10 +68,13 @@ _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
 # the usual target of a rotation.
 _MOVING = 0.003
 
-# Orientations are copies if they agree to this angle, twice as well as any two sensors of the
-# recordings at hand, and so many times better than each stream is rough, which was ten times there
-# at most: slow motion is smooth.
-_AGREE_RAD, _BELOW_ROUGHNESS = float(np.radians(0.015)), 20.0
+# Orientations are copies if they agree to this angle, several times better than any two sensors of
+# the recordings at hand, and so many times better than each stream is rough: slow motion is smooth,
+# and a slow stream of fast motion is rough without noise. Noise of both streams that is the same
+# shows a copy as well: roughness grows with each further difference as that of white noise does
+# (by 1.9), and what remains is so many times smaller.
+_AGREE_RAD, _BELOW_ROUGHNESS = float(np.radians(0.008)), 50.0
+_AGREE_NOISE_RAD, _WHITE, _BELOW_NOISE = float(np.radians(0.02)), 1.6, 15.0
 
 # This share of the poses must agree: the rest may be jumps.
 _SHARE = 0.9
@@ -309,7 +312,10 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
     aligned : Trajectory
         The child on the parent's clock.
     """
-    limit_rad = min(_AGREE_RAD, *(_roughness(each) / _BELOW_ROUGHNESS for each in (parent, child)))
+    (rough_p, white_p), (rough_c, white_c) = map(_roughness, (parent, child))
+    limit_rad = min(_AGREE_RAD, min(rough_p, rough_c) / _BELOW_ROUGHNESS)
+    if min(white_p, white_c) > _WHITE:
+        limit_rad = max(limit_rad, min(_AGREE_NOISE_RAD, min(rough_p, rough_c) / _BELOW_NOISE))
     # Programs interpolate at the stamps of the new stream.
     for slow, fast in ((child, parent), (parent, child), (aligned, parent), (parent, aligned)):
         residual_rad = _disagreement(slow, fast)
@@ -318,11 +324,12 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
     return []
 
 
-def _roughness(trajectory: Trajectory) -> float:
-    """Third difference of the orientations, rad."""
+def _roughness(trajectory: Trajectory) -> tuple[float, float]:
+    """Third difference of the orientations, rad, and by how much the fourth is larger."""
     rotations = trajectory.poses[:, :3, :3]
     steps = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    return _size(np.diff(steps, n=2, axis=0))
+    third, fourth = (_size(np.diff(steps, n=n, axis=0)) for n in (2, 3))
+    return third, fourth / max(third, 1e-300)
 
 
 def _disagreement(slow: Trajectory, fast: Trajectory) -> float:

@@ -18,8 +18,8 @@ ROOT = SOURCE.parent
 # lines, 19,000 of code, 400 constants, 10 functions above 50 lines, 450 functions in 50 files
 # entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
-    "lines": 30_950,
-    "lines of code": 20_070,
+    "lines": 30_960,
+    "lines of code": 20_080,
     "numeric constants": 636,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
