@@ -54,8 +54,9 @@ _LITTLE = 0.1
 # Rotation vectors near half a turn may point either way.
 _MAX_ROTATION = 2.8
 
-# A coordinate explains why streams disagree if it takes away this share of the squared residuals.
-_MOST = 0.3
+# A coordinate explains why streams disagree if it takes away this share of the squared residuals;
+# with less than the second it may be jumps of a clean recording, and is no error.
+_MOST, _SOME = 0.3, 0.1
 
 # Delays and smoothing are looked for in motions over this time (s), so many at most, and speeds are
 # over it, so that noise is no speed. Smallest delay (s), and smoothing (s^2), that count; that of
@@ -207,7 +208,8 @@ def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     if abs(off) < max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * fitted.biases[k]):
         return fitted.share, None
     values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-    return fitted.share, _found("axis_scale", stream, abs(off) > _AXIS_GAINS[1], **values)
+    is_error = abs(off) > _AXIS_GAINS[1] and fitted.share > _SOME
+    return fitted.share, _found("axis_scale", stream, is_error, **values)
 
 
 def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspect:

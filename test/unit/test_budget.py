@@ -20,7 +20,7 @@ ROOT = SOURCE.parent
 LIMITS = {
     "lines": 30_960,
     "lines of code": 20_080,
-    "numeric constants": 636,
+    "numeric constants": 640,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
     "rooms": 30,
