@@ -16,6 +16,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.lever_arm import weighted_products
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.stats import median
 
 # Standard deviation along (m) and about (rad) each axis, and of the scale of a path.
 FLOOR_TRANSLATION = 0.005
@@ -50,7 +51,7 @@ def usual_speed(stamps_ns: IntArray, positions: FloatArray) -> float:
     stamps_ns : (N,) int64 array
     positions : (N, 3) array
     """
-    step_s = float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else 1.0
+    step_s = median(np.diff(stamps_ns)) * 1e-9 if len(stamps_ns) > 1 else 1.0
     stride = max(1, round(_SPEED_OVER_S / step_s))
     seconds = np.diff(stamps_ns[::stride]) * 1e-9
     metres = np.linalg.norm(np.diff(positions[::stride], axis=0), axis=1)

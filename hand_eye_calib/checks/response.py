@@ -229,14 +229,11 @@ def response(
         ),
         "gain": (none, (x @ axes)[:, None, :] * axes[None]),
     }
+    after = None
     if moved_at_ns is not None:
         stamps_ns = pose_pairs.stamps_ns
-        middles_ns = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2
-        after = (middles_ns >= moved_at_ns)[:, None, None]
-        of_t = np.concatenate([parent.chords, se3.skew(child.moved)], axis=2)
-        of_r = np.concatenate([none, child.rotations - np.eye(3)], axis=2)
-        groups["moved"] = after * of_t, after * of_r
-    return _regression(parent, child, T_parent_child, groups, ()), axes
+        after = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2 >= moved_at_ns
+    return _regression(parent, child, T_parent_child, groups, (), after), axes
 
 
 def delays(
@@ -302,9 +299,10 @@ def _regression(
     T_parent_child: FloatArray,
     groups: Mapping[str, tuple[FloatArray, FloatArray]],
     base: Sequence[str],
+    after: BoolArray | None = None,
 ) -> Regression:
     """Regression on groups of columns, of displacements and of rotations, and on those of X and the
-    scale.
+    scale; on those of X again, as ``moved``, of the motions (K,) after some time.
     """
     displaced = child.moved - parent.moved
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
@@ -322,6 +320,9 @@ def _regression(
         name: np.concatenate([of_t / unit_t, of_r / unit_r], axis=1)
         for name, (of_t, of_r) in (of_mount | dict(groups)).items()
     }
+    if after is not None:
+        of_x = np.concatenate([columns["lever"], columns["rotation"]], axis=2)
+        columns["moved"] = after[:, None, None] * of_x
     target = np.concatenate([displaced / unit_t, turned / unit_r], axis=1)
     return Regression(target, columns, (*of_mount, *base), (unit_r / unit_t) ** 2)
 

@@ -2,6 +2,7 @@
 of a lidar, fields of any message, or transforms.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from hand_eye_calib.io.transforms import TfSource, TfStream
 Source = str | TfSource
 
 
-class Reading:
+class Reading(ABC):
     """Reads one stream; there is a subclass for each kind of source.
 
     ``topics`` are those whose messages it takes, ``notes`` what a person should know in the end.
@@ -30,13 +31,13 @@ class Reading:
         self.stream, self.topics = stream, topics
         self.notes: list[str] = []
 
+    @abstractmethod
     def take(self, run: Run) -> None:
         """Take the next messages of one of the topics; an InputError if they cannot be used."""
-        raise NotImplementedError
 
+    @abstractmethod
     def table(self) -> PoseTable:
         """The poses of all messages; an InputError if there can be none."""
-        raise NotImplementedError
 
     def _of_frames(self, stamps_ns: Any, poses: FloatArray, bag_ns: Any, *frames: Any) -> PoseTable:
         """A table whose poses are all in the same frames: of the world, of the sensor."""
