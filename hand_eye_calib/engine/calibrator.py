@@ -7,7 +7,7 @@ files.
 import contextlib
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -178,7 +178,7 @@ class Calibrator:
         """Where a result came from, in plain values: options, and streams by their topics."""
         streams = {}
         for stream, topic in topics.items():
-            counts = vars(self.statistics(stream))
+            counts = asdict(self._buffers[stream].statistics)
             streams[stream] = {"topic": str(topic), "messages": counts.pop("received"), **counts}
         return {"options": self.config.to_options(), **streams}
 
