@@ -16,7 +16,7 @@ import numpy as np
 from hand_eye_calib.alignment.similarity import settle_scale
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -79,7 +79,7 @@ def real_cases(folder: Path | None) -> Iterator[Case]:
 def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
     assert rig.truth is not None
     options = {name: value for name, value in rig.options.items() if name != "prior"}
-    snapshot = whole_snapshot(offline_config(parent, child, options), parent, child).resolved
+    snapshot = whole_snapshot(parent, child, options).resolved
     pairs = snapshot.pose_pairs
     pairs = pairs.child_scaled(settle_scale(pairs, snapshot.config.scale)[0])
     family = next((each for each in _FAMILIES if each in rig.name), rig.name)

@@ -88,11 +88,14 @@ class CheckResult:
         Of the angular rates of both streams.
     fit : SimilarityFit or None
         The fit under the hypothesis that holds; None if none does.
+    offset : TimeOffset or None
+        What is left of the clock offset, beside the one that is known; None if no hypothesis holds.
     """
 
     findings: tuple[Finding, ...]
     correlation: Correlation = Correlation()
     fit: SimilarityFit | None = None
+    offset: TimeOffset | None = None
 
 
 def check_streams(
@@ -152,7 +155,7 @@ def check_streams(
     findings += found
     if is_sound:
         findings += _check_agreeing(streams.shifted(offset.seconds), streams, fit, known)
-    return CheckResult(gravest_first(findings), correlation, explanation.fit)
+    return CheckResult(gravest_first(findings), correlation, explanation.fit, offset)
 
 
 def _on_one_clock(

@@ -45,14 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.findings import answered, finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.engine.checking import check
-    from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+    from hand_eye_calib.engine.snapshot import whole_snapshot
     from hand_eye_calib.plain import json_text
 
     options = options_from(arguments)
     sources, (first, second), repairs = _opened(arguments, options)
-    config = offline_config(first, second, options)
-    snapshot = whole_snapshot(config, first, second)
-    parent, child = snapshot.parent, snapshot.child
+    snapshot = whole_snapshot(first, second, options)
+    config, parent, child = snapshot.config, snapshot.parent, snapshot.child
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
     scale = config.scale if isinstance(config.scale, float) else 1.0

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from hand_eye_calib.cli.console import STREAMS, flag, note, waiting_for, with_progress
 from hand_eye_calib.cli.options import FILE_OPTIONS
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import run
-from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
@@ -97,7 +96,7 @@ def read_pair(arguments: Namespace, options: Mapping[str, Any]) -> Recording:
         inputs[stream] = {"file": str(path), "poses": len(poses)}
         inputs[stream] |= {"first_stamp_ns": first_ns, "last_stamp_ns": last_ns}
     times = {arguments.times, arguments.parent_times, arguments.child_times} - {None}
-    snapshot = whole_snapshot(offline_config(parent, child, options), parent, child)
+    snapshot = whole_snapshot(parent, child, options)
     return Recording(snapshot, inputs, [*map(Path, arguments.paths), *times])
 
 

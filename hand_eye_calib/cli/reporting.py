@@ -6,6 +6,7 @@ import os
 import pickle
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,13 +65,14 @@ def write_session() -> None:
         if result.others:
             _session_rig(directory / "rig", result)
         if result.with_report:
-            from hand_eye_calib.engine.run import review
+            from hand_eye_calib.engine.checking import check
             from hand_eye_calib.io.results import save_result
 
-            found = review(result.calibration, result.snapshot, may_solve=False)
+            checked = check(result.snapshot, result.calibration)
+            found = replace(result.calibration, findings=checked.findings)
             # The file and the report beside it say the same.
-            save_result(found.calibration, directory, result.inputs)
-            write_report(directory, found.calibration, result.snapshot, result.inputs)
+            save_result(found, directory, result.inputs)
+            write_report(directory, found, result.snapshot, result.inputs)
     except (HandEyeCalibError, OSError) as error:
         sys.exit(fail(error, 1))
 

@@ -6,7 +6,6 @@ both halves of the recording what changes during it. Neither shows an error that
 """
 
 import contextlib
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -53,8 +52,13 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
     """
     result = solved.calibration()
     others, halves = other_answers(result, config, pose_pairs)
-    if unseen := _unseen_by_all(result, others):
-        result = solved.calibration(unseen)
+    robust = _sound(others)
+    # One of a reference was solved where the motion shows most, which others need not see.
+    if len(robust) >= _MIN_OTHERS and not METHODS[result.method].uses_reference:
+        of_others = np.array([other.sigmas for other in robust])
+        unseen = np.isfinite(result.sigmas) & np.isinf(of_others).all(axis=0)
+        if unseen.any():
+            result = solved.calibration(np.array(AXES)[unseen].tolist())
     return replace(result, cross_check=compare_answers(result, others, halves))
 
 
@@ -96,33 +100,10 @@ def other_answers(
         own = f"B{_BASELINES[-2]}"
     half = n_poses // 2
     stride = max(-(-(n_poses - half) // _MOST_POSES), 1)
-    edges = ((0, half), (half, n_poses))
-    halves = [(_coarser(own, stride), slice(start, end, stride)) for start, end in edges]
+    # About the same pairs of every stride-th pose.
+    own = f"{own[0]}{max(round(int(own[1:]) / stride), 1 if own[0] == 'B' else 2)}"
+    halves = [(own, slice(*edges, stride)) for edges in ((0, half), (half, n_poses))]
     return answers(others), answers(halves)
-
-
-def _coarser(reference: str, stride: int) -> str:
-    """The reference with about the same pairs of every ``stride``-th pose."""
-    kind, step = reference[0], reference[1:]
-    if not step.isdecimal():
-        return reference
-    return f"{kind}{max(round(int(step) / stride), 1 if kind == 'B' else 2)}"
-
-
-def _unseen_by_all(calibration: Calibration, others: Sequence[Calibration]) -> list[str]:
-    """Axes that a result knows, and no sound answer at other references.
-
-    None for a method with a reference: it is chosen, or given, where the motion shows most, which
-    others at shorter ones need not see.
-    """
-    robust = _sound(others)
-    if len(robust) < _MIN_OTHERS or METHODS[calibration.method].uses_reference:
-        return []
-    return [
-        dof.name
-        for index, dof in enumerate(calibration.observability)
-        if math.isfinite(dof.sigma) and all(np.isinf(other.sigmas[index]) for other in robust)
-    ]
 
 
 def compare_answers(

@@ -14,7 +14,6 @@ import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import (
     STREAMS,
     Snapshot,
@@ -308,7 +307,7 @@ class Calibrator:
             if self._time_offset is None:
                 return
             config = replace(config, time_offset=self._time_offset.seconds)
-        offset_ns = round(fixed_time_offset(config) * 1e9)
+        offset_ns = round(float(config.time_offset) * 1e9)
         if self._paired_at is None:
             self._paired_at = slower_stream(np.array(parent.stamps_ns), np.array(child.stamps_ns))
         horizon_ns = min(

@@ -18,7 +18,6 @@ from hand_eye_calib.checks.check import (
     unseen,
 )
 from hand_eye_calib.checks.findings import Finding, answered, gravest_first
-from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.status import AXES
@@ -62,7 +61,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Finding]:
     """Findings about streams that are no poses; of the solve, those of its result."""
     found = [*calibration.findings] if calibration else []
-    known_s = fixed_time_offset(snapshot.resolved.config)
+    known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
         found += check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)

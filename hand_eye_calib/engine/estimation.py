@@ -18,7 +18,7 @@ from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs, u
 from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
@@ -75,10 +75,16 @@ class Solved:
         """
         T_method, config = self.solution.T_parent_child, self.config
         fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), config.prior())
-        offset_s, offset_sigma_s = fixed_time_offset(config), 0.0
+        offset_s, offset_sigma_s = float(config.time_offset), 0.0
         if offset := self.time_offset:
             offset_s, offset_sigma_s = offset.seconds, offset.sigma_s
-        scale, scale_sigma = self.scale, self.scale_fit.scale_sigma if self.scale_fit else 0.0
+        scale, scale_sigma, warnings = self.scale, 0.0, [*fused.warnings]
+        if self.scale_fit:
+            scale_sigma = self.scale_fit.scale_sigma
+            times = f"{scale:.4f} +/- {scale_sigma:.4f}, as estimated from the motion"
+            warnings += [f"the child's lengths are multiplied by {times}"] * (
+                config.scale == "auto"
+            )
         found, noise = self.solution, None
         if isinstance(found, AdaptiveSolution):
             noise = found.describe(self.stamps_ns)
@@ -106,8 +112,7 @@ class Solved:
             clock_rate=offset.rate if offset else None,
             scale=scale,
             scale_sigma=scale_sigma,
-            warnings=(*fused.warnings, *self.warnings)
-            + (self.shift.warnings if self.shift else ()),
+            warnings=(*warnings, *self.warnings, *(self.shift.warnings if self.shift else ())),
         )
 
 
@@ -189,23 +194,23 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config, is_beside=is_beside)
-    found, of_offset = solved.solution, time_offset
-    if isinstance(found, AdaptiveSolution) and found.time_offset_s:
-        of_offset = None  # the model knows how uncertain that is
-    spread = _spread_by_alignment(scale_fit, of_offset)
+    found, spread = solved.solution, np.zeros((6, 6))
+    if scale_fit:
+        by_log_scale = scale_fit.sensitivity[:, 0]
+        share = scale_fit.scale_sigma / scale_fit.scale
+        spread += np.outer(by_log_scale, by_log_scale) * share**2
+    is_model = isinstance(found, AdaptiveSolution) and found.time_offset_s  # it knows its own
+    if time_offset and time_offset.fit and not is_model:
+        by_offset = time_offset.fit.sensitivity[:, 1]
+        spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
     if solved.shift is not None:
         spread += solved.shift.spread
-    warnings = solved.warnings
-    if scale_fit and config.scale == "auto":
-        times = f"{scale:.4f} +/- {scale_fit.scale_sigma:.4f}, as estimated from the motion"
-        warnings = (f"the child's lengths are multiplied by {times}", *warnings)
     return replace(
         solved,
         assessment=widened(solved.assessment, found.T_parent_child[:3, :3], spread),
         config=config,
         scale=scale,
         scale_fit=scale_fit,
-        warnings=warnings,
         time_offset=time_offset,
         floor=None if is_beside else _floor(solved, pose_pairs, config),
     )
@@ -220,19 +225,6 @@ def _floor(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> F
         return odometries / 2 * common_mode_floor(speed_m_s, math.hypot(*lasting))
     T = found.T_parent_child
     return odometries / 2 * floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
-
-
-def fixed_time_offset(config: CalibratorConfig) -> float:
-    """The time offset of options that have it in seconds.
-
-    Raises
-    ------
-    ConfigError
-        If it is still to be estimated.
-    """
-    if isinstance(config.time_offset, str):
-        raise ConfigError(f"time_offset {config.time_offset!r} must be estimated before solving")
-    return config.time_offset
 
 
 def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:
@@ -331,19 +323,3 @@ def _solve_pairs(
         proved_global="not tried" if is_beside else method.proved_global(pairs, found),
         shift=shift,
     )
-
-
-def _spread_by_alignment(
-    of_scale: SimilarityFit | None, time_offset: TimeOffset | None
-) -> FloatArray:
-    """Covariance (6, 6) that an estimated scale and time offset add to the extrinsic's."""
-    spread = np.zeros((6, 6))
-    if of_scale:
-        by_log_scale = of_scale.sensitivity[:, 0]
-        spread += (
-            np.outer(by_log_scale, by_log_scale) * (of_scale.scale_sigma / of_scale.scale) ** 2
-        )
-    if time_offset and time_offset.fit:
-        by_offset = time_offset.fit.sensitivity[:, 1]
-        spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
-    return spread

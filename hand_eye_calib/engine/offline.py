@@ -2,24 +2,20 @@
 
 import inspect
 import textwrap
-from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import compare_answers, other_answers
 from hand_eye_calib.engine.run import Progress, run
-from hand_eye_calib.engine.snapshot import Snapshot, name_frames
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
 from hand_eye_calib.text import AXIS_UNITS, Prior
 from hand_eye_calib.upstairs import upstairs
-
-# Pose pairs that are used unless an option says otherwise: the noise model takes 8 kB for each, and
-# hours at ten a second hold as many.
-_MOST_PAIRS = 100_000
 
 MethodName: TypeAlias = Literal[
     "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive"
@@ -105,16 +101,14 @@ def calibrate(
     >>> result.parent_frame, result.child_frame
     ('lidar', 'camera')
     """
-    options = dict(locals())
-    for name in ("parent", "child", "prior", "checks", "progress"):
-        del options[name]
-    options = {name: value for name, value in options.items() if value is not None}
+    values = {name: value for name, value in locals().items() if value is not None}
     first, second = parent, child
     if not (isinstance(first, Trajectory) and isinstance(second, Trajectory)):
         first, second = upstairs("io.trajectory_files.reading", "read_trajectories")(first, second)
-    options = _of_streams(first, second) | options | prior_fields(prior or {})
-    snapshot = whole_snapshot(CalibratorConfig(**options), first, second)
-    found = run(snapshot, checks=checks, progress=progress)
+    values |= prior_fields(prior or {})
+    options = {option_name(each): each.name for each in fields(CalibratorConfig)}
+    given = {name: values[field] for name, field in options.items() if field in values}
+    found = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
     return replace(found.calibration, recording=found.snapshot)
 
 
@@ -159,43 +153,6 @@ def prior_fields(prior: Prior) -> dict[str, str]:
     return fields
 
 
-def offline_config(
-    parent: Trajectory, child: Trajectory, options: Mapping[str, object]
-) -> CalibratorConfig:
-    """The CalibratorConfig for two whole trajectories, from options by their public names: all
-    pairs up to 100,000 unless they set another limit.
-    """
-    return CalibratorConfig.from_options(_of_streams(parent, child) | dict(options))
-
-
-def whole_snapshot(config: CalibratorConfig, parent: Trajectory, child: Trajectory) -> Snapshot:
-    """The Snapshot of two whole trajectories."""
-    parent_frame, child_frame, warnings = name_frames(
-        config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
-    )
-    if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
-        warnings += (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
-    return Snapshot(
-        config=config,
-        buffered_parent=parent,
-        buffered_child=child,
-        parent_frame=parent_frame,
-        child_frame=child_frame,
-        warnings=warnings,
-    )
-
-
-def _of_streams(parent: Trajectory, child: Trajectory) -> dict[str, Any]:
-    """Options that follow from the streams: what they measure, and that all their poses are used
-    unless there are too many.
-    """
-    return {
-        "max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS),
-        "parent_measures": parent.measures,
-        "child_measures": child.measures,
-    }
-
-
 def cross_check(
     calibration: Calibration,
     parent: Trajectory,
@@ -227,8 +184,8 @@ def cross_check(
     >>> list(scatter)
     ['x', 'y', 'z', 'roll', 'pitch', 'yaw']
     """
-    config = config or offline_config(parent, child, {"method": calibration.method})
+    snapshot = whole_snapshot(parent, child, {"method": calibration.method})
+    config = config or snapshot.config
     config.require_poses("a cross-check")
-    settled = replace(config, time_offset=calibration.time_offset_s)
-    pose_pairs = whole_snapshot(settled, parent, child).pose_pairs
-    return compare_answers(calibration, *other_answers(calibration, config, pose_pairs))
+    settled = replace(snapshot, config=replace(config, time_offset=calibration.time_offset_s))
+    return compare_answers(calibration, *other_answers(calibration, config, settled.pose_pairs))

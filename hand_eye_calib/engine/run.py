@@ -8,12 +8,10 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-from hand_eye_calib.alignment.time_offset import refine_time_offset
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity, finding, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.estimation import fixed_time_offset
 from hand_eye_calib.engine.snapshot import CONVENTIONS, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
@@ -74,10 +72,7 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
         If both streams have the same sensor frame.
     """
     tell = progress or (lambda share, step: None)
-    tell(0.0, "time offset")
-    if checks is not False:
-        snapshot = _at_clear_offset(snapshot)
-    tell(0.2, "solving")
+    tell(0.0, "solving")
     calibration = snapshot.estimate(cross_check=checks)
     found = Run(calibration, snapshot)
     if checks is not False:
@@ -91,17 +86,12 @@ def review(
     calibration: Calibration,
     snapshot: Snapshot,
     settled: Collection[str] = (),
-    *,
-    may_solve: bool = True,
 ) -> Run:
     """Check the streams of a result, from the poses and options that gave it. If a check is certain
     of the time offset or of the scale, and neither the user nor an earlier check has ``settled``
-    it, solve once more with it if that is allowed, and keep that if there is less to say against
-    it.
+    it, solve once more with it, and keep that if there is less to say against it.
     """
     first = _checked(calibration, snapshot)
-    if not may_solve:
-        return first
     given = snapshot.config.given.union(settled)
     options, found = _certain(first.check.findings, given), first.check.findings
     if {*options} & {*_REPAIRS}:
@@ -110,11 +100,16 @@ def review(
         second = _solved_with(snapshot, options)
         is_clear = second and not any(each.makes_unusable for each in second.check.findings)
         return _repaired(first, second, options) if second and is_clear else first
-    if "time_offset" not in given and snapshot.config.time_offset == "estimate":
-        return _of_clear_offset(first, options)
     least = int(bool(options))
-    moved_s = calibration.time_offset_s - fixed_time_offset(snapshot.resolved.config)
-    if "time_offset" not in given and _is_large(moved_s, calibration):
+    moved_s = calibration.time_offset_s - float(snapshot.resolved.config.time_offset)
+    is_free = not METHODS[snapshot.config.method].uses_reference
+    if (clock := first.check.offset) and is_free and snapshot.config.reference == "auto":
+        # Of a rate, and of DNLO, which has no offset of its own, only the check knows.
+        left_s = clock.largest_s(snapshot.child.duration_s)
+        if clock.spread_s < 0.5 * left_s:
+            moved_s = max(abs(moved_s), left_s - 0.5 * clock.spread_s)
+    most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else _MOST_MOVED_S
+    if "time_offset" not in given and abs(moved_s) >= most_s:
         options = {"time_offset": "estimate", **options}
     second = _improved(first, options, by=least)
     return _telling(second, options, found) if second else first
@@ -134,23 +129,6 @@ def _improved(first: Run, options: Options, by: int) -> Run | None:
     is_sound = fits[1] and not serious[1]
     is_better = serious[1] <= serious[0] - by and fits[1] >= fits[0]
     return second if is_sound or is_better else None
-
-
-def _of_clear_offset(first: Run, certain: Options) -> Run:
-    """The run whose time offset :func:`_at_clear_offset` had estimated, or a second one: without
-    that if it is small, or with what else is certain.
-    """
-    ahead = {"time_offset": "estimate"}
-    clock, offset_s = first.snapshot.time_offset, first.calibration.time_offset_s
-    if clock and clock.rate and clock.rate.is_used:
-        offset_s = replace(clock, seconds=offset_s).largest_s(first.snapshot.child.duration_s)
-    others = {name: value for name, value in certain.items() if name != "time_offset"}
-    if _is_large(offset_s, first.calibration):
-        if second := _improved(first, others, by=1):
-            return _telling(second, ahead | others, first.check.findings)
-        return _telling(first, ahead, ())
-    without = _solved_with(first.snapshot, {"time_offset": CalibratorConfig.time_offset} | others)
-    return _telling(without, others, first.check.findings) if without else first
 
 
 def _repaired(first: Run, second: Run, options: Options) -> Run:
@@ -190,25 +168,6 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         paired_at=None,
         time_offset=None,
     )
-
-
-def _at_clear_offset(snapshot: Snapshot) -> Snapshot:
-    """The snapshot with an estimated time offset, if that is clear before any solve."""
-    config = snapshot.config
-    uses_reference = METHODS[config.method].uses_reference or config.reference != "auto"
-    if "time_offset" in config.given or config.measured != "poses" or uses_reference:
-        return snapshot
-    if not snapshot.correlation.is_clear:
-        return snapshot
-    clock = refine_time_offset(
-        snapshot.parent, snapshot.child, snapshot.correlation, config.max_gap, least_s=_MOST_MOVED_S
-    )
-    largest_s = clock.largest_s(snapshot.child.duration_s)
-    if not clock.spread_s < 0.5 * largest_s or largest_s - 0.5 * clock.spread_s < _MOST_MOVED_S:
-        return snapshot
-    moved = replace(snapshot, config=replace(config, time_offset="estimate"), time_offset=clock)
-    can_solve = all(len(each.pose_pairs) >= config.min_pairs for each in (snapshot, moved))
-    return moved if can_solve else snapshot
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Run:
@@ -272,9 +231,3 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
             if is_sure and is_known and name not in given:
                 certain[name] = "estimate" if each.code in ("time_offset", "scale") else value
     return certain
-
-
-def _is_large(moved_s: float, calibration: Calibration) -> bool:
-    """Whether a model should not move poses by so much."""
-    most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else _MOST_MOVED_S
-    return abs(moved_s) >= most_s

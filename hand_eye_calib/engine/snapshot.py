@@ -10,7 +10,7 @@ from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
 from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import cross_checked
-from hand_eye_calib.engine.estimation import fixed_time_offset, solve_poses
+from hand_eye_calib.engine.estimation import solve_poses
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -31,6 +31,10 @@ _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "back
 # A time offset (s) of positions or rotations is used if it is closer than this to the one that they
 # were paired with; they are paired anew if it is farther away than this.
 _BELIEVABLE_S, _NEGLIGIBLE_S = 1.0, 0.005
+
+# Pose pairs of whole trajectories that are used unless an option says otherwise: the noise model
+# takes 8 kB for each, and hours at ten a second hold as many.
+_MOST_PAIRS = 100_000
 
 # Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
 # were downsampled are farther apart than poses.
@@ -171,7 +175,7 @@ class Snapshot:
         of_positions = self.config.measured == "positions"
         estimate = estimate_lever_arm if of_positions else estimate_rotation
         result = estimate(self.pose_pairs, self.config)
-        found_s, given_s = result.time_offset_s, fixed_time_offset(self.config)
+        found_s, given_s = result.time_offset_s, float(self.config.time_offset)
         if not abs(found_s - given_s) < _BELIEVABLE_S:
             return replace(result, time_offset_s=given_s)
         if len(self.kept) or not abs(found_s - given_s) > _NEGLIGIBLE_S:
@@ -188,7 +192,7 @@ class Snapshot:
         """
         streams = [self.parent, self.child]
         if len(self.kept):
-            pairs, offset_s = self.pose_pairs, fixed_time_offset(self.resolved.config)
+            pairs, offset_s = self.pose_pairs, float(self.resolved.config.time_offset)
             streams = [Trajectory(pairs.stamps_ns, Ts) for Ts in (pairs.Ts_pw_p, pairs.Ts_cw_c)]
             streams[1] = streams[1].shifted(-offset_s)
         for k, stream in enumerate(STREAMS):
@@ -199,7 +203,7 @@ class Snapshot:
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
-        parent, child = self.parent, self.child.shifted(fixed_time_offset(self.config))
+        parent, child = self.parent, self.child.shifted(float(self.config.time_offset))
         for name, stream in zip(STREAMS, (parent, child), strict=True):
             if len(stream) == 0:
                 return f"{needed}: no poses on the {name} stream"
@@ -232,6 +236,33 @@ def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) ->
         trajectory = replace(trajectory, poses=right)
     is_scaled = stream == "parent" and config.parent_scale != 1.0
     return trajectory.scaled(config.parent_scale) if is_scaled else trajectory
+
+
+def whole_snapshot(
+    parent: Trajectory, child: Trajectory, options: Mapping[str, object]
+) -> Snapshot:
+    """The Snapshot of two whole trajectories, with options by their public names: all pairs up to
+    100,000 unless they set another limit.
+    """
+    of_streams = {
+        "max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS),
+        "parent_measures": parent.measures,
+        "child_measures": child.measures,
+    }
+    config = CalibratorConfig.from_options(of_streams | dict(options))
+    parent_frame, child_frame, warnings = name_frames(
+        config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
+    )
+    if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
+        warnings += (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
+    return Snapshot(
+        config=config,
+        buffered_parent=parent,
+        buffered_child=child,
+        parent_frame=parent_frame,
+        child_frame=child_frame,
+        warnings=warnings,
+    )
 
 
 def name_frames(
@@ -282,7 +313,7 @@ def pair_poses(
     kept: PosePairs,
 ) -> PosePairs:
     """Pose pairs of two trajectories that are keyframes, after the last pair of ``kept``."""
-    made = synchronise(parent, child.shifted(fixed_time_offset(config)), config.max_gap, at)
+    made = synchronise(parent, child.shifted(float(config.time_offset)), config.max_gap, at)
     if len(kept):
         made = made[made.stamps_ns > kept.stamps_ns[-1]]
     least = config.keyframe_min_translation, config.keyframe_min_rotation

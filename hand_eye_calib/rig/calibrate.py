@@ -8,8 +8,8 @@ from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import solve_poses
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import Progress, run
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import synchronise
@@ -84,14 +84,14 @@ def solve_rig(
     star, moved = [], []
     for index, other in enumerate(named[1:]):
         tell(0.6 * index / (len(sensors) - 1), f"{other.sensor_frame} in {sensors[0]}")
-        config = offline_config(named[0], other, options)
-        answer = run(whole_snapshot(config, named[0], other)).calibration
+        snapshot = whole_snapshot(named[0], other, options)
+        answer = run(snapshot).calibration
         star.append(answer)
         moved.append(other.scaled(answer.scale).shifted(answer.time_offset_s))
     chain = []
     for index, (answer, before, after) in enumerate(zip(star, moved, moved[1:], strict=False)):
         tell(0.6 + 0.4 * index / (len(star) - 1), "closure of pairs")
-        pairs = synchronise(before, after, config.max_gap)
+        pairs = synchronise(before, after, snapshot.config.max_gap)
         of_pair = {"method": answer.method, "max_pairs": max(len(pairs), 10)}
         found = solve_poses(pairs, CalibratorConfig.from_options(of_pair)).calibration()
         ends = before.sensor_frame, after.sensor_frame

@@ -17,7 +17,8 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.offline import prior_fields, whole_snapshot
+from hand_eye_calib.engine.offline import prior_fields
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
@@ -107,8 +108,9 @@ def stops(recorded: Recorded) -> list[dict[str, Any]]:
 def _steps(recorded: Recorded) -> Iterator[Step]:
     """Calibrations of the parts; those that cannot be solved are left out."""
     options: dict[str, Any] = dict(recorded.options)
-    options |= prior_fields(options.pop("prior", {}))
-    config = CalibratorConfig(**options)
+    of_axes = prior_fields(options.pop("prior", {}))
+    options |= {name.replace("_", ".", 1): value for name, value in of_axes.items()}
+    options = {"max_pairs": CalibratorConfig.max_pairs, **options}
     streams = recorded.recording.parent, recorded.recording.child
     of_parent, of_child = (each.stamps_ns[[0, -1]] for each in streams)
     # Clocks of their own: the child's part is the same share of its recording.
@@ -120,7 +122,7 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
             for stream, (start_ns, end_ns) in zip(streams, (of_parent, of_child), strict=True)
         ]
         try:
-            snapshot = whole_snapshot(config, *parts).resolved
+            snapshot = whole_snapshot(parts[0], parts[1], options).resolved
             calibration = snapshot.estimate()
             seen = excitation(snapshot.pose_pairs)
         except (HandEyeCalibError, np.linalg.LinAlgError):

@@ -13,7 +13,8 @@ from motions import (
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.engine.offline import calibrate, offline_config, whole_snapshot
+from hand_eye_calib.engine.offline import calibrate
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -72,9 +73,10 @@ def test_adaptive_adds_the_lag_it_finds_to_a_time_offset_unless_that_was_set():
     poses = wandering_poses(400, 5)
     parent = as_trajectory(poses)
     child = as_trajectory(child_of(disturbed(poses, 1, 1e-4, 1e-4))).shifted(0.02)
-    config = offline_config(parent, child, {"method": "adaptive"})
+    whole = whole_snapshot(parent, child, {"method": "adaptive"})
     for offset_s in (0.0, -0.015):
-        snapshot = whole_snapshot(dataclasses.replace(config, time_offset=offset_s), parent, child)
+        config = dataclasses.replace(whole.config, time_offset=offset_s)
+        snapshot = dataclasses.replace(whole, config=config)
         assert snapshot.estimate().time_offset_s == pytest.approx(-0.02, abs=1e-3)
         result = calibrate(parent, child, method="adaptive", time_offset=offset_s)
         assert result.time_offset_s == offset_s

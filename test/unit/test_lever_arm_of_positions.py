@@ -7,7 +7,7 @@ from motions import geodetic, planar_poses, wandering_poses
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.partial import simulated_positions
@@ -186,7 +186,7 @@ class TestLeverArm:
         parent, child = recorded(n_poses=80)
 
         def codes(parent, child):
-            snapshot = whole_snapshot(offline_config(parent, child, {}), parent, child)
+            snapshot = whole_snapshot(parent, child, {})
             return [each.code for each in check(snapshot, snapshot.estimate()).findings]
 
         assert codes(parent, child.scaled(1000.0)) == ["units"]

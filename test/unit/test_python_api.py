@@ -20,7 +20,8 @@ from motions import (
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.offline import offline_config, prior_fields, whole_snapshot
+from hand_eye_calib.engine.offline import prior_fields
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.methods import BACKENDS, METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -59,7 +60,7 @@ class TestOptionsOfCalibrate:
         seen = []
         monkeypatch.setattr(
             "hand_eye_calib.engine.offline.whole_snapshot",
-            lambda config, parent, child: seen.append(config),
+            lambda *given: seen.append(whole_snapshot(*given).config),
         )
         solved = SimpleNamespace(calibration=result_making.calibration(), snapshot=None)
         monkeypatch.setattr("hand_eye_calib.engine.offline.run", lambda *_, **__: solved)
@@ -86,22 +87,22 @@ class TestOptionsOfCalibrate:
         parent, child = streams(60)
         result = hec.calibrate(parent, child, reference="B1", max_pairs=20)
         assert result.n_poses <= 20
-        assert offline_config(parent, child, {}).max_pairs == 60
+        assert whole_snapshot(parent, child, {}).config.max_pairs == 60
         # Of two files of a million poses one in ten is used.
         poses = np.broadcast_to(np.eye(4), (1_000_000, 4, 4))
         long = hec.Trajectory(np.arange(1_000_000), poses)
-        config = offline_config(long, long, {})
-        assert config.max_pairs == 100_000
-        said = " ".join(whole_snapshot(config, long, long).warnings)
+        snapshot = whole_snapshot(long, long, {})
+        assert snapshot.config.max_pairs == 100_000
+        said = " ".join(snapshot.warnings)
         assert "100,000 pose pairs are used at most" in said
-        assert offline_config(long, long, {"max_pairs": 2_000_000}).max_pairs == 2_000_000
+        assert whole_snapshot(long, long, {"max_pairs": 2_000_000}).config.max_pairs == 2_000_000
 
     def test_progress_is_told_and_changes_nothing(self):
         parent, child = streams()
         told = []
         tell = lambda share, step: told.append((share, step))  # noqa: E731
         result = hec.calibrate(parent, child, reference="B1", progress=tell)
-        steps = ["time offset", "solving", "checking the streams", "done"]
+        steps = ["solving", "checking the streams", "done"]
         assert [step for _, step in told] == steps
         assert sorted(told) == told
         assert (told[0][0], told[-1][0]) == (0.0, 1.0)

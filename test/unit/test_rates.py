@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory
@@ -216,7 +216,7 @@ class TestFiles:
 class TestCheck:
     @staticmethod
     def codes(parent, child, **options):
-        snapshot = whole_snapshot(offline_config(parent, child, options), parent, child)
+        snapshot = whole_snapshot(parent, child, options)
         found = check(snapshot, snapshot.estimate()).findings
         return [(each.code, each.severity.value, dict(each.options)) for each in found]
 
@@ -253,7 +253,7 @@ class TestCheck:
             Trajectory(np.r_[rest, parent.stamps_ns], poses, "lidar"),
             Trajectory.from_rates(np.r_[fine_ns, stamps_ns], np.r_[quiet, rates], "imu"),
         )
-        found = whole_snapshot(offline_config(*streams, {}), *streams).estimate()
+        found = whole_snapshot(*streams, {}).estimate()
         assert found.findings == ()
         assert angle_to(T_PARENT_CHILD[:3, :3], found) < np.radians(2.0)
 

@@ -20,7 +20,7 @@ from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
 from hand_eye_calib.cli.reporting import write_report
 from hand_eye_calib.engine import evidence
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.report.report import render
@@ -76,7 +76,7 @@ def simulated(seed=3, poses=200, frames=("lidar", "camera"), options=None, **mot
     config = dataclasses.replace(DRIVE, poses=poses, **motion, **names)
     drive = simulate_drive(seed, config, REALISTIC)
     streams = drive.parent, drive.child
-    snapshot = whole_snapshot(offline_config(*streams, options or {}), *streams)
+    snapshot = whole_snapshot(*streams, options or {})
     return snapshot, snapshot.estimate()
 
 
@@ -192,8 +192,7 @@ def partial():
         streams = {"parent": drive.parent, "child": drive.child}
         streams[of] = dataclasses.replace(streams[of], measures=name)
         options = {"parent_frame": "lidar", "child_frame": "antenna"}
-        config = offline_config(streams["parent"], streams["child"], options)
-        snapshot = whole_snapshot(config, **streams)
+        snapshot = whole_snapshot(**streams, options=options)
         calibration = snapshot.estimate()
         made[name] = (calibration, *page_of(snapshot, calibration))
     return made

@@ -13,9 +13,8 @@ import hand_eye_calib as hec
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.offline import offline_config, whole_snapshot
 from hand_eye_calib.engine.run import review, run, with_options
-from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
@@ -103,7 +102,7 @@ def test_a_convention_that_was_given_is_kept_and_the_advice_undoes_it(streams):
 def test_kept_pairs_are_put_right_like_poses(streams):
     parent, child, expected = streams
     child = written_otherwise(child, REPAIRS[0])
-    snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
+    snapshot = whole_snapshot(parent, child, {"reference": "B5"})
     nothing = {"buffered_parent": parent[:0], "buffered_child": child[:0]}
     kept = replace(snapshot, kept=snapshot.pose_pairs, paired_at="child", **nothing)
     found = with_options(kept, {"child_invert": "poses"})
@@ -157,7 +156,7 @@ def test_options_that_are_passed_are_given_even_if_they_are_the_defaults():
 
 def test_good_streams_are_left_alone(streams):
     parent, child, _ = streams
-    snapshot = whole_snapshot(offline_config(parent, child, {"reference": "B5"}), parent, child)
+    snapshot = whole_snapshot(parent, child, {"reference": "B5"})
     plain = snapshot.estimate()
     found = review(plain, snapshot)
     assert found.snapshot is snapshot
@@ -202,47 +201,13 @@ def late():
     poses = wandering_poses(300)
     parent = as_trajectory(poses)
     child = as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001)).shifted(-0.05)
-    return whole_snapshot(offline_config(parent, child, {}), parent, child)
+    return whole_snapshot(parent, child, {})
 
 
-class TestClearOffset:
-    def test_it_is_estimated_before_the_first_solve(self, late):
-        in_turn = review(late.estimate(), late)
-        found = run(late)
-        assert found.snapshot.config == in_turn.snapshot.config
-        assert found.told == in_turn.told
-        expected = in_turn.calibration
-        np.testing.assert_array_equal(found.calibration.T_parent_child, expected.T_parent_child)
-        np.testing.assert_array_equal(found.calibration.covariance, expected.covariance)
-        assert found.calibration.findings == expected.findings
-        assert expected.time_offset_s == pytest.approx(0.05, abs=0.003)
-
-    @pytest.mark.parametrize(
-        "options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}]
-    )
-    def test_a_clock_that_the_user_set_stays(self, late, options):
-        other = replace(late, config=replace(late.config, given=options, **options))
-        assert run(other).snapshot is other
-
-    def test_two_solves_at_most(self, late, monkeypatch):
-        solved = []
-        estimate = Snapshot.estimate
-
-        def counted(*given, **more):
-            solved.append(1)
-            return estimate(*given, **more)
-
-        monkeypatch.setattr(Snapshot, "estimate", counted)
-        run(late)
-        assert len(solved) == 1
-        spread = replace(with_options(late, {"time_offset": "estimate"}).resolved.time_offset)
-        unclear = replace(spread, spread_s=0.4)
-        monkeypatch.setattr(
-            "hand_eye_calib.engine.run.refine_time_offset", lambda *given, **more: unclear
-        )
-        found = run(late)
-        assert len(solved) == 3
-        assert found.calibration.time_offset_s == pytest.approx(0.05, abs=0.003)
+@pytest.mark.parametrize("options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}])
+def test_a_clock_that_the_user_set_stays(late, options):
+    other = replace(late, config=replace(late.config, given=options, **options))
+    assert run(other).snapshot is other
 
 
 def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
