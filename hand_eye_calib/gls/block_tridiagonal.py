@@ -9,8 +9,6 @@ overhead grows with the logarithm of the number of blocks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
@@ -39,53 +37,6 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inverse, np.asarray(2.0 * np.log(pivots).sum(axis=1))
 
 
-@dataclass(frozen=True)
-class _Level:
-    """What eliminating every other block, the second first, needs: the inverse root of its own
-    block, and that times its coupling to the block before and, if there is one, behind.
-    """
-
-    inverse: FloatArray
-    before: FloatArray
-    behind: FloatArray
-
-    def whiten(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened columns of the eliminated blocks, and the columns of the blocks that stay."""
-        whitened, rest = self.inverse @ right[1::2], right[::2].copy()
-        rest[: len(whitened)] -= transposed(self.before) @ whitened
-        n_behind = len(self.behind)
-        rest[1 : 1 + n_behind] -= transposed(self.behind) @ whitened[:n_behind]
-        return whitened, rest
-
-    def restore(self, whitened: FloatArray, rest: FloatArray) -> FloatArray:
-        """Solution of all blocks from that of those that stay."""
-        n_behind = len(self.behind)
-        own = whitened - self.before @ rest[: len(whitened)]
-        own[:n_behind] -= self.behind @ rest[1 : 1 + n_behind]
-        solved = np.empty((len(whitened) + len(rest), *rest.shape[1:]))
-        solved[::2] = rest
-        np.matmul(transposed(self.inverse), own, out=solved[1::2])
-        return solved
-
-    def extend(self, diagonal: FloatArray, below: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Blocks of the inverse on the diagonal and below it from those of the blocks that stay."""
-        n_own, n_behind = len(self.inverse), len(self.behind)
-        root = transposed(self.inverse)
-        to_before, to_behind = -root @ self.before, -root[:n_behind] @ self.behind
-        with_before = to_before @ diagonal[:n_own]
-        with_before[:n_behind] += to_behind @ below[:n_behind]
-        with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
-        with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
-        own = transposed(self.inverse) @ self.inverse
-        own += with_before @ transposed(to_before)
-        own[:n_behind] += transposed(to_behind @ with_behind)
-        all_diagonal = np.empty((len(diagonal) + n_own, *diagonal.shape[1:]))
-        all_below = np.empty((len(all_diagonal) - 1, *diagonal.shape[1:]))
-        all_diagonal[::2], all_diagonal[1::2] = diagonal, own
-        all_below[::2], all_below[1::2] = with_before, with_behind
-        return all_diagonal, all_below
-
-
 class Factor:
     """Cholesky factor L of a positive definite matrix with permuted rows and columns;
     ``log_determinant`` is that of the matrix.
@@ -103,13 +54,19 @@ class Factor:
     """
 
     def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
-        self._levels: list[_Level] = []
+        # Every other block is eliminated, the second first. That needs the inverse root of its own
+        # block, and that times its coupling to the block before and, if there is one, behind.
+        self._levels: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _DENSE:
-            inverse, n_behind = self._inverse_root(diagonal[1::2]), (len(diagonal) - 1) // 2
+            (inverse, logarithms), n_behind = (
+                inverse_roots(diagonal[1::2]),
+                (len(diagonal) - 1) // 2,
+            )
             before = inverse @ below[::2]
             behind = inverse[:n_behind] @ transposed(below[1::2])
-            self._levels.append(_Level(inverse, before, behind))
+            self._levels.append((inverse, before, behind))
+            self.log_determinant += float(logarithms.sum())
             diagonal = diagonal[::2].copy()
             diagonal[: len(before)] -= transposed(before) @ before
             diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
@@ -118,20 +75,19 @@ class Factor:
         whole, blocks = np.zeros((self._n_last, self._size) * 2), np.arange(self._n_last)
         whole[blocks, :, blocks] = diagonal
         whole[blocks[1:], :, blocks[:-1]] = below
-        self._last = self._inverse_root(whole.reshape(1, self._n_last * self._size, -1))[0]
-
-    def _inverse_root(self, blocks: FloatArray) -> FloatArray:
-        inverse, log_determinants = inverse_roots(blocks)
-        self.log_determinant += float(log_determinants.sum())
-        return inverse
+        roots, logarithms = inverse_roots(whole.reshape(1, self._n_last * self._size, -1))
+        self.log_determinant += float(logarithms.sum())
+        self._last = roots[0]
 
     def whiten(self, right: FloatArray) -> FloatArray:
         """``L^-1`` times columns (n, d, k), in the order of the elimination."""
         whitened, start = np.empty(right.shape), 0
-        for level in self._levels:
-            part = slice(start, start + len(level.inverse))
-            whitened[part], right = level.whiten(right)
-            start = part.stop
+        for inverse, before, behind in self._levels:
+            own, right = inverse @ right[1::2], right[::2].copy()
+            right[: len(own)] -= transposed(before) @ own
+            right[1 : 1 + len(behind)] -= transposed(behind) @ own[: len(behind)]
+            whitened[start : start + len(own)] = own
+            start += len(own)
         last = right.reshape(len(self._last), -1)
         whitened[start:] = (self._last @ last).reshape(right.shape)
         return whitened
@@ -141,10 +97,14 @@ class Factor:
         start = len(whitened) - self._n_last
         last = whitened[start:].reshape(len(self._last), -1)
         solved = (self._last.T @ last).reshape(whitened[start:].shape)
-        for level in reversed(self._levels):
-            part = slice(start - len(level.inverse), start)
-            solved = level.restore(whitened[part], solved)
-            start = part.start
+        for inverse, before, behind in reversed(self._levels):
+            rest, end = solved, start
+            start -= len(inverse)
+            own = whitened[start:end] - before @ rest[: len(inverse)]
+            own[: len(behind)] -= behind @ rest[1 : 1 + len(behind)]
+            solved = np.empty((len(inverse) + len(rest), *rest.shape[1:]))
+            solved[::2] = rest
+            np.matmul(transposed(inverse), own, out=solved[1::2])
         return solved
 
     def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
@@ -153,6 +113,19 @@ class Factor:
         whole = (self._last.T @ self._last).reshape(shape).transpose(0, 2, 1, 3)
         blocks = np.arange(self._n_last)
         diagonal, below = whole[blocks, blocks], whole[blocks[1:], blocks[:-1]]
-        for level in reversed(self._levels):
-            diagonal, below = level.extend(diagonal, below)
+        for inverse, before, behind in reversed(self._levels):
+            n_own, n_behind, root = len(inverse), len(behind), transposed(inverse)
+            to_before, to_behind = -root @ before, -root[:n_behind] @ behind
+            with_before = to_before @ diagonal[:n_own]
+            with_before[:n_behind] += to_behind @ below[:n_behind]
+            with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
+            with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
+            own = root @ inverse
+            own += with_before @ transposed(to_before)
+            own[:n_behind] += transposed(to_behind @ with_behind)
+            rest = diagonal
+            diagonal = np.empty((len(rest) + n_own, *rest.shape[1:]))
+            below = np.empty((len(diagonal) - 1, *rest.shape[1:]))
+            diagonal[::2], diagonal[1::2] = rest, own
+            below[::2], below[1::2] = with_before, with_behind
         return diagonal, below

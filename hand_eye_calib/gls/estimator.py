@@ -15,10 +15,10 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.increments import N_SYSTEMATIC, SYSTEMATIC, Streams
+from hand_eye_calib.gls.increments import N_SYSTEMATIC, PARAMETERS, SYSTEMATIC, Streams
 from hand_eye_calib.gls.noise_model import ROTATION
 from hand_eye_calib.gls.problem import Fit, Problem
-from hand_eye_calib.gls.solution import AdaptiveSolution
+from hand_eye_calib.gls.solution import AdaptiveSolution, parts_of
 from hand_eye_calib.gls.stages import STAGES, is_settled, start
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 from hand_eye_calib.stats import median
@@ -60,7 +60,7 @@ def solve(
     """
     problem = Problem(
         streams=Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c),
-        systematic=tuple(systematic),
+        columns=[column for name in systematic for column in PARAMETERS[name]],
         is_clock_free=is_clock_free,
         without=frozenset(without) | (_SLOW if quick else frozenset()),
         tuning=tuning,
@@ -125,8 +125,11 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     """The solution one step from where the search stands."""
     streams, posterior, columns = problem.streams, problem.posterior(fit), problem.columns
     normal = posterior.normal
+    # Rows of an increment that tell: three where only rotations are measured, without a place.
+    places = np.concatenate([streams.Ts_pw_p[:, :3, 3], streams.Ts_cw_c[:, :3, 3]], axis=1)
+    n_rows = 6 if np.ptp(places, axis=0).any() else 3
     n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
-    misfit = float(normal.cost) / max(streams.n_rows * n_evidence - 6 - len(columns), 1)
+    misfit = float(normal.cost) / max(n_rows * n_evidence - 6 - len(columns), 1)
     # Steps smaller than predicted do not make what was learned over long baselines more certain.
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
@@ -142,8 +145,7 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         model=fit.model,
         levels=fit.levels,
         weights=fit.weights,
-        parameters=np.where(is_there, final.parameters, 0.0),
-        parameter_sigmas=np.where(is_there, sigmas, 0.0),
+        **parts_of(np.where(is_there, final.parameters, 0.0), np.where(is_there, sigmas, 0.0)),
         jumps=fit.outliers.jumps,
         spikes=fit.outliers.spikes,
         heavy_tails=fit.has_heavy_tails and "tails" not in problem.without,

@@ -20,7 +20,6 @@ steps are lost in noise would seem to shrink.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,25 +29,18 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
+from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.stats import median
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
 # of the child's path along its axes (m/m), by how much the child's stamps are late (s), the bias of
 # the child's rates minus that of the parent's, along the axes of the child (rad/s).
-SCALE, BIAS, TIME, RATE = 0, slice(1, 4), 4, slice(5, 8)
-PARAMETERS = {
-    "scale": [SCALE],
-    "bias": [*range(BIAS.start, BIAS.stop)],
-    "time": [TIME],
-    "rate": [*range(RATE.start, RATE.stop)],
-}
+PARAMETERS = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
+(SCALE,), BIAS, (TIME,), RATE = PARAMETERS.values()
+N_SYSTEMATIC = sum(map(len, PARAMETERS.values()))
 SYSTEMATIC = ("scale", "bias", "time")
 # Of streams without positions, and of those whose rotations are integrated rates.
 SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
-N_SYSTEMATIC = RATE.stop
-
-# Steps count as noise until they differ from their neighbours by so many times its variance.
-_CAUTION, _LEAST_VARIANCE = 10.0, 1e-24
 
 
 @dataclass(frozen=True)
@@ -73,14 +65,6 @@ class Streams:
     def typical_turn(self) -> float:
         """Median angle (rad) that the parent turns by from pose to pose."""
         return median(se3.rotation_angle(self.motions_p[:, :3, :3]))
-
-    @cached_property
-    def n_rows(self) -> int:
-        """Values that an increment tells: 6, or 3 if neither sensor ever leaves its place, because
-        only rotations are measured.
-        """
-        positions = np.concatenate([self.Ts_pw_p[:, :3, 3], self.Ts_cw_c[:, :3, 3]], axis=1)
-        return 6 if np.ptp(positions, axis=0).any() else 3
 
     @cached_property
     def motions_p(self) -> FloatArray:
@@ -127,9 +111,6 @@ class Course:
     path: FloatArray
     along: FloatArray
 
-    def __getitem__(self, index: IntArray | slice) -> Course:
-        return Course(self.twists[index], self.path[index], self.along[index])
-
 
 def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.inf) -> Course:
     """Course of both sensors; the child's steps are the mean of what both streams say.
@@ -165,8 +146,8 @@ def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> Floa
     rates = steps / intervals_s[:, None]
     around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
     smooth = 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None]
-    variance = max(median((steps - smooth) ** 2), _LEAST_VARIANCE)
-    believed = max(1.0 - _CAUTION * noise_m**2 / variance, 0.0)
+    variance = max(median((steps - smooth) ** 2), TUNING.least_variance)
+    believed = max(1.0 - TUNING.caution * noise_m**2 / variance, 0.0)
     return smooth + believed * (steps - smooth)
 
 
@@ -176,12 +157,6 @@ def motions(Ts_world_sensor: FloatArray) -> FloatArray:
     moved[:, :3, 3] -= before[:, :3, 3]
     moved[:, :3] = np.swapaxes(before[:, :3, :3], 1, 2) @ moved[:, :3]
     return moved
-
-
-def _as_child(Ts: FloatArray, T_parent_child: FloatArray) -> FloatArray:
-    """Motions (n, 4, 4) of the parent as the child makes them, ``X^-1 A X``."""
-    moved = (Ts.reshape(-1, 4) @ T_parent_child).reshape(Ts.shape)
-    return se3.inverse(T_parent_child) @ moved
 
 
 def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -211,21 +186,6 @@ class Linearisation:
     columns: FloatArray
     adjoints: FloatArray
     by_scale: FloatArray
-
-    @property
-    def jacobian(self) -> FloatArray:
-        """(n, 6, 6 + k) array: the derivatives."""
-        return self.columns[:, :, :-1]
-
-    @property
-    def residuals(self) -> FloatArray:
-        """(n, 6) array: e."""
-        return self.columns[:, :, -1]
-
-    def with_columns(self, columns: FloatArray) -> Linearisation:
-        """With more derivatives (n, 6, l)."""
-        parts = [self.jacobian, columns, self.columns[:, :, -1:]]
-        return dataclasses.replace(self, columns=np.concatenate(parts, axis=2))
 
 
 def linearise(
@@ -273,7 +233,8 @@ def linearise(
     by_parameter[:, :3, BIAS] = back[:, :3, :3] @ metres
     by_parameter[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
     by_parameter[:, 3:, RATE] = by_rate
-    residuals[:] = se3.log(back @ _as_child(streams.motions_p, T_parent_child))
+    moved = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(by_child.shape)
+    residuals[:] = se3.log(back @ (se3.inverse(T_parent_child) @ moved))
     if error is not None:
         residuals += error[1:] - turned(adjoints, error[:-1])
     asked = [*range(6), *(6 + column for column in columns), by.shape[2] - 1]
@@ -294,38 +255,3 @@ def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
     by_rate = _by_rate_bias(rotations, np.diff(stamps_ns) * 1e-9)
     freed = chained(rotations @ se3.rotation_exp(-by_rate @ bias))
     return se3.from_rotation_translation(freed, np.zeros((len(freed), 3)))
-
-
-def freed(
-    streams: Streams,
-    white_error: FloatArray,
-    other_error: FloatArray,
-    T_parent_child: FloatArray,
-    white: tuple[FloatArray, FloatArray],
-) -> Streams:
-    """Streams without the errors c (N, 6), split between the sensors.
-
-    White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c`` with
-    the white covariances S' of the parent and S of the child, in the child's frame: with a lever
-    arm, a translation says which of the sensors rotated. This holds for errors of these covariances
-    only. A lasting error of some centimetres beside white noise of a millimetre would be taken for
-    large and opposite rotations, so other errors are split in halves.
-
-    Parameters
-    ----------
-    streams : Streams
-    white_error, other_error : (N, 6) arrays
-    T_parent_child : (4, 4) array
-    white : ((1 or N, 6, 6) array, (1 or N, 6, 6) array)
-        Of parent and child.
-    """
-    of_parent, of_child = white
-    share = np.swapaxes(np.linalg.solve(of_parent + of_child, of_parent), 1, 2)
-    of_white = turned(share, white_error)
-    by_parent, by_child = of_white + 0.5 * other_error, of_white - white_error - 0.5 * other_error
-    to_parent = se3.adjoint(T_parent_child).T
-    return Streams(
-        streams.stamps_s,
-        streams.Ts_pw_p @ se3.exp(-by_parent @ to_parent),
-        streams.Ts_cw_c @ se3.exp(-by_child),
-    )

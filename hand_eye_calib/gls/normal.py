@@ -6,13 +6,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.gls.block_tridiagonal import transposed
-
-# Information below this share of what a parameter's own diagonal promises is rounding; no diagonal
-# counts as smaller than the latter.
-_RANK_TOLERANCE, _LEAST_INFORMATION = 1e-12, float(np.finfo(float).tiny)
-
-# Blocks of a recording that a jackknife leaves out.
-N_BLOCKS = 10
+from hand_eye_calib.gls.tuning import TUNING
 
 
 class NormalEquations:
@@ -23,8 +17,8 @@ class NormalEquations:
     ----------
     step : (..., p) array
         Change of the parameters; zero along directions without any evidence.
-    covariance : (..., p, p) array
-        Zero along these directions, too.
+    covariance, root : (..., p, p) arrays
+        Zero along these directions, too; root R with covariance R R'.
     is_complete : (...) bool array
         Whether there are none.
     cost : (...) array
@@ -36,13 +30,13 @@ class NormalEquations:
     def __init__(self, products: FloatArray) -> None:
         information, gradient = products[..., :-1, :-1], products[..., :-1, -1]
         diagonal = np.einsum("...ii->...i", information)
-        scale = 1.0 / np.sqrt(np.maximum(diagonal, _LEAST_INFORMATION))
+        scale = 1.0 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
-        self._seen = values > _RANK_TOLERANCE
+        self._seen = values > TUNING.least_information_share
         values = np.where(self._seen, values, 1.0)
         self._axes = scale[..., :, None] * vectors
-        self._root = self._axes * (self._seen / np.sqrt(values))[..., None, :]
-        self.covariance = self._root @ transposed(self._root)
+        self.root = self._axes * (self._seen / np.sqrt(values))[..., None, :]
+        self.covariance = self.root @ transposed(self.root)
         self.is_complete = self._seen.all(axis=-1)
         self.step = -(self.covariance @ gradient[..., None])[..., 0]
         self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
@@ -53,17 +47,6 @@ class NormalEquations:
         """(p, U) array: the directions without evidence of one system, of unit length."""
         axes = self._axes[:, ~self._seen]
         return np.asarray(axes / np.linalg.norm(axes, axis=0))
-
-    @property
-    def mixing(self) -> FloatArray:
-        """(p + 1, 1 + p) array of one system: residuals after the step, then the columns of a root
-        of the covariance.
-        """
-        size = len(self.step)
-        mixing = np.zeros((size + 1, size + 1))
-        mixing[:-1, 0], mixing[-1, 0] = self.step, 1.0
-        mixing[:-1, 1:] = self._root
-        return mixing
 
 
 def selected(products: FloatArray, columns: list[int]) -> FloatArray:
@@ -77,7 +60,7 @@ def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
     return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
 
 
-def answers_without(products: FloatArray, n_blocks: int = N_BLOCKS) -> FloatArray:
+def answers_without(products: FloatArray, n_blocks: int) -> FloatArray:
     """Steps (B, p) of xi and then the systematic errors, each without one of B blocks of parts.
 
     Parameters

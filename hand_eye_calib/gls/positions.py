@@ -26,6 +26,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.increments import (
+    BIAS,
     N_SYSTEMATIC,
     SCALE,
     TIME,
@@ -38,63 +39,29 @@ from hand_eye_calib.gls.increments import (
     turned,
 )
 from hand_eye_calib.gls.noise_model import (
-    LOWEST_VARIANCE,
     N_FAST,
     ROTATION,
+    ROTATIONS,
+    TRANSLATIONS,
     WALK_ROTATION,
     WALK_TRANSLATION,
-    Extent,
     NoiseModel,
     Slow,
 )
 from hand_eye_calib.gls.normal import NormalEquations, selected
-from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged, judged, surprises
+from hand_eye_calib.gls.outliers import Outliers, bridged, judged, surprises
 from hand_eye_calib.gls.problem import known_products, sample
-from hand_eye_calib.gls.solution import LeverArmSolution
+from hand_eye_calib.gls.solution import LeverArmSolution, parts_of
 from hand_eye_calib.gls.stages import rough_levels
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
+from hand_eye_calib.gls.tuning import TUNING
 
 # A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
 # acceleration (s^2). Those in the model, and the columns of the lever arm and of those that it is
 # solved with: all but the last.
 RESPONSE = N_SYSTEMATIC
-_SHARED = [SCALE, 1, 2, 3, TIME]
+_SHARED = [SCALE, *BIAS, TIME]
 _SOLVED = list(range(3 + len(_SHARED)))
-
-# Log variance (rad^2) of orientations that may be anything, and bounds of their walk.
-_ANY_ROTATION = float(np.log(100.0))
-_LEAST_WALK, _FIRST_WALK, _MOST_WALK = np.log([1e-12, 1e-6, 0.1])
-
-# Rounds of updating the orientations, and those before which noise levels are fitted; X moves by
-# less than this share of its sigma in the last. An axis that is not known to this (m) need not
-# settle: noise moves it on and on.
-_ROUNDS, _FITS, _SETTLED, _UNKNOWN_M = 10, (1, 3, 5), 0.1, 0.2
-
-# Standard deviations beforehand: of the lever arm (m), of the time offset (s), of the scale of the
-# odometry, known or not, of its direction (rad), and of what the positions answer to acceleration
-# (s^2). Accelerations are those over this time (s).
-_LONG_M, _TIME_SIGMA_S, _SCALE_SIGMA, _ANY_SCALE = 10.0, 1.0, 0.01, 1.0
-_DIRECTION_SIGMA, _RESPONSE_SIGMA = float(np.radians(0.15)), 0.002
-_ACCELERATING_S, _NEAR = 0.2, 2.5
-
-# An error that lasts is part of the model if the loss is so much lower with it.
-_LEAST_GAIN = 4.0
-
-# Noise levels need no more poses than this. A jump is a step of the walk with this many times the
-# variance that it needs.
-_MOST_POSES, _JUMP_FACTOR = 300, 10.0
-
-# The quality of a solution is that of so many positions around; those whose squared errors exceed
-# that of the best quarter of the recording by this factor are left out: they would hardly count,
-# and their errors last.
-_NEIGHBOURS, _WORSE = 11, 16.0
-
-# Poses of the windows that are aligned by themselves for the start. The first lever arm is drawn to
-# zero by so much where the motion does not tell it.
-_WINDOW, _START_STEPS, _DRAWN = 200, 50, 1e-6
-
-# Parts of a recording whose paths are compared by themselves.
-_PARTS = 10
 
 
 def solve(
@@ -116,16 +83,18 @@ def solve(
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     Ts = se3.from_rotation_translation(rotations, scale * positions)
     state = _State.first(Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
-    for number in range(_ROUNDS):
-        if number in _FITS:
-            state = state.fitted(("body", "world") if number == _FITS[0] else ())
+    for number in range(TUNING.rounds):
+        if number in TUNING.fits:
+            state = state.fitted(("body", "world") if number == TUNING.fits[0] else ())
         posterior = Posterior(state.space(), state.levels)
-        if number + 1 in _FITS[1:]:
+        if number + 1 in TUNING.fits[1:]:
             state = state.with_outliers(posterior)
         normal = NormalEquations(selected(posterior.products, _SOLVED))
         step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
-        is_settled = (np.abs(step[:3]) < _SETTLED * sigmas) | (sigmas > _UNKNOWN_M)
-        converged = number > _FITS[-1] and bool(is_settled.all())
+        is_settled = (np.abs(step[:3]) < TUNING.settled_sigmas * sigmas) | (
+            sigmas > TUNING.unknown_m
+        )
+        converged = number > TUNING.fits[-1] and bool(is_settled.all())
         if converged:
             break
         state = state.moved(posterior, step)
@@ -155,25 +124,25 @@ class _State:
     def first(cls, streams: Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
         """Where it begins."""
         stamps_s, n = streams.stamps_s, len(streams) - 1
-        extent = Extent(float(np.median(np.diff(stamps_s))), float(stamps_s[-1]))
+        interval_s, duration_s = float(np.median(np.diff(stamps_s))), float(stamps_s[-1])
         state = cls(
             positions=streams.Ts_cw_c[:, :3, 3],
             streams=streams,
             lever_arm=lever_arm,
-            scale_sigma=_ANY_SCALE if with_scale else _SCALE_SIGMA,
+            scale_sigma=TUNING.any_scale if with_scale else TUNING.scale,
             parameters=np.zeros(RESPONSE + 1),
-            model=NoiseModel((), "sensors", extent),
+            model=NoiseModel((), "sensors", interval_s, duration_s),
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
             boost=np.ones(n),
             worse=np.zeros(n + 1, dtype=bool),
         )
-        residuals = state.linearised().residuals
+        residuals = state.linearised().columns[:, :, -1]
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
         worse = _worse(np.concatenate(around))
         levels = rough_levels(residuals, worse[1:] | worse[:-1])
-        levels[ROTATION], levels[WALK_ROTATION] = _ANY_ROTATION, _FIRST_WALK
+        levels[ROTATION], levels[WALK_ROTATION] = TUNING.any_rotation, TUNING.rotation_walk[1]
         streams = bridged(streams, state.X, worse)
         return replace(state, streams=streams, levels=levels, worse=worse)
 
@@ -207,15 +176,15 @@ class _State:
         course, moving = self.course, _accelerations(self.streams, self.X)
         found = linearise(self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED)
         answering = turned(found.adjoints, moving[:-1]) - moving[1:]
-        found = found.with_columns(answering[:, :, None])
-        return replace(found, columns=np.delete(found.columns, [3, 4, 5], axis=2))
+        columns = np.insert(found.columns, -1, answering, axis=2)
+        return replace(found, columns=np.delete(columns, [3, 4, 5], axis=2))
 
     def space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of all poses: without a rotation to estimate, with orientations that may be
         anything, and with a walk that is the odometry's.
         """
-        sigmas = [_LONG_M] * 3 + [self.scale_sigma] + [_DIRECTION_SIGMA] * 3
-        sigmas += [_TIME_SIGMA_S, _RESPONSE_SIGMA]
+        sigmas = [TUNING.lever_arm_m] * 3 + [self.scale_sigma] + [TUNING.direction] * 3
+        sigmas += [TUNING.time_s, TUNING.response]
         values = np.r_[self.lever_arm, self.parameters[[*_SHARED, RESPONSE]]]
         n = len(values)
         known = known_products(range(n), values, np.array(sigmas) ** -2.0, n + 1)
@@ -229,20 +198,19 @@ class _State:
             known,
         )
         to_child = se3.adjoint(se3.inverse(self.X))
-        translation, rotation = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
         return replace(
             space,
             relative=space.relative * self.boost,
-            white=(translation[None], rotation[None]),
-            walk=(translation, to_child @ rotation @ to_child.T),
+            white=(TRANSLATIONS[None], ROTATIONS[None]),
+            walk=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
         )
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of as many poses as noise levels need."""
-        kept = sample(len(self.streams), _MOST_POSES)
+        kept = sample(len(self.streams), TUNING.most_poses)
         if kept is None:
             return self.space(model)
-        jumps = self.outliers.across(kept, LONGEST_GAP).jumps
+        jumps = self.outliers.across(kept).jumps
         return replace(
             self,
             streams=self.streams[kept],
@@ -256,9 +224,9 @@ class _State:
         kinds, if the data ask for it.
         """
         fit, _ = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
-        best, loss = replace(self, levels=fit.levels), fit.loss - _LEAST_GAIN
+        best, loss = replace(self, levels=fit.levels), fit.loss - TUNING.least_gain
         for kind in kinds:
-            model, levels = self.model.with_lasting([Slow(kind, "translation")], fit.levels)
+            model, levels = self.model.with_lasting((Slow(kind, "translation"),), fit.levels)
             rival, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
             if rival.loss < loss:
                 best, loss = replace(self, model=model, levels=rival.levels), rival.loss
@@ -270,7 +238,7 @@ class _State:
         """
         of_walk, of_white = surprises(posterior, self.left_out)
         found = judged(self.outliers, of_walk, of_white, with_spikes=True)
-        boost = np.where(found.jumps, np.maximum(_JUMP_FACTOR * of_walk, self.boost), 1.0)
+        boost = np.where(found.jumps, np.maximum(TUNING.jump_factor * of_walk, self.boost), 1.0)
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
@@ -296,22 +264,22 @@ class _State:
         )
 
 
-def _worse(squares: FloatArray, least: float = LOWEST_VARIANCE) -> BoolArray:
+def _worse(squares: FloatArray, least: float = TUNING.lowest_variance) -> BoolArray:
     """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
     those around, and than the least square: the odometry's drift from one position to the next.
     """
-    window = np.ones(min(_NEIGHBOURS, len(squares)))
+    window = np.ones(min(TUNING.neighbours, len(squares)))
     around = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
     usual = max(float(np.quantile(around / counts, 0.25)), least)
-    return np.asarray(around > _WORSE * usual * counts)
+    return np.asarray(around > TUNING.worse * usual * counts)
 
 
 def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
     """What is known of log levels beforehand, for a search from these."""
     prior = model.prior(levels)
-    prior.lower[ROTATION] = prior.upper[ROTATION] = _ANY_ROTATION
-    prior.lower[WALK_ROTATION], prior.upper[WALK_ROTATION] = _LEAST_WALK, _MOST_WALK
+    prior.lower[ROTATION] = prior.upper[ROTATION] = TUNING.any_rotation
+    prior.lower[WALK_ROTATION], prior.upper[WALK_ROTATION] = TUNING.rotation_walk[::2]
     return prior
 
 
@@ -333,9 +301,7 @@ def _solution(
         lever_arm=state.lever_arm + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
         response=(float(-parameters[RESPONSE]), float(sigmas[RESPONSE])),
-        parameters=parameters,
-        parameter_sigmas=sigmas,
-        unit=first_scale,
+        **parts_of(parameters, sigmas, first_scale),
         model=state.model,
         levels=state.levels,
         worse=state.worse,
@@ -354,14 +320,14 @@ def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:
     """
     path, stamps_s = (streams.Ts_pw_p @ X)[:, :3, 3], streams.stamps_s
     found, interval_s = np.zeros((len(path), 6)), float(np.median(np.diff(stamps_s)))
-    k = max(round(_ACCELERATING_S / interval_s), 1)
+    k = max(round(TUNING.accelerating_s / interval_s), 1)
     if len(path) <= 4 * k:
         return found
     velocities = (path[k:] - path[:-k]) / (stamps_s[k:] - stamps_s[:-k])[:, None]
     spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
     changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
     back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
-    is_near = spans_s < _NEAR * 4 * k * interval_s
+    is_near = spans_s < TUNING.near * 4 * k * interval_s
     found[2 * k : -2 * k, :3] = np.where(is_near, turned(back, changes), 0.0)
     return found
 
@@ -375,10 +341,10 @@ def _start(
     """
     lever_arm, scale = np.zeros(3), 1.0
     whole = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
-    size = min(_WINDOW, len(positions))
+    size = min(TUNING.window, len(positions))
     axes, path, measured = (_windows(values, size) for values in whole)
-    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
-    for _ in range(_START_STEPS):
+    information = np.einsum("nkij,nkil->njl", axes, axes) + TUNING.drawn * size * np.eye(3)
+    for _ in range(TUNING.start_steps):
         predicted = axes @ lever_arm + path
         turns = _rotations(measured, predicted)
         rotated = measured @ turns
@@ -404,7 +370,7 @@ def unexplained_share(
     explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
     """
     predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
-    size = max(len(positions) // _PARTS, min(_PARTS, len(positions)))
+    size = max(len(positions) // TUNING.path_parts, min(TUNING.path_parts, len(positions)))
     expected, measured = (_windows(path, size) for path in (predicted, scale * positions))
     residuals = measured @ _rotations(measured, expected) - expected
     left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))

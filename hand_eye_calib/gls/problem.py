@@ -13,16 +13,9 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.increments import (
-    N_SYSTEMATIC,
-    PARAMETERS,
-    Course,
-    Streams,
-    freed,
-    linearise,
-)
+from hand_eye_calib.gls.increments import N_SYSTEMATIC, Course, Streams, linearise, turned
 from hand_eye_calib.gls.noise_model import ROTATION, NoiseModel
-from hand_eye_calib.gls.outliers import LONGEST_GAP, Outliers, bridged
+from hand_eye_calib.gls.outliers import Outliers, bridged
 from hand_eye_calib.gls.state_space import WHITE, Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 
@@ -34,8 +27,8 @@ class Problem:
     Attributes
     ----------
     streams : Streams
-    systematic : tuple of str
-        Systematic errors in the model.
+    columns : list of int
+        Parameters of the systematic errors in the model.
     is_clock_free : bool
         Whether the time offset is not known beforehand.
     without : frozenset of str
@@ -44,17 +37,12 @@ class Problem:
     """
 
     streams: Streams
-    systematic: tuple[str, ...]
+    columns: list[int]
     is_clock_free: bool = False
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
     # The fit whose posterior of all poses was asked for last, and that posterior. It is large.
     _last: list[tuple[Fit, Posterior]] = field(default_factory=list)
-
-    @property
-    def columns(self) -> list[int]:
-        """Parameters of systematic errors in the model."""
-        return [column for name in self.systematic for column in PARAMETERS[name]]
 
     def known(self, fit: Fit) -> FloatArray:
         """Products (p + 1, p + 1) that what is known of the parameters beforehand adds."""
@@ -68,8 +56,9 @@ class Problem:
         poses, course, error, weights = fit.poses, fit.course, fit.error, fit.weights
         outliers = fit.outliers
         if kept is not None:
-            poses, course, error, weights = poses[kept], course[kept], error[kept], weights[kept]
-            outliers = outliers.across(kept, LONGEST_GAP)
+            course = Course(course.twists[kept], course.path[kept], course.along[kept])
+            poses, error, weights = poses[kept], error[kept], weights[kept]
+            outliers = outliers.across(kept)
         known = error if error.any() else None
         return (model or fit.model).state_space(
             poses,
@@ -137,19 +126,27 @@ class Fit:
         parameters[columns] += step[6:]
         return replace(self, T=after(self.T, step[:6]), parameters=parameters)
 
-    def bridged(self, streams: Streams, outliers: Outliers) -> Fit:
-        """With other outliers, at poses as given."""
-        poses = bridged(streams, self.T, outliers.spikes)
-        return replace(self, outliers=outliers, poses=poses, error=np.zeros_like(self.error))
-
     def freed(self, streams: Streams, states: FloatArray) -> Fit:
-        """With the given poses freed of the errors that latent states (N, d) make."""
-        spikes = self.outliers.spikes
+        """With the given poses freed of the errors that latent states (N, d) make.
+
+        White errors are split between the sensors by their covariances, which holds for errors of
+        these covariances only. A lasting error of some centimetres beside white noise of a
+        millimetre would be taken for large and opposite rotations, so other errors are split in
+        halves; spikes, too.
+        """
+        spikes, T = self.outliers.spikes, self.T
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
-        error = states[:, :WHITE] + self.model.lasting(states, self.poses, self.T)
-        white = self.model.sensor_white(self.levels, self.poses, self.T)
-        given = bridged(streams, self.T, spikes)
-        poses = freed(given, white_error, error - white_error, self.T, white)
+        error = states[:, :WHITE] + self.model.lasting(states, self.poses, T)
+        other_error = error - white_error
+        of_white = turned(self.model.shares(self.levels, self.poses, T), white_error)
+        by_parent = of_white + 0.5 * other_error
+        by_child = of_white - white_error - 0.5 * other_error
+        given = bridged(streams, T, spikes)
+        poses = Streams(
+            streams.stamps_s,
+            given.Ts_pw_p @ se3.exp(-by_parent @ se3.adjoint(T).T),
+            given.Ts_cw_c @ se3.exp(-by_child),
+        )
         return replace(self, poses=poses, error=error)
 
 

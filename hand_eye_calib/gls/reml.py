@@ -15,15 +15,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.gls.block_tridiagonal import transposed
 from hand_eye_calib.gls.normal import multiplied
 from hand_eye_calib.gls.state_space import WHITE, Markov, Posterior, StateSpace
-
-# The search ends if a step promises to lower the loss by less: noise levels need no more than a few
-# per cent. Steps stay within a radius of the log levels.
-_SETTLED_LOSS, _SETTLED_STEP, _MAX_STEPS = 0.05, 1e-3, 20
-_FIRST_RADIUS, _LARGEST_RADIUS = 1.5, 3.0
-_GOOD, _POOR, _SHRINK = 0.5, 0.2, 0.3
-
-# Information that every level has beforehand: bounds the step along levels that do not matter.
-_LEAST_CURVATURE = 0.05
+from hand_eye_calib.gls.tuning import TUNING
 
 
 @dataclass(frozen=True)
@@ -39,53 +31,43 @@ class Prior:
         """Negative log density, constants left out."""
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
-    def gradient(self, levels: FloatArray) -> FloatArray:
-        """(m,) array: derivatives of the loss."""
-        return self.precision * (levels - self.mean)
-
 
 def fit(space: StateSpace, start: FloatArray, prior: Prior) -> tuple[Posterior, FloatArray]:
     """The posterior at the levels of the least loss near a start, by Newton steps within a radius;
     and the average information (m, m).
     """
     levels = np.clip(start, prior.lower, prior.upper)
-    posterior, radius = Posterior(space, levels), _FIRST_RADIUS
+    posterior, radius = Posterior(space, levels), TUNING.first_radius
     loss = posterior.loss + prior.loss(levels)
-    for _ in range(_MAX_STEPS):
+    for _ in range(TUNING.max_steps):
         gradient, information = derivatives(posterior)
-        gradient = gradient + prior.gradient(levels)
-        curvature = information + np.diag(prior.precision + _LEAST_CURVATURE)
+        gradient = gradient + prior.precision * (levels - prior.mean)
+        curvature = information + np.diag(prior.precision + TUNING.least_curvature)
         gain = 0.0
-        while radius > _SETTLED_STEP:
+        while radius > TUNING.settled_level:
             step, is_newton = _step(levels, gradient, curvature, prior, radius)
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
-            if np.abs(step).max() < _SETTLED_STEP or (is_newton and promised < _SETTLED_LOSS):
+            is_small = is_newton and promised < TUNING.settled_loss
+            if is_small or np.abs(step).max() < TUNING.settled_level:
                 break
-            rival, rival_loss = _tried(space, levels + step, prior)
-            gain = loss - rival_loss
+            try:
+                rival = Posterior(space, levels + step)
+                gain = loss - (rival.loss + prior.loss(rival.levels))
+            except np.linalg.LinAlgError:
+                gain = 0.0
             if gain > 0.0:
                 break
-            radius, gain = _SHRINK * float(np.abs(step).max()), 0.0
-        if gain == 0.0 or rival is None:
+            radius, gain = TUNING.shrink * float(np.abs(step).max()), 0.0
+        if gain == 0.0:
             break
         levels, posterior, loss = rival.levels, rival, loss - gain
-        if gain > _GOOD * promised:
-            radius = min(2.0 * radius, _LARGEST_RADIUS)
-        elif gain < _POOR * promised:
+        if gain > TUNING.good * promised:
+            radius = min(2.0 * radius, TUNING.largest_radius)
+        elif gain < TUNING.poor * promised:
             radius = 0.5 * float(np.abs(step).max())
-        if gain < 0.5 * _SETTLED_LOSS:
+        if gain < 0.5 * TUNING.settled_loss:
             break
     return posterior, information
-
-
-def _tried(space: StateSpace, levels: FloatArray, prior: Prior) -> tuple[Posterior | None, float]:
-    """The posterior at some levels, and its loss with the prior; infinite where there is none."""
-    try:
-        posterior = Posterior(space, levels)
-    except np.linalg.LinAlgError:
-        return None, np.inf
-    loss = posterior.loss + prior.loss(levels)
-    return posterior, loss if np.isfinite(loss) else np.inf
 
 
 def _step(
@@ -110,26 +92,14 @@ def _step(
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Gradient (m,) of the loss by the log levels and the average information (m, m)."""
-    states = posterior.restricted()
-    walk = posterior.restricted_walk(states)
-    gradient = np.concatenate(
-        [
-            _white_gradient(posterior, states[:, :WHITE]),
-            _walk_gradient(posterior, walk),
-            *(_markov_gradient(posterior, process, states) for process in posterior.markov),
-        ]
-    )
-    return gradient, _average_information(posterior, states[:, :, 0], walk[:, :, 0])
-
-
-def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
     space, precision = posterior.space, posterior.white
-    covariance, _ = posterior.selected_inverse
-    moments = states @ transposed(states)
-    moments += covariance[:, :WHITE, :WHITE]
+    states, walk = posterior.restricted()
+    white = states[:, :WHITE]
+    moments = white @ transposed(white)
+    moments += posterior.selected_inverse[0][:, :WHITE, :WHITE]
     moments *= space.weights[:, None, None]
     excess = precision - precision @ moments @ precision
-    excess[space.is_free] = 0.0
+    excess[space.weights == 0.0] = 0.0
     total = excess.sum(axis=0)
     traces = [
         float((total * basis[0]).sum() if len(basis) == 1 else (excess * basis).sum())
@@ -137,17 +107,14 @@ def _white_gradient(posterior: Posterior, states: FloatArray) -> FloatArray:
     ]
     along = (excess @ space.twists[:, :, None])[:, :, 0]
     traces.append(float((along * space.twists).sum()))
-    return 0.5 * np.exp(posterior.levels[: len(traces)]) * traces
-
-
-def _walk_gradient(posterior: Posterior, walk: FloatArray) -> FloatArray:
-    space, precision = posterior.space, posterior.walk
-    moments = walk_covariance(posterior) + walk @ walk.transpose(0, 2, 1)
+    moments = walk_covariance(posterior) + walk @ transposed(walk)
     total = np.tensordot(posterior.evidence, moments, axes=1)
-    excess = (~space.cut).sum() * precision - precision @ total @ precision
-    first = space.n_white
-    traces = [float((excess * basis).sum()) for basis in space.walk]
-    return 0.5 * np.exp(posterior.levels[first : first + len(traces)]) * traces
+    excess = (~space.cut).sum() * posterior.walk - posterior.walk @ total @ posterior.walk
+    traces += [float((excess * basis).sum()) for basis in space.walk]
+    gradient = [0.5 * np.exp(posterior.levels[: len(traces)]) * traces]
+    gradient += [_markov_gradient(posterior, process, states) for process in posterior.markov]
+    information = _average_information(posterior, states[:, :, 0], walk[:, :, 0])
+    return np.concatenate(gradient), information
 
 
 def walk_covariance(posterior: Posterior) -> FloatArray:
@@ -163,14 +130,14 @@ def walk_covariance(posterior: Posterior) -> FloatArray:
 
 
 def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
-    phi, rest, group = process.phi, process.rest, process.group.states
+    phi, rest, group = process.phi, process.rest, process.states
     covariance, below = posterior.selected_inverse
     own = states[:, group]
     here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
     ahead = np.einsum("nii->n", below[:, group, group])
     ahead += np.einsum("nij,nij->n", own[1:], own[:-1])
     innovations = here[1:] - 2.0 * phi * ahead + phi**2 * here[:-1]
-    size, variance = process.group.size, process.variance
+    size, variance = own.shape[1], process.variance
     by_variance = 0.5 * (
         size * len(here) - (here[0] + float((innovations / rest).sum())) / variance
     )
@@ -180,23 +147,22 @@ def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) 
 
 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
-    space = posterior.space
-    variances = np.exp(posterior.levels)
+    space, variances = posterior.space, np.exp(posterior.levels)
+    n_white = len(space.white)
     moved = np.zeros((*states.shape, len(variances)))
     pulled = (posterior.white @ states[:, :WHITE, None])[:, :, 0]
-    pulled[space.is_free] = 0.0
+    pulled[space.weights == 0.0] = 0.0
     for index, basis in enumerate(space.white):
         moved[:, :WHITE, index] = variances[index] * (basis @ pulled[:, :, None])[:, :, 0]
-    along = variances[len(space.white)] * (space.twists * pulled).sum(axis=1)
-    moved[:, :WHITE, len(space.white)] = along[:, None] * space.twists
-    for process in posterior.markov:
-        group = process.group
-        values = states[:, group.states]
-        moved[:, group.states, group.variance] = values
-        moved[:, group.states, group.tau] = _by_tau(process, values)
+    along = variances[n_white] * (space.twists * pulled).sum(axis=1)
+    moved[:, :WHITE, n_white] = along[:, None] * space.twists
+    for at, process in enumerate(posterior.markov):
+        level, values = n_white + 1 + len(space.walk) + 2 * at, states[:, process.states]
+        moved[:, process.states, level] = values
+        moved[:, process.states, level + 1] = process.by_tau(values)
     columns = space.observed(moved)
     pushed = walk @ posterior.walk
-    for index, basis in enumerate(space.walk, start=space.n_white):
+    for index, basis in enumerate(space.walk, start=n_white + 1):
         columns[:, :, index] = variances[index] * pushed @ basis
     columns[space.cut] = 0.0
     weighed, whitened = posterior.halves(columns)
@@ -205,15 +171,3 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     shared = shared[:-1]
     information = 0.5 * (own - shared.T @ posterior.normal.covariance @ shared)
     return 0.5 * (information + information.T)
-
-
-def _by_tau(process: Markov, values: FloatArray) -> FloatArray:
-    """Derivative by log tau of the states (N, k) that the covariance makes of fixed forces."""
-    phi, rest, slope = process.phi, process.rest, process.slope
-    by_rest = 2.0 * phi * slope / rest**2
-    beside = (slope / rest + phi * by_rest)[:, None]
-    first = (2.0 * phi * slope / rest + phi**2 * by_rest)[:, None]
-    forces = np.zeros_like(values)
-    forces[1:] += by_rest[:, None] * values[1:] - beside * values[:-1]
-    forces[:-1] += first * values[:-1] - beside * values[1:]
-    return -process.covariance_times(forces)

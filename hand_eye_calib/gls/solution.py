@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from hand_eye_calib.gls.noise_model import (
     WALK_TRANSLATION,
     NoiseModel,
 )
+from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.results.records import CorrelatedError, Noise
 from hand_eye_calib.text import angle, length
 
@@ -27,9 +29,6 @@ _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 # Stamps that jitter by less are not worth a sentence (s).
 _NOTABLE_JITTER_S = 1e-4
-
-# What is beyond so many standard deviations is there.
-_PLAIN = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +41,12 @@ class ModelSolution:
     levels : (m,) array
         Log levels of the model.
     parameters, parameter_sigmas : (8 or more,) arrays
-        Parameters of all systematic errors, see :attr:`scale`, :attr:`time_offset_s` and
-        :mod:`~hand_eye_calib.gls.increments`, and their standard deviations; zero for those that
-        are not there.
-    unit : float
-        Factor of the child's lengths that was taken out before.
+        Parameters of all systematic errors, see :mod:`~hand_eye_calib.gls.increments`, and their
+        standard deviations; zero for those that are not there.
+    scale, scale_sigma : float
+        Factor from the child's lengths to the parent's, and its standard deviation.
+    time_offset_s, time_offset_sigma_s : float
+        Seconds to add to the child's stamps, and their standard deviation.
     jumps : (n,) bool array
         Increments (from pose i to i + 1) across which a trajectory jumped for good.
     spikes : (n + 1,) bool array
@@ -65,7 +65,10 @@ class ModelSolution:
     levels: FloatArray
     parameters: FloatArray
     parameter_sigmas: FloatArray
-    unit: float = 1.0
+    scale: float
+    scale_sigma: float
+    time_offset_s: float
+    time_offset_sigma_s: float
     jumps: BoolArray
     spikes: BoolArray
     misfit: float
@@ -73,25 +76,19 @@ class ModelSolution:
     objective: float
     converged: bool
 
-    @property
-    def scale(self) -> float:
-        """Factor from the child's lengths to the parent's."""
-        return self.unit * (1.0 + float(self.parameters[SCALE]))
 
-    @property
-    def scale_sigma(self) -> float:
-        """Standard deviation of the scale."""
-        return self.unit * float(self.parameter_sigmas[SCALE])
-
-    @property
-    def time_offset_s(self) -> float:
-        """Seconds to add to the child's stamps."""
-        return -float(self.parameters[TIME])
-
-    @property
-    def time_offset_sigma_s(self) -> float:
-        """Standard deviation of the time offset."""
-        return float(self.parameter_sigmas[TIME])
+def parts_of(parameters: FloatArray, sigmas: FloatArray, unit: float = 1.0) -> dict[str, Any]:
+    """The fields of a solution that parameters make, with the factor of the child's lengths that
+    was taken out before.
+    """
+    return {
+        "parameters": parameters,
+        "parameter_sigmas": sigmas,
+        "scale": unit * (1.0 + float(parameters[SCALE])),
+        "scale_sigma": unit * float(sigmas[SCALE]),
+        "time_offset_s": -float(parameters[TIME]),
+        "time_offset_sigma_s": float(sigmas[TIME]),
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +124,7 @@ class AdaptiveSolution(ModelSolution):
     @property
     def systematic(self) -> str:
         """Systematic errors that the data show beyond doubt, joined by ``+``; ``none``."""
-        shown = np.abs(self.parameters) > _PLAIN * self.parameter_sigmas
+        shown = np.abs(self.parameters) > TUNING.plain * self.parameter_sigmas
         return "+".join(name for name, at in PARAMETERS.items() if shown[at].any()) or "none"
 
     @property
@@ -143,7 +140,7 @@ class AdaptiveSolution(ModelSolution):
         variance = 2 * white + n_intervals * walk
         for slow in self.noise.lasting:
             if slow.part == "rotation":
-                ratio = n_intervals * self.model.extent.interval_s / slow.tau_s
+                ratio = n_intervals * self.model.interval_s / slow.tau_s
                 variance = variance - 2 * slow.sigma**2 * np.expm1(-ratio)
         return np.asarray(variance)
 
@@ -212,22 +209,26 @@ class AdaptiveSolution(ModelSolution):
         return said
 
     def _systematic_in_words(self) -> list[str]:
-        systematic = self.systematic.split("+")
-        off, offset_ms = 100 * (self.scale - 1), 1000 * self.time_offset_s
-        bias, sigmas = np.degrees(self.rate_bias)
-        along = ", ".join(f"{'xyz'[k]} {1000 * self.parameters[BIAS][k]:.2g}" for k in range(3))
-        rates = ", ".join(f"{'xyz'[k]} {bias[k]:.3g} +/- {sigmas[k]:.1g}" for k in range(3))
-        said = {
-            "scale": f"the child's lengths are {abs(off):.2f} +/- {100 * self.scale_sigma:.2g} % "
-            f"{'shorter' if off > 0 else 'longer'} than the parent's",
-            "bias": f"the child's path is off by {along} mm per metre travelled, along its axes",
-            "rate": f"bias of the angular rates, along the child's axes: {rates} deg/s",
-            "time": f"the child's stamps are {abs(offset_ms):.1f} +/- "
-            f"{1000 * self.time_offset_sigma_s:.2g} ms {'early' if offset_ms > 0 else 'late'}",
-        }
+        systematic, said = self.systematic.split("+"), []
+        if "scale" in systematic:
+            off, sigma = 100 * (self.scale - 1), 100 * self.scale_sigma
+            than = f"{'shorter' if off > 0 else 'longer'} than the parent's"
+            said.append(f"the child's lengths are {abs(off):.2f} +/- {sigma:.2g} % {than}")
+        if "bias" in systematic:
+            bias = zip("xyz", 1000 * self.parameters[BIAS], strict=True)
+            along = ", ".join(f"{axis} {value:.2g}" for axis, value in bias)
+            said.append(
+                f"the child's path is off by {along} mm per metre travelled, along its axes"
+            )
         if "rate" in systematic:
-            del said["time"]
-        return [sentence for name, sentence in said.items() if name in systematic]
+            rates = zip("xyz", *np.degrees(self.rate_bias), strict=True)
+            about = ", ".join(f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates)
+            said.append(f"bias of the angular rates, along the child's axes: {about} deg/s")
+        elif "time" in systematic:
+            ms, sigma = 1000 * self.time_offset_s, 1000 * self.time_offset_sigma_s
+            late = "early" if ms > 0 else "late"
+            said.append(f"the child's stamps are {abs(ms):.1f} +/- {sigma:.2g} ms {late}")
+        return said
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +272,7 @@ class LeverArmSolution(ModelSolution):
         if worse:
             said.append(f"{worse:.0%} of the positions are far less precise, and are left out")
         response, sigma = 1e3 * np.array(self.response)
-        if abs(response) > _PLAIN * sigma:
+        if abs(response) > TUNING.plain * sigma:
             said.append(
                 f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
                 "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"

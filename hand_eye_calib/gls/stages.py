@@ -24,16 +24,14 @@ from hand_eye_calib.gls.increments import (
 )
 from hand_eye_calib.gls.noise_model import (
     CENTRES,
-    JITTER_VARIANCE,
     LASTING,
-    LOWEST_VARIANCE,
     N_FAST,
     ROTATION,
     TRANSLATION,
     WALK_ROTATION,
     WALK_TRANSLATION,
-    Extent,
     NoiseModel,
+    whole,
 )
 from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.outliers import (
@@ -43,11 +41,10 @@ from hand_eye_calib.gls.outliers import (
     judged,
     surprises,
     tail_weights,
-    tails_are_heavy,
-    with_jumps_across_spikes,
 )
 from hand_eye_calib.gls.problem import Fit, Problem, after, sample
 from hand_eye_calib.gls.state_space import Posterior
+from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.stats import median
@@ -58,24 +55,18 @@ def start(problem: Problem) -> Fit:
     streams, tuning = problem.streams, problem.tuning
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
     T = Method("dnlo").solve(pairs).T_parent_child
-    course, none = course_of(streams, T), np.zeros(N_SYSTEMATIC)
-    linearisation = linearise(streams, course, T, none, ())
-    residuals = linearisation.residuals
-    extent = Extent(median(np.diff(streams.stamps_s)), float(np.ptp(streams.stamps_s)))
-    outliers = first_outliers(residuals)
-    poses = bridged(streams, T, outliers.spikes)
-    if outliers.spikes.any():
-        bridging = linearise(poses, course, T, none, ()).residuals
-        outliers = with_jumps_across_spikes(outliers, residuals, bridging)
+    course = course_of(streams, T)
+    residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ()).columns[:, :, -1]
+    outliers = first_outliers(streams, course, T, residuals)
+    interval_s, duration_s = median(np.diff(streams.stamps_s)), float(np.ptp(streams.stamps_s))
     centre = _centre(streams, T, residuals, tuning.decisive_centre)
-    model = NoiseModel((), centre, extent)
     beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
-        poses=poses,
+        poses=bridged(streams, T, outliers.spikes),
         error=np.zeros((len(streams), 6)),
         course=course,
         T=T,
-        model=model,
+        model=NoiseModel((), centre, interval_s, duration_s),
         levels=rough_levels(residuals, beside),
         outliers=outliers,
         weights=np.ones(len(streams)),
@@ -103,17 +94,16 @@ def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> FloatArray:
     """
     kept = ~left_out
     together = kept[1:] & kept[:-1]
-    levels = np.full(N_FAST, np.log(JITTER_VARIANCE))
-    for index, part in enumerate((slice(0, 3), slice(3, 6))):
-        of_part = residuals[:, part]
-        total = np.mean(of_part[kept] ** 2) if kept.any() else LOWEST_VARIANCE
-        total = max(float(total), 100 * LOWEST_VARIANCE)
+    levels, least = np.full(N_FAST, TUNING.jitter), TUNING.lowest_variance
+    at = (TRANSLATION, WALK_TRANSLATION), (ROTATION, WALK_ROTATION)
+    for (of_white, of_walk), of_part in zip(at, np.split(residuals, 2, axis=1), strict=True):
+        total = np.mean(of_part[kept] ** 2) if kept.any() else least
+        total = max(float(total), 100 * least)
         products = of_part[1:][together] * of_part[:-1][together]
         neighbours = np.mean(products) if together.any() else -total / 2
-        white = float(np.clip(-neighbours, 0.05 * total, 0.5 * total))
-        levels[[TRANSLATION, ROTATION][index]] = np.log(white)
-        walk = max(total - 2 * white, 0.02 * total)
-        levels[[WALK_TRANSLATION, WALK_ROTATION][index]] = np.log(walk)
+        white = float(np.clip(-neighbours, *np.multiply(TUNING.first_white, total)))
+        levels[of_white] = np.log(white)
+        levels[of_walk] = np.log(max(total - 2 * white, TUNING.first_walk * total))
     return levels
 
 
@@ -127,7 +117,7 @@ def noise(problem: Problem, fit: Fit) -> Fit:
         fit,
         levels=found.levels,
         T=T,
-        course=course_of(problem.streams, T, fit.model.step_noise(found.levels)),
+        course=course_of(problem.streams, T, float(np.exp(0.5 * whole(found.levels)[0]))),
     )
 
 
@@ -149,14 +139,18 @@ def _outliers_found(problem: Problem, fit: Fit, rounds: int, with_spikes: bool =
     """Jumps and spikes in turn, until they stay; or jumps alone, where tails have weights."""
     for _ in range(rounds):
         if problem.is_noisy(fit):
-            fit = _freed(problem, fit)
+            posterior = problem.posterior(fit)
+            fit = fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
         of_walk, of_white = surprises(problem.posterior(fit), fit.outliers.spikes)
         found = judged(fit.outliers, of_walk, of_white, with_spikes)
         if not found.differs_by(fit.outliers):
             break
-        fit = fit.bridged(problem.streams, found)
+        poses = bridged(problem.streams, fit.T, found.spikes)
+        fit = replace(fit, outliers=found, poses=poses, error=np.zeros_like(fit.error))
     if with_spikes:
-        fit = replace(fit, has_heavy_tails=tails_are_heavy(fit.outliers, of_white))
+        normal = of_white[~fit.outliers.spikes]
+        is_heavy = np.mean(normal**2) > TUNING.heavy_kurtosis * np.mean(normal) ** 2
+        fit = replace(fit, has_heavy_tails=bool(is_heavy))
     return fit
 
 
@@ -168,7 +162,7 @@ def tails(problem: Problem, fit: Fit) -> Fit:
         posterior = problem.posterior(fit)
         for _ in range(problem.tuning.tail_rounds - 1):
             weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior))
-            posterior = posterior.with_weights(weights)
+            posterior = Posterior(replace(posterior.space, weights=weights), posterior.levels)
         fit = noise(problem, replace(fit, weights=tail_weights(posterior)))
     return _outliers_found(problem, fit, 2, with_spikes=False)
 
@@ -177,13 +171,20 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     """Errors that last, if the data ask for them."""
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning.most_poses_lasting)
-    model, levels = fit.model.with_lasting(LASTING, fit.model.raised(fit.levels))
+    # No white noise and no walk is so small that the search cannot hear it.
+    levels, total = fit.levels.copy(), whole(fit.levels)
+    levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible_white))
+    levels[3:5] = np.maximum(levels[3:5], total + np.log(tuning.audible_walk))
+    model, levels = fit.model.with_lasting(LASTING, levels)
     found, information = reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))
     before = Posterior(problem.space(fit, kept), fit.levels)
     if before.loss - found.loss < tuning.least_gain:
         return fit
-    reduced, levels = model.reduced(found.levels, information)
-    return replace(fit, model=reduced, levels=levels)
+    # Without the processes that make no difference.
+    matters = np.diag(information)[N_FAST::2] > tuning.least_information
+    slow = tuple(each for each, is_kept in zip(model.slow, matters, strict=True) if is_kept)
+    left = found.levels[np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]]
+    return replace(fit, model=replace(model, slow=slow), levels=left)
 
 
 def systematic(problem: Problem, fit: Fit) -> Fit:
@@ -199,7 +200,7 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
         """The loss with these errors of the path, with a time offset or without."""
         found = []
         for there in (of_path + time for time in times):
-            is_there = [k in there or k >= RATE.start for k in range(N_SYSTEMATIC)]
+            is_there = [k in there or k in RATE for k in range(N_SYSTEMATIC)]
             rival = replace(fit, sigmas=np.where(is_there, tuning.sizes, tuning.none))
             normal = NormalEquations(without + problem.known(rival))
             loss = float(normal.cost + normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
@@ -234,12 +235,6 @@ def polish(problem: Problem, fit: Fit) -> Fit:
         moved = fit.moved(step, problem.columns)
         fit = moved.freed(problem.streams, posterior.states_after(step))
     return fit
-
-
-def _freed(problem: Problem, fit: Fit) -> Fit:
-    """At poses freed of the errors that are known of all poses, X as it is."""
-    posterior = problem.posterior(fit)
-    return fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
 
 
 def is_settled(problem: Problem, fit: Fit) -> bool:

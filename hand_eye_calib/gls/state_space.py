@@ -25,39 +25,10 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.gls.block_tridiagonal import Factor, inverse_roots, transposed
 from hand_eye_calib.gls.normal import NormalEquations, multiplied
+from hand_eye_calib.gls.tuning import TUNING
 
+# States of a pose's white error.
 WHITE = 6
-
-# Precision (1/m^2, 1/rad^2) of poses that may be anywhere.
-FREE = 1.0
-
-# Parts of a recording.
-_N_PARTS = 20
-
-# Diagonals are raised by this share, so that rounding cannot make them negative.
-_ROUNDING = 1e-13
-
-
-@dataclass(frozen=True)
-class Group:
-    """States that are independent Gauss-Markov processes with one variance and one time constant.
-
-    Attributes
-    ----------
-    states : slice
-        Of the latent state.
-    variance, tau : int
-        Where log variance and log time constant are among the levels.
-    """
-
-    states: slice
-    variance: int
-    tau: int
-
-    @property
-    def size(self) -> int:
-        """Number of states."""
-        return self.states.stop - self.states.start
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +48,9 @@ class StateSpace:
         What log levels scale: the covariances are ``sum exp(level) basis``.
     twists : (N, 6) array
         v of one more basis v v' of each pose's white error.
-    groups : tuple of Group
+    sizes : tuple of int
+        Numbers of states behind the white error that are independent Gauss-Markov processes with
+        one variance and one time constant, group by group.
     weights : (N,) array
         Factors of the precision of each pose's white error; zero for poses that may be anywhere.
     cut : (n,) bool array
@@ -94,28 +67,10 @@ class StateSpace:
     white: tuple[FloatArray, ...]
     walk: tuple[FloatArray, ...]
     twists: FloatArray
-    groups: tuple[Group, ...]
+    sizes: tuple[int, ...]
     weights: FloatArray
     cut: BoolArray
     prior: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.columns)
-
-    @property
-    def is_free(self) -> BoolArray:
-        """(N,) whether each pose may be anywhere."""
-        return self.weights == 0.0
-
-    @property
-    def n_states(self) -> int:
-        """d."""
-        return self.behind.shape[2]
-
-    @property
-    def n_white(self) -> int:
-        """Number of levels of the white errors, the first ones."""
-        return len(self.white) + 1
 
     def white_covariance(self, levels: FloatArray) -> FloatArray:
         """Covariances (N, 6, 6) of the white errors at log levels, weights left out."""
@@ -148,45 +103,47 @@ class StateSpace:
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
-        states = np.zeros((len(columns) + 1, self.n_states, columns.shape[2]))
+        states = np.zeros((len(columns) + 1, self.behind.shape[2], columns.shape[2]))
         states[1:, :WHITE] = columns
         states[1:, WHITE:] = transposed(self.ahead) @ columns
         states[:-1] -= transposed(self.behind) @ columns
         return states
 
 
-@dataclass(frozen=True)
 class Markov:
-    """A group at given levels: phi_i, its derivative by log tau, and the innovations' relative
-    variances ``1 - phi_i^2``.
+    """A group of processes at given levels.
+
+    Attributes
+    ----------
+    states : slice
+        Of the latent state.
+    variance : float
+    phi, slope, rest : (n,) arrays
+        phi_i, its derivative by log tau, and the innovations' relative variances ``1 - phi_i^2``.
+    beside, before, after : (n,) arrays
+        What each increment adds to the precision for unit variance: beside the diagonal, to the
+        state before and to that behind. The first state has 1 of its own.
     """
 
-    group: Group
-    variance: float
-    phi: FloatArray
-    slope: FloatArray
-    rest: FloatArray
+    def __init__(self, states: slice, levels: FloatArray, intervals_s: FloatArray) -> None:
+        ratio = intervals_s / np.exp(levels[1])
+        self.states, self.variance, self.phi = states, float(np.exp(levels[0])), np.exp(-ratio)
+        self.slope, self.rest = self.phi * ratio, -np.expm1(-2.0 * ratio)
+        self.after = 1.0 / self.rest
+        self.beside, self.before = -self.phi * self.after, self.phi**2 * self.after
 
-    @classmethod
-    def of(cls, group: Group, levels: FloatArray, intervals_s: FloatArray) -> Markov:
-        """At these log levels."""
-        ratio = intervals_s / np.exp(levels[group.tau])
-        variance, phi = float(np.exp(levels[group.variance])), np.exp(-ratio)
-        return cls(group, variance, phi, phi * ratio, -np.expm1(-2.0 * ratio))
-
-    def transitions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What each increment (n,) adds to the precision for unit variance: beside the diagonal, to
-        the state before and to that behind. The first state has 1 of its own.
-        """
-        inverse = 1.0 / self.rest
-        return -self.phi * inverse, self.phi**2 * inverse, inverse
-
-    def covariance_times(self, columns: FloatArray) -> FloatArray:
-        """The covariance for unit variance times columns (N, k)."""
-        here, before, after = self.transitions()
-        diagonal = np.r_[1.0, after] + np.r_[before, 0.0]
-        factor = Factor(diagonal[:, None, None], here[:, None, None])
-        return factor.restore(factor.whiten(columns[:, None]))[:, 0]
+    def by_tau(self, values: FloatArray) -> FloatArray:
+        """Derivative by log tau of the states (N, k) that the covariance makes of fixed forces."""
+        phi, rest, slope = self.phi, self.rest, self.slope
+        by_rest = 2.0 * phi * slope / rest**2
+        beside = (slope / rest + phi * by_rest)[:, None]
+        first = (2.0 * phi * slope / rest + phi**2 * by_rest)[:, None]
+        forces = np.zeros_like(values)
+        forces[1:] += by_rest[:, None] * values[1:] - beside * values[:-1]
+        forces[:-1] += first * values[:-1] - beside * values[1:]
+        diagonal = np.r_[1.0, self.after] + np.r_[self.before, 0.0]
+        factor = Factor(diagonal[:, None, None], self.beside[:, None, None])
+        return -factor.restore(factor.whiten(forces[:, None]))[:, 0]
 
 
 class Posterior:
@@ -230,23 +187,31 @@ class Posterior:
 
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
         self.space, self.levels = space, levels
+        n_poses, n_white = len(space.weights), len(space.white) + 1
+        kept, given = ~space.cut, space.weights != 0.0
         self.white, of_white = space.white_precision(levels)
-        self.walk_covariance = _combined(levels[space.n_white :], space.walk)
+        weights = space.weights[:, None, None]
+        free = TUNING.free * np.eye(WHITE)
+        self._of_poses = np.where(weights > 0.0, weights * self.white, free)
+        self.walk_covariance = _combined(levels[n_white:], space.walk)
         self.walk = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
         self._weights = self.evidence[:, None, None] * self.walk
-        self.markov = [Markov.of(group, levels, space.intervals_s) for group in space.groups]
-        diagonal, below = self._blocks(0, len(space))
+        self.markov, start, at = [], WHITE, n_white + len(space.walk)
+        for size in space.sizes:
+            of_group = slice(start, start + size), levels[at : at + 2]
+            self.markov.append(Markov(*of_group, space.intervals_s))
+            start, at = start + size, at + 2
+        diagonal, below = self._blocks(0, n_poses - 1)
         diagonal[0] += self._first_block()
-        states = range(space.n_states)
-        diagonal[:, states, states] *= 1.0 + _ROUNDING
+        states = range(start)
+        diagonal[:, states, states] *= 1.0 + TUNING.raised
         self.factor = Factor(diagonal, below)
-        n_poses, kept, given = len(space) + 1, ~space.cut, ~space.is_free
         white = WHITE * np.log(np.where(given, space.weights, 1.0)) - of_white
-        prior = float(white[given].sum()) + WHITE * np.log(FREE) * int((~given).sum())
-        for process in self.markov:
+        prior = float(white[given].sum()) + WHITE * np.log(TUNING.free) * int((~given).sum())
+        for process, size in zip(self.markov, space.sizes, strict=True):
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
-            prior -= process.group.size * of_one
+            prior -= size * of_one
         of_walk = (
             kept.sum() * np.linalg.slogdet(self.walk_covariance)[1]
             + 6 * np.log(space.relative[kept]).sum()
@@ -263,10 +228,9 @@ class Posterior:
         """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d), of the m increments
         from pose to pose; without what is known of the first pose by itself.
         """
-        space, size = self.space, self.space.n_states
-        part, here = slice(start, end), slice(1, None)
+        space, part, here = self.space, slice(start, end), slice(1, None)
         ahead, behind, weights = space.ahead[part], space.behind[part], self._weights[part]
-        n = len(behind)
+        n, _, size = behind.shape
         diagonal, below = np.zeros((n + 1, size, size)), np.zeros((n, size, size))
         diagonal[here, :WHITE, :WHITE] = weights
         weighed = weights @ behind
@@ -276,29 +240,20 @@ class Posterior:
         diagonal[here, WHITE:, WHITE:] = transposed(ahead) @ beside
         below[:, WHITE:] = transposed(ahead) @ below[:, :WHITE]
         diagonal[:-1] += transposed(behind) @ weighed
-        diagonal[here, :WHITE, :WHITE] += self._of_poses(slice(start + 1, end + 1))
+        diagonal[here, :WHITE, :WHITE] += self._of_poses[start + 1 : end + 1]
         for process in self.markov:
-            states = range(process.group.states.start, process.group.states.stop)
-            beside, before, after = (
-                each[part, None] / process.variance for each in process.transitions()
-            )
-            below[:, states, states] += beside
-            diagonal[:-1, states, states] += before
-            diagonal[1:, states, states] += after
+            states, variance = range(size)[process.states], process.variance
+            below[:, states, states] += process.beside[part, None] / variance
+            diagonal[:-1, states, states] += process.before[part, None] / variance
+            diagonal[1:, states, states] += process.after[part, None] / variance
         return diagonal, below
-
-    def _of_poses(self, part: slice) -> FloatArray:
-        """Precisions (m, 6, 6) of the white errors of some poses."""
-        weights = self.space.weights[part, None, None]
-        white = self.white if len(self.white) == 1 else self.white[part]
-        return np.where(weights > 0.0, weights * white, FREE * np.eye(WHITE))
 
     def _first_block(self) -> FloatArray:
         """What is known of the state (d, d) of the first pose by itself."""
-        block = np.zeros((self.space.n_states,) * 2)
-        block[:WHITE, :WHITE] = self._of_poses(slice(0, 1))[0]
+        block = np.zeros((self.space.behind.shape[2],) * 2)
+        block[:WHITE, :WHITE] = self._of_poses[0]
         for process in self.markov:
-            states = range(process.group.states.start, process.group.states.stop)
+            states = range(len(block))[process.states]
             block[states, states] = 1.0 / process.variance
         return block
 
@@ -314,24 +269,20 @@ class Posterior:
         weighed = self._weights @ columns
         return weighed, self.factor.whiten(self.space.gathered(weighed))
 
-    def with_weights(self, weights: FloatArray) -> Posterior:
-        """The posterior at other weights (N,) of the white errors."""
-        return Posterior(replace(self.space, weights=weights), self.levels)
-
     def states_after(self, step: FloatArray) -> FloatArray:
         """States (N, d) expected after a step of the parameters."""
         mixing = np.r_[step, 1.0][:, None]
         return self.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
 
-    def restricted(self) -> FloatArray:
-        """States (N, d, 1 + q): expected values and, behind them, what the parameters' uncertainty
-        adds, as columns whose squares sum to it.
+    def restricted(self) -> tuple[FloatArray, FloatArray]:
+        """States (N, d, 1 + q) and walk (n, 6, 1 + q): expected values and, behind them, what the
+        parameters' uncertainty adds, as columns whose squares sum to it.
         """
-        return self.factor.restore(_mixed(self.whitened, self.normal.mixing))
-
-    def restricted_walk(self, states: FloatArray) -> FloatArray:
-        """The same of the walk, (n, 6, 1 + q), from all states."""
-        return _mixed(self.space.columns, self.normal.mixing) - self.space.observed(states)
+        size, normal = len(self.normal.step), self.normal
+        mixing = np.zeros((size + 1, size + 1))
+        mixing[:-1, 0], mixing[-1, 0], mixing[:-1, 1:] = normal.step, 1.0, normal.root
+        states = self.factor.restore(_mixed(self.whitened, mixing))
+        return states, _mixed(self.space.columns, mixing) - self.space.observed(states)
 
     def part_products(self) -> FloatArray:
         """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20.
@@ -343,8 +294,9 @@ class Posterior:
         Each part is a quadratic form of the states at its two ends and of the columns: all states
         between are eliminated. The forms are added in order of time.
         """
-        n, size, n_columns = len(self.space), self.space.n_states, self.space.columns.shape[2]
-        ends = np.linspace(0, n, min(_N_PARTS, n) + 1).astype(int).tolist()
+        n, _, n_columns = self.space.columns.shape
+        size = self.space.behind.shape[2]
+        ends = np.linspace(0, n, min(TUNING.n_parts, n) + 1).astype(int).tolist()
         known = np.zeros((size + n_columns, size + n_columns))
         known[:size, :size] = self._first_block()
         totals = [np.zeros((n_columns, n_columns))]
@@ -362,7 +314,7 @@ class Posterior:
         """Quadratic form (2 d + k, 2 d + k) of the states at pose ``start`` and at ``end`` and of k
         columns, of the increments between; of the states before the start nothing is known.
         """
-        space, part, size = self.space, slice(start, end), self.space.n_states
+        space, part, size = self.space, slice(start, end), self.space.behind.shape[2]
         diagonal, below = self._blocks(start, end)
         weighed = self._weights[part] @ space.columns[part]
         here = replace(space, ahead=space.ahead[part], behind=space.behind[part])

@@ -7,14 +7,10 @@ from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.block_tridiagonal import Factor
 from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.gls.outliers import surprises
-from hand_eye_calib.gls.state_space import (
-    Group,
-    Posterior,
-    StateSpace,
-)
+from hand_eye_calib.gls.state_space import Posterior, StateSpace
 
 N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
-N_LEVELS = 5 + 2 * 4
+N_LEVELS, SIZES = 5 + 2 * 4, (3, 3, 3, 1)
 
 
 def space_of(seed=1, cut=(4,)):
@@ -32,7 +28,6 @@ def space_of(seed=1, cut=(4,)):
     lever = random.standard_normal((3, 6))
     twists = random.standard_normal((N_POSES, 6))
     bases = np.diag([1.0, 1, 1, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1, 1]) + lever.T @ lever
-    ends = [6, 9, 12, 15, 16]
     flags = np.zeros(n, dtype=bool)
     flags[list(cut)] = True
     residuals = random.standard_normal((n, 6, 1))
@@ -46,7 +41,7 @@ def space_of(seed=1, cut=(4,)):
         white=(bases[0][None], bases[1][None]),
         walk=bases,
         twists=twists,
-        groups=tuple(Group(slice(ends[k], ends[k + 1]), 5 + 2 * k, 6 + 2 * k) for k in range(4)),
+        sizes=SIZES,
         weights=random.uniform(0.3, 2.0, N_POSES),
         cut=flags,
         prior=np.zeros((N_PARAMETERS + 1, N_PARAMETERS + 1)),
@@ -64,7 +59,7 @@ LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
 
 def dense_covariance(space, levels):
     """V (6 n, 6 n) by its definition, increments that are no evidence included."""
-    variances, n, d = np.exp(levels), len(space), space.n_states
+    variances, (n, _, d) = np.exp(levels), space.behind.shape
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white]
@@ -72,16 +67,14 @@ def dense_covariance(space, levels):
         white = sum(variance * basis for variance, basis in zip(variances, bases, strict=False))
         prior[pose, :6, pose, :6] = white / space.weights[pose]
     times = np.r_[0.0, np.cumsum(space.intervals_s)]
-    for group in space.groups:
-        apart = np.abs(times[:, None] - times) / variances[group.tau]
-        for state in range(group.states.start, group.states.stop):
-            prior[:, state, :, state] = variances[group.variance] * np.exp(-apart)
+    for state, group in enumerate(np.repeat(range(len(SIZES)), SIZES), start=6):
+        variance, tau_s = variances[5 + 2 * group : 7 + 2 * group]
+        prior[:, state, :, state] = variance * np.exp(-np.abs(times[:, None] - times) / tau_s)
     entries = np.zeros((n, 6, N_POSES, d))
     for i in range(n):
         entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = np.eye(6), space.ahead[i]
         entries[i, :, i] = -space.behind[i]
     entries = entries.reshape(6 * n, -1)
-    assert len(bases) == space.n_white == 3
     walk = variances[3] * space.walk[0] + variances[4] * space.walk[1]
     return entries @ prior.reshape(N_POSES * d, -1) @ entries.T + np.kron(
         np.diag(space.relative), walk
@@ -164,7 +157,7 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     parts = posterior.part_products()
     np.testing.assert_allclose(parts.sum(axis=0), posterior.products, atol=1e-8)
     n_known = 9  # of 14 parts, one increment each
-    rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space)) < 6 * n_known)
+    rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space.columns)) < 6 * n_known)
     V = dense_covariance(space, LEVELS)[np.ix_(rows, rows)]
     columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
     expected = columns.T @ np.linalg.solve(V, columns)
