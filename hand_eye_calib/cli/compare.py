@@ -11,7 +11,7 @@ from hand_eye_calib.text import amount, told_apart
 
 if TYPE_CHECKING:
     from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.results.records import Comparison
+    from hand_eye_calib.results.context import Comparison
 
 _EPILOG = """\
 examples:

@@ -19,6 +19,7 @@ from hand_eye_calib.cli.console import (
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.document import usable_numbers
 from hand_eye_calib.results.tables import summary
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
@@ -125,7 +126,7 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
             lines += transform_lines(document[name], reach, with_details)
     lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
     if command := calibration.static_transform_command():
-        by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
+        by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = list(_details(calibration) if with_details else _comparisons(calibration))

@@ -5,7 +5,7 @@ assess, add the prior, judge.
 import contextlib
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,7 @@ class Solved:
         Of the mount within the recording.
     stamps_ns, config, scale, time_offset
         What was solved; the time offset if it was estimated.
-    floor : (6, 6) array or None
+    floor : (6, 6) array
         Common-mode uncertainty; None if it is only to be compared with a result.
     """
 
@@ -67,7 +67,7 @@ class Solved:
     scale: float = 1.0
     scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
-    floor: FloatArray | None = None
+    floor: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
         """The result without frame names; ``unseen`` axes count as unobservable whatever the method
@@ -212,7 +212,7 @@ def solve_poses(
         scale=scale,
         scale_fit=scale_fit,
         time_offset=time_offset,
-        floor=None if is_beside else _floor(solved, pose_pairs, config),
+        floor=np.zeros((6, 6)) if is_beside else _floor(solved, pose_pairs, config),
     )
 
 

@@ -16,6 +16,7 @@ from hand_eye_calib.errors import InputError, printable
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.document import usable_angles, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
@@ -187,7 +188,7 @@ def _xacro_text(calibration: Calibration) -> str:
         quoteattr(printable(text).replace("$", "$$"))
         for text in (f"{parent}_to_{child}", parent, child)
     )
-    numbers = calibration.usable_numbers() | calibration.usable_angles()
+    numbers = usable_numbers(calibration) | usable_angles(calibration)
     xyz, rpy = (
         " ".join(str(numbers[name]) for name in names) for names in (TRANSLATIONS, ROTATIONS)
     )
@@ -223,7 +224,7 @@ def _launch_text(calibrations: Sequence[Calibration]) -> str:
     for calibration in calibrations:
         frames = printable(calibration.mounting[0]), printable(calibration.child_frame)
         arguments = ["--frame-id", frames[0], "--child-frame-id", frames[1]]
-        for name, value in calibration.usable_numbers().items():
+        for name, value in usable_numbers(calibration).items():
             text = value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
             arguments += [f"--{name}", text]
         nodes += _NODE.format(arguments)

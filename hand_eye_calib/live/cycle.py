@@ -27,7 +27,7 @@ from hand_eye_calib.live.state import (
 )
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.results.records import Comparison
+from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.session.goal import Goal
 
 # Takes whether a solve was good, and a line about it.

@@ -11,7 +11,7 @@ from enum import Enum, IntEnum
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.plain import plain
-from hand_eye_calib.results.records import Comparison, Progress
+from hand_eye_calib.results.context import Comparison, Progress
 from hand_eye_calib.results.status import AXES
 
 AxisValues = Mapping[str, float | None]

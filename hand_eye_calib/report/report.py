@@ -22,6 +22,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.document import usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.tables import summary
 from hand_eye_calib.results.verdict import shown, target_of
@@ -112,7 +113,7 @@ def render(
     parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
     verdict, _, said = calibration.headline.partition(": ")
     document = calibration.to_dict()
-    by_hand = [each for each in calibration.usable_numbers().values() if isinstance(each, str)]
+    by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
     evidence = gather(calibration, snapshot) if snapshot else None
     advice, unknown = "", {*calibration.out_of_reach}
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:

@@ -1,51 +1,209 @@
-"""Values of a result's document, checked before a result is made of them.
-
-A file may be changed by hand, or damaged. All functions raise KeyError, TypeError or ValueError for
-what was not written so; :meth:`~hand_eye_calib.results.calibration.Calibration.from_dict` says it
-in words.
+"""A result in plain values: its document in JSON and YAML, both ways, and the numbers that other
+programs read.
 """
 
 from collections.abc import Mapping
 from dataclasses import MISSING
-from typing import Any, get_type_hints
+from typing import Any, cast, get_type_hints
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_rpy, sigmas_translation
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.plain import from_plain
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.plain import from_plain, plain
+from hand_eye_calib.results.result import Result
+from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS, by_hand
+from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
+
+# Format and version of a document. A change that an older reader cannot understand raises the
+# version.
+_FORMAT = {"format": "hand_eye_calib/extrinsic", "version": 1}
 
 # Fields that a document has under other names, as matrices; and those that files do not have.
-MATRICES = (
-    "T_parent_child",
-    "T_method",
-    "covariance",
-    "floor",
-    "T_base_parent",
-    "T_world_world",
-    "cov_world_world",
-)
-NOT_IN_FILES = ("motion_residuals", "recording")
+_TRANSFORMS = ("T_parent_child", "T_method", "T_world_world", "T_base_parent")
+_COVARIANCES = ("covariance", "cov_world_world", "floor")
+_NOT_IN_FILES = ("motion_residuals", "recording")
+
+# With a direction unobservable, a larger standard deviation (m) in other axes comes from that.
+UNKNOWN_M = 0.9
+
+# An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
+_SHARED = 0.02
 
 
-def values_of(of: type[Any], data: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a calibration from its document."""
+def document_of(result: Result) -> dict[str, Any]:
+    """The document of a result; see ``Calibration.to_dict``."""
+    T, parent, child = result.T_parent_child, result.parent_frame, result.child_frame
+    own, found = (result.covariance, result.floor), reasons(result)
+    exchanged = tuple(inverse_covariance(T, each) for each in own)
+    # Where the rotation is out of reach, the axes of both sensors are the same by convention.
+    has_same_axes = {*ROTATIONS} <= {*result.out_of_reach}
+    of_inverse = result.sigmas[:3] if has_same_axes else None
+    document: dict[str, Any] = {
+        "verdict": verdict_of(found),
+        "headline": headline(result, found),
+        "reasons": found,
+        **_FORMAT,
+        "parent_frame": parent,
+        "child_frame": child,
+        "T_parent_child": _printed(result, T, (parent, child), own, result.sigmas[:3]),
+        "T_child_parent": _printed(
+            result, result.T_child_parent, (child, parent), exchanged, of_inverse
+        ),
+        "status": result.status,
+        "covariance": _matrix_of("error xi in T_parent_child @ exp(xi)", child, result.covariance)
+        | {"order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]},
+        "observability": [
+            vars(dof) | {"sigma_total": total, "frame": parent}
+            for dof, total in zip(result.observability, result.sigmas_with_floor, strict=True)
+        ],
+    }
+    if result.T_base_child is not None:
+        frames = result.base_frame, child
+        document["T_base_child"] = _printed(result, result.T_base_child, frames, own)
+    if result.T_method is not None:
+        of = "T_parent_child as the method solved it: nothing set, no prior added"
+        document["T_method"] = {"of": of, "matrix": result.T_method}
+    if (Z := result.T_world_world) is not None and (cov := result.cov_world_world) is not None:
+        worlds = result.parent_world_frame, result.child_world_frame
+        document["T_world_world"] = _printed(result, Z, worlds, (cov, np.zeros((6, 6))))
+        of = "error xi in T_world_world @ exp(xi)"
+        document["cov_world_world"] = _matrix_of(of, worlds[1], cov)
+    of = "errors of a whole recording, the same in every part; not in the covariance"
+    document["floor"] = _matrix_of(of, child, result.floor)
+    document["sigma_total"] = dict(zip(AXES, result.sigmas_with_floor, strict=True))
+    for name in result.__dataclass_fields__:
+        if name not in (*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, *document):
+            document[name] = getattr(result, name)
+    return cast(dict[str, Any], plain(document))
+
+
+def _printed(
+    result: Result,
+    T_target_source: FloatArray,
+    frames: tuple[str, str],
+    covariances: tuple[FloatArray, ...],
+    sigmas_m: FloatArray | None = None,
+) -> dict[str, Any]:
+    """A transform between frames (target, source) in the notations people and programs use, with
+    the standard deviation of each number that is printed, without and with the common-mode
+    uncertainty, from both covariances; infinite, and no number, for what is unknown.
+    """
+    sigmas, of_floor = (sigmas_rpy(T_target_source, each) for each in covariances)
+    along, floor_m = (sigmas_translation(T_target_source, each) for each in covariances)
+    if sigmas_m is None:
+        is_unsure = bool(result.unobservable()) or covariances[0] is result.cov_world_world
+        sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
+    is_turn_known = not {*ROTATIONS} & {*result.unobservable()}
+    # Near gimbal lock roll and yaw have no standard deviation and are known.
+    known = np.isfinite(sigmas) | is_turn_known
+    rpy = se3.rotation_to_rpy(T_target_source[:3, :3])
+    return {
+        "maps": f"coordinates of {frames[1]} into {frames[0]}",
+        "translation": np.where(np.isfinite(sigmas_m), T_target_source[:3, 3], np.nan),
+        "sigma_translation": sigmas_m,
+        "sigma_total_translation": np.hypot(sigmas_m, floor_m),
+        "quat_xyzw": se3.to_quat_xyzw(T_target_source) if is_turn_known else None,
+        "rpy_deg": np.degrees(np.where(known, rpy, np.nan)),
+        "sigma_rpy_deg": np.degrees(sigmas),
+        "sigma_total_rpy_deg": np.degrees(np.hypot(sigmas, of_floor)),
+        "matrix": T_target_source,
+    }
+
+
+def _matrix_of(of: str, frame: str, matrix: FloatArray) -> dict[str, Any]:
+    """A covariance of a document, and what it is of."""
+    return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
+
+
+# ------------------------------------------------------------------------ for robots
+
+
+def usable_numbers(result: Result) -> dict[str, float | str]:
+    """The numbers of a result's ``mounting`` for commands and files that others read.
+
+    Returns
+    -------
+    dict
+        x, y, z in m and qx, qy, qz, qw; if an angle is unknown, roll, pitch and yaw in rad instead
+        of the quaternion. An axis that cannot be determined is a text that no parser takes, such as
+        MEASURE_Z_BY_HAND. Empty under DO NOT USE.
+    """
+    if verdict_of(reasons(result)) is Verdict.DO_NOT_USE:
+        return {}
+    T, unknown = result.mounting[1], {*result.unobservable()}
+    hidden = np.array([axis in unknown for axis in TRANSLATIONS])
+    if result.T_base_parent is not None:  # axes that share a direction that the motion hides
+        of_base = np.abs(result.T_base_parent[:3, :3][:, hidden])
+        hidden = of_base.max(axis=1, initial=0.0) > _SHARED
+    numbers: dict[str, float | str] = {
+        axis: by_hand(axis) if is_hidden else float(value)
+        for axis, value, is_hidden in zip(TRANSLATIONS, T[:3, 3], hidden, strict=True)
+    }
+    if unknown.intersection(ROTATIONS):
+        return numbers | usable_angles(result)
+    return numbers | dict(zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True))
+
+
+def usable_angles(result: Result) -> dict[str, float | str]:
+    """Roll, pitch and yaw of a result's ``mounting``, rad, about fixed axes, as in URDF; a text for
+    an angle that cannot be determined.
+    """
+    T = result.mounting[1]
+    known = np.full(3, True)  # near gimbal lock roll and yaw have no sigma and are known
+    if set(result.unobservable()).intersection(ROTATIONS):
+        known = np.isfinite(sigmas_rpy(T, result.covariance))
+    angles = se3.rotation_to_rpy(T[:3, :3]).tolist()
+    return {
+        name: angle if is_known else by_hand(name)
+        for name, angle, is_known in zip(ROTATIONS, angles, known, strict=True)
+    }
+
+
+# -------------------------------------------------------------------------- reading
+
+
+def values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a calibration from its document, which may have been changed by hand, or damaged;
+    an InputError that says what is wrong.
+    """
+    found = {name: data.get(name) if isinstance(data, Mapping) else None for name in _FORMAT}
+    if found != _FORMAT:
+        raise InputError(
+            f"expected format {_FORMAT['format']}, version {_FORMAT['version']}; "
+            f"found format {found['format']}, version {found['version']}"
+        )
+    try:
+        return _values_of(of, data)
+    except KeyError as error:
+        raise InputError(f"the calibration has no {error}: restore or repeat it") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"the calibration was changed after it was written: {error}; restore or repeat it"
+        ) from None
+
+
+def _values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
+    """The same; KeyError, TypeError or ValueError for what was not written so."""
+    from hand_eye_calib.results import context
+
     values: dict[str, Any] = {}
-    for name in ("T_parent_child", "T_method", "T_world_world", "T_base_child"):
+    for name in (*_TRANSFORMS, "T_base_child"):
         if name in data:
             values[name] = _transform_of(data[name])
-    for name in ("covariance", "cov_world_world", "floor"):
+    for name in _COVARIANCES:
         if name in data:
             values[name] = _covariance_of(data[name])
     if "T_base_child" in values:
         T_child_parent = se3.inverse(values["T_parent_child"])
         values["T_base_parent"] = values.pop("T_base_child") @ T_child_parent
-    hints = get_type_hints(of)
+    hints = get_type_hints(of, localns=vars(context))
     for name, each in of.__dataclass_fields__.items():
-        if name in data and name not in (*MATRICES, *NOT_IN_FILES):
+        if name in data and name not in (*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES):
             try:
                 values[name] = from_plain(hints[name], data[name])
             except TypeError as error:

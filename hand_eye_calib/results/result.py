@@ -13,14 +13,11 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import sigmas_rpy
 from hand_eye_calib.results.records import (
     ClockRate,
-    Comparison,
     CrossCheck,
     Finding,
     Noise,
-    Progress,
     RateBias,
     Residuals,
-    Together,
 )
 from hand_eye_calib.results.status import (
     ROTATIONS,
@@ -32,6 +29,8 @@ from hand_eye_calib.results.status import (
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
+
+    from hand_eye_calib.results.context import Comparison, Progress, Together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +75,7 @@ class Result:
         sensor's frame, m and rad.
     observability : tuple of DofObservability
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
-    floor : (6, 6) array or None
+    floor : (6, 6) array
         Common-mode uncertainty: covariance, of the same xi, of errors that are the same in every
         part of the recording, so that nothing in it shows them
         (:mod:`hand_eye_calib.assessment.floor`). ``covariance`` does not contain it.
@@ -154,7 +153,7 @@ class Result:
 
     covariance: FloatArray
     observability: tuple[DofObservability, ...]
-    floor: FloatArray | None = None
+    floor: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     contradictions: Mapping[str, float] = field(default_factory=dict)
 
     measured: str = "poses"
@@ -180,9 +179,9 @@ class Result:
     target_translation: float = CalibratorConfig.target_translation
     target_rotation: float = CalibratorConfig.target_rotation
     target_axes: Mapping[str, float] = field(default_factory=dict)
-    comparison: Comparison | None = None
-    goal: Progress | None = None
-    together: Together | None = None
+    comparison: "Comparison | None" = None
+    goal: "Progress | None" = None
+    together: "Together | None" = None
 
     @property
     def rotation(self) -> "Rotation":
@@ -250,11 +249,7 @@ class Result:
     @property
     def covariance_with_floor(self) -> FloatArray:
         """(6, 6) array: covariance and common-mode uncertainty together."""
-        return self.covariance + self._floor
-
-    @property
-    def _floor(self) -> FloatArray:
-        return np.zeros((6, 6)) if self.floor is None else self.floor
+        return self.covariance + self.floor
 
     @property
     def sigmas_of_floor(self) -> FloatArray:
@@ -262,7 +257,7 @@ class Result:
         parent sensor's frame.
         """
         to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
-        variances = np.diag(to_parent @ self._floor @ to_parent.T)
+        variances = np.diag(to_parent @ self.floor @ to_parent.T)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     @property

@@ -12,7 +12,7 @@ from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_r
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
-from hand_eye_calib.results.records import AxisDifference, Comparison, Difference
+from hand_eye_calib.results.context import AxisDifference, Comparison, Difference
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.session.together import agreement_of_results, require_same_frames
@@ -139,7 +139,6 @@ def _spread(given: Calibration | Extrinsic) -> FloatArray:
     if isinstance(given, Calibration):
         hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
         covariance = covariance + np.diag(np.where(hidden, UNKNOWN**2, 0.0))
-        if given.floor is not None:
-            floor = to_parent @ given.floor @ to_parent.T
+        floor = to_parent @ given.floor @ to_parent.T
     scatter = scatter_of_recordings(covariance) if _is_found(given) else np.zeros((6, 6))
     return np.array([covariance, scatter, floor])

@@ -13,7 +13,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.records import AxisProgress, Progress
+from hand_eye_calib.results.context import AxisProgress, Progress
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import angle, axes_in_words, duration, length
 

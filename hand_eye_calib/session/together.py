@@ -16,7 +16,7 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.records import Recorded, Together
+from hand_eye_calib.results.context import Recorded, Together
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions
@@ -241,12 +241,11 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
     newest = used[-1]
     own_clock = {(one.time_offset_s, one.scale) for one in used}
     offset_s, scale = own_clock.pop() if len(own_clock) == 1 else (0.0, 1.0)
-    floors = [np.zeros((6, 6)) if one.floor is None else one.floor for one in used]
     return Calibration(
         T_parent_child=T,
         covariance=assessed.cov_parent_child_in_child,
         observability=observability,
-        floor=np.mean(floors, axis=0),
+        floor=np.mean([one.floor for one in used], axis=0),
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=found.chi2,
         method=Counter(one.method for one in used).most_common(1)[0][0],

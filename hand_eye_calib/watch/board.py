@@ -18,7 +18,7 @@ from hand_eye_calib.live.state import (
     ResultState,
     SavedState,
 )
-from hand_eye_calib.results.records import Comparison
+from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.text import amount, duration, fixed, listing, two_digits
 

@@ -10,6 +10,7 @@ from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.document import usable_numbers
 from reproduction.partial import simulated_positions
 
 LEVER_ARM = np.array([0.8, -0.5, 1.2])
@@ -66,7 +67,7 @@ class TestLeverArm:
         assert result.T_parent_child[:3, :3].tolist() == np.eye(3).tolist()
         assert np.isinf(result.sigmas[3:]).all()
         assert result.covariance[3, 3] > 1.0
-        assert result.usable_numbers()["yaw"] == "MEASURE_YAW_BY_HAND"
+        assert usable_numbers(result)["yaw"] == "MEASURE_YAW_BY_HAND"
         assert result.status is hec.SolveStatus.OK
 
     def test_positions_of_the_parent_give_the_opposite(self, streams, result):

@@ -22,6 +22,7 @@ from hand_eye_calib.io.bags.messages import (
     unpack_poses,
 )
 from hand_eye_calib.io.trajectory_files import read_trajectory_file
+from hand_eye_calib.results.document import usable_numbers
 
 BIAS = np.array([0.02, -0.01, 0.03])
 OFFSET_S = 0.02
@@ -74,7 +75,7 @@ class TestRates:
         assert result.out_of_reach == ("x", "y", "z")
         assert np.isinf(result.sigmas[:3]).all()
         assert result.covariance[0, 0] > 1.0
-        assert result.usable_numbers()["x"] == "MEASURE_X_BY_HAND"
+        assert usable_numbers(result)["x"] == "MEASURE_X_BY_HAND"
         assert result.verdict is hec.Verdict.USE
         assert "out of reach" in result.headline
 

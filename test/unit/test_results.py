@@ -28,7 +28,8 @@ from hand_eye_calib.results.calibration import (
     SolveStatus,
     Verdict,
 )
-from hand_eye_calib.results.records import AxisProgress, CorrelatedError, Noise, Progress, RateBias
+from hand_eye_calib.results.context import AxisProgress, Progress
+from hand_eye_calib.results.records import CorrelatedError, Noise, RateBias
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]

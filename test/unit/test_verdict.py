@@ -19,7 +19,8 @@ from hand_eye_calib.results.calibration import (
     SolveStatus,
     Verdict,
 )
-from hand_eye_calib.results.records import AxisScatter, Finding, Severity, Together
+from hand_eye_calib.results.context import Together
+from hand_eye_calib.results.records import AxisScatter, Finding, Severity
 from hand_eye_calib.results.verdict import RULES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"

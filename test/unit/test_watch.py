@@ -27,7 +27,7 @@ from hand_eye_calib.live.state import (
     SavedState,
 )
 from hand_eye_calib.plain import from_plain, plain
-from hand_eye_calib.results.records import (
+from hand_eye_calib.results.context import (
     AxisDifference,
     AxisProgress,
     Comparison,
