@@ -128,7 +128,7 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
     times = file([f"{secs}.{nsecs:09d}" for secs, nsecs in stamps], "times.txt")
     assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times), relative_ns)
     said = r"poses\.txt: the poses have no stamps; name their column t, give `times`, or pair"
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(InputError, match=said):
         hec.read_trajectory(poses, "kitti")
     one, short = file(["0.0"], "one.txt"), file(["0.0", "0.1"], "short.txt")
     for path, beside, message in (

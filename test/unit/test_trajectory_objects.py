@@ -59,7 +59,7 @@ class TestReading:
     @pytest.mark.parametrize(
         ("source", "options", "error", "message"),
         [
-            (POSES, {}, ConfigError, "no stamps"),
+            (POSES, {}, InputError, "no stamps"),
             (POSES, {"times": SECONDS[:-1]}, InputError, "one stamp per pose; found 29 stamps"),
             (5, {"times": SECONDS}, InputError, r"expected a path, .* found an array \(\)"),
             ({"a": 1}, {}, InputError, "expected a path, .* found dict"),

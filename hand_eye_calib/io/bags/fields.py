@@ -14,9 +14,8 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.mcap_files import MessageKind
-from hand_eye_calib.io.trajectory_files.columns import TWIST
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import AUTO, table_of
+from hand_eye_calib.io.trajectory_files.table import TWIST, Table
 
 _ORIENTATION = "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
 
@@ -105,14 +104,14 @@ class FieldReader:
         """Stamps (N,) in ns and poses (N, 7) of x y z qx qy qz qw of the cells of messages, and
         notes for a person; an InputError if they are no poses.
         """
-        measures = "twists" if {*TWIST} <= {*self._names} else AUTO
-        table = table_of(self._topic, self._names, enumerate(rows, 1), list, measures)
+        measures = "twists" if {*TWIST} <= {*self._names} else "auto"
+        table = Table(self._topic, self._names, measures).fill(enumerate(rows, 1), list)
         if not table.stamps:
             raise InputError(f"no messages on {self._topic}, or none of its fields is a stamp, t")
         stamps_ns = stamps_in_ns(table, None)
         if measures == "twists":
-            return stamps_ns, _integrated(stamps_ns, table.values), []
-        if table.columns.measures == "rates":
+            return stamps_ns, _integrated(stamps_ns, table.values()), []
+        if table.measures == "rates":
             raise InputError(f"{self._topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
         return stamps_ns, np.c_[poses_of(table)], table.guesses
 

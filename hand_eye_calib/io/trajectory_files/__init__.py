@@ -8,11 +8,12 @@ motion, and what was found is said.
 """
 
 from hand_eye_calib.io.trajectory_files.reading import (
+    AUTO,
+    FileOptions,
     read_trajectory,
     read_trajectory_file,
     read_trajectory_files,
 )
-from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 __all__ = [

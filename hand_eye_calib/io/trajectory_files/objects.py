@@ -6,13 +6,7 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.trajectory_files.columns import (
-    MATRIX,
-    POSITION,
-    QUATERNION,
-    choose_columns,
-)
-from hand_eye_calib.io.trajectory_files.table import Table
+from hand_eye_calib.io.trajectory_files.table import MATRIX, POSITION, QUATERNION, Table
 
 _KINDS = (
     "a path, an array (N, 4, 4), (N, 8) of t, x, y, z, qx, qy, qz, qw or (N, 7), or a table with "
@@ -30,25 +24,25 @@ def table_of_object(source: Any, times: Any = None) -> Table:
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]
-        columns = choose_columns("the table", [*map(str, keys)])
-        places = columns.quantities.values()
-        values = np.column_stack([np.asarray(source[keys[place]], dtype=float) for place in places])
-        if times is None and len(columns.stamp) == 1:
-            times = source[keys[columns.stamp[0]]]
+        table = Table("the table", [*map(str, keys)], expected=_KINDS)
+        columns = [np.asarray(source[keys[at]], dtype=float) for at in table.at.values()]
+        values = np.column_stack(columns)
+        if times is None and len(table.stamp_at) == 1:
+            times = source[keys[table.stamp_at[0]]]
     else:
         try:
             values = np.asarray(source, dtype=float)
         except (TypeError, ValueError):
             raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
         if values.shape[1:] == (4, 4):
-            columns, values = choose_columns("", MATRIX), values.reshape(-1, 16)[:, :12]
+            names, values = MATRIX, values.reshape(-1, 16)[:, :12]
         elif values.ndim == 2 and values.shape[1] in (7, 8):
-            columns = choose_columns("", (*POSITION, *QUATERNION))
+            names = (*POSITION, *QUATERNION)
             times = values[:, 0] if times is None and values.shape[1] == 8 else times
             values = values[:, -7:]
         else:
             raise InputError(f"expected {_KINDS}; found an array {values.shape}")
-    table = Table("the poses", _KINDS, columns)
+        table = Table("the poses", names, expected=_KINDS)
     table.numbers.frombytes(np.ascontiguousarray(values).tobytes())
     table.line_numbers.extend(range(1, len(values) + 1))
     if times is not None:
@@ -56,7 +50,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
             times = np.asarray(times, dtype="datetime64[ns]")
         stamps = np.asarray(times)
         if stamps.dtype.kind == "M":
-            table.columns = columns._replace(stamp_unit="ns")
+            table.units["t"] = "ns"
             stamps = stamps.astype("datetime64[ns]").astype(np.int64)
         if stamps.dtype.kind not in "iuf" or not np.isfinite(stamps).all():
             raise InputError(

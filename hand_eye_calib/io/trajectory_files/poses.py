@@ -20,31 +20,36 @@ from hand_eye_calib.geometry.trajectory import (
     ROTATION_TOLERANCE,
     far_position,
 )
-from hand_eye_calib.io.trajectory_files.columns import MATRIX, QUATERNION, RATES, UNNAMED
-from hand_eye_calib.io.trajectory_files.table import Table
+from hand_eye_calib.io.trajectory_files.table import (
+    DIGITS,
+    MATRIX,
+    QUATERNION,
+    RATES,
+    UNNAMED,
+    Table,
+)
 from hand_eye_calib.stats import median
 
-# Below the largest number of 64 bits, in the year 2261.
-_LARGEST_NS = 9.2e18
 # Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
 # mistaken.
 _LONGEST_INTERVAL_S = 10
 # Units of lengths, angles and rates in m, rad and rad/s. Without a name it is the first, or the
 # second if a value is larger than the limit: a turn with room for rounding, and 2,000 deg/s, which
 # no gyroscope exceeds.
-_LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}, np.inf
-_ANGLES = {"rad": 1.0, "deg": np.pi / 180}, 2 * np.pi + 0.01
-_RATES = {"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0
-# A first orientation so close to the identity is where an odometry starts.
-_IDENTITY_WITHIN = 1e-8
+_KINDS = {
+    "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001}, np.inf),
+    "angle": ({"rad": 1.0, "deg": np.pi / 180}, 2 * np.pi + 0.01),
+    "rate": ({"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0),
+}
 
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
 # The inverse rotation in roll, pitch and yaw, as pyboreas has it.
 _INVERSE = "that of the world in the sensor's frame"
 
-# Steps are this share of the extent of the positions, and at least so many are needed.
-_STEPS_IN_EXTENT, _FEWEST_STEPS = 50, 10
+# Directions of steps that are this share of the extent of the positions are compared, of a fifth of
+# that number at least.
+_STEPS_IN_EXTENT = 50
 # The wrong convention scatters the direction at least so much, and so many times as much as the
 # right one.
 _SMALLEST_SCATTER, _CLEARLY = 0.05, 4.0
@@ -59,17 +64,20 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     Raises
     ------
     InputError
-        If they are too large, or their unit is not clear.
+        If there are none, they are too large, or their unit is not clear.
     """
-    unit = stamp_unit or table.columns.stamp_unit
+    if not table.stamps:
+        raise InputError(
+            f"{table.path}: the poses have no stamps; name their column t, give `times`, or pair "
+            "poses by row with `pair_by`"
+        )
+    unit = stamp_unit or table.units["t"]
     sizes = np.abs(np.array(table.stamps, dtype=float))
-    # Seconds since 1970 have ten digits, and each smaller unit three more.
-    digits = {"ns": 17, "us": 14, "ms": 11}
-    by_size = (each for each, count in digits.items() if sizes.max() >= 10.0**count)
+    by_size = (each for each, digits in DIGITS.items() if sizes.max() >= 10.0**digits)
     recognised = unit or next(by_size, "s")
     factor = STAMP_UNITS[recognised]
     table.refuse(
-        np.asarray(sizes * factor > _LARGEST_NS),
+        np.asarray(sizes * factor >= float(np.iinfo(np.int64).max)),
         lambda index: (
             f"the timestamp {table.stamps[index]:.6g} is too large for {recognised}; name its unit "
             "with `stamp_unit`"
@@ -90,16 +98,14 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Indices of the poses in the order of time, each stamp once, and what was repaired for that.
+    """Indices of poses in the order of time, each stamp once, and what was repaired for that.
 
     Raises
     ------
     InputError
-        If stamps repeat or decrease and must not be repaired.
+        If it must not be repaired that stamps repeat or decrease.
     """
     wrong = np.r_[False, stamps_ns[1:] <= stamps_ns[:-1]]
-    if not wrong.any():
-        return np.arange(len(stamps_ns)), []
     if not repair:
         table.refuse(
             wrong,
@@ -137,63 +143,70 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
         For values that cannot be; the message names the line.
     """
     table.refuse(
-        np.asarray(~np.isfinite(table.values).all(axis=1)),
+        np.asarray(~np.isfinite(table.values()).all(axis=1)),
         lambda _: "found a value that is not finite; remove the line or repair its source",
     )
-    if table.columns.measures == "rates":
-        return (_in_si(table, RATES, _RATES),)
-    quantities, positions, to_first = table.columns.quantities, np.zeros((len(table), 3)), None
-    up = next((name for name in ("z", "height") if name in quantities), None)
-    if "lat" in quantities:
+    if table.measures == "rates":
+        return (_in_si(table, RATES, "rate"),)
+    positions, to_first = np.zeros((len(table.line_numbers), 3)), None
+    up = [name for name in ("z", "height") if name in table.at][:1]
+    if "lat" in table.at:
         positions, to_first = _on_earth(table, up)
-    elif "x" in quantities:
-        names = ("x", "y", up) if up else ("x", "y")
-        positions[:, : len(names)] = _in_si(table, names, _LENGTHS)
-    elif MATRIX[0] in quantities:
-        matrices = table.columns_of(MATRIX).reshape(-1, 3, 4)
+    elif "x" in table.at:
+        names = ("x", "y", *up)
+        positions[:, : len(names)] = _in_si(table, names, "length")
+    elif MATRIX[0] in table.at:
+        matrices = table.values(MATRIX).reshape(-1, 3, 4)
         positions = matrices[:, :, 3]
-    if not up and {"x", "lat"} & quantities.keys():
+    if not up and {"x", "lat"} & table.at.keys():
         table.guess("no column of heights: taken as 0")
     table.refuse(
         np.asarray(np.abs(positions).max(axis=1) > FARTHEST_M),
         lambda row: f"{far_position(*positions[row])}; check its unit",
     )
-    if MATRIX[0] in quantities:
-        return positions, _from_matrices(table, matrices[:, :, :3])
-    quats_xyzw = _orientations(table, positions, convention)
-    if to_first is not None:
-        in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
-        quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
-    return positions, quats_xyzw
+    if MATRIX[0] not in table.at:
+        quats_xyzw = _orientations(table, positions, convention)
+        if to_first is not None:
+            in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
+            quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
+        return positions, quats_xyzw
+    # The nearest rotations: files have few digits.
+    nearest = se3.nearest_rotation(matrices[:, :, :3])
+    table.refuse(
+        np.asarray(np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2)) > ROTATION_TOLERANCE),
+        lambda _: (
+            f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
+            "of the values"
+        ),
+    )
+    return positions, se3.to_quat_xyzw(nearest)
 
 
-def _on_earth(table: Table, up: str | None) -> tuple[FloatArray, FloatArray]:
+def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
     """Metres (N, 3) east, north and up of the first position, and the rotations (N, 3, 3) from the
     axes of each position to those of the first.
     """
     from hand_eye_calib.io.geodetic import LocalOrigin, rotations_to_first
 
-    lat, lon = _in_si(table, ("lat", "lon"), _ANGLES).T
+    lat, lon = _in_si(table, ("lat", "lon"), "angle").T
     table.refuse(
-        (np.abs(lat) > np.pi / 2 + 1e-9) | (np.abs(lon) > _ANGLES[1]),
+        (np.abs(lat) > np.pi / 2) | (np.abs(lon) > _KINDS["angle"][1]),
         lambda row: (
             f"found latitude {np.degrees(lat[row]):.7g} deg, longitude "
             f"{np.degrees(lon[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps they "
             "are swapped"
         ),
     )
-    height = _in_si(table, (up,), _LENGTHS)[:, 0] if up else np.zeros(len(table))
+    height = _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat))
     table.guess("latitude and longitude became metres east and north of the first position")
     return LocalOrigin().local(lat, lon, height), rotations_to_first(lat, lon)
 
 
-def _in_si(
-    table: Table, names: Sequence[str], kind: tuple[Mapping[str, float], float]
-) -> FloatArray:
+def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     """Columns (N, k) in m, rad or rad/s: in the unit that the header names, or by their size."""
-    known, largest_of_first = kind
-    values = table.columns_of(names)
-    named = {unit for name in names if (unit := table.columns.units.get(name))}
+    known, largest_of_first = _KINDS[kind]
+    values = table.values(names)
+    named = {unit for name in names if (unit := table.units.get(name))}
     if len(named) > 1 or named - known.keys():
         raise InputError(
             f"{table.path}: columns {', '.join(names)} in {', '.join(sorted(named))}; expected one "
@@ -201,7 +214,7 @@ def _in_si(
         )
     largest = float(np.abs(values).max())
     unit = min(named) if named else [*known][largest > largest_of_first]
-    if not named and kind is not _LENGTHS:
+    if not named and kind != "length":
         table.guess(
             f"{', '.join(names)} read in {unit}, the largest is {largest:.4g}; to change that, "
             f"name the unit in the header, such as {names[-1]}_{unit.replace('/', '_')}"
@@ -212,28 +225,14 @@ def _in_si(
 # ---- orientations
 
 
-def _from_matrices(table: Table, rotations: FloatArray) -> FloatArray:
-    """Quaternions (N, 4), scalar last, of the nearest rotations: files have few digits."""
-    nearest = se3.nearest_rotation(rotations)
-    table.refuse(
-        np.asarray(np.abs(nearest - rotations).max(axis=(1, 2)) > ROTATION_TOLERANCE),
-        lambda _: (
-            f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
-            "of the values"
-        ),
-    )
-    return se3.to_quat_xyzw(nearest)
-
-
 def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:
     """Quaternions (N, 4), scalar last; level where there are none."""
-    quantities = table.columns.quantities
-    names = next((each for each in (QUATERNION, UNNAMED) if each[0] in quantities), None)
-    if names is None and {"yaw", "heading"} & quantities.keys():
-        return _from_angles(table, positions, convention)
-    if names is None:
+    names = next((each for each in (QUATERNION, UNNAMED) if each[0] in table.at), ())
+    if not names:
+        if {"yaw", "heading"} & table.at.keys():
+            return _from_angles(table, positions, convention)
         return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
-    quats = table.columns_of(names)
+    quats = table.values(names)
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(quats, axis=1)
     table.refuse(
@@ -248,7 +247,8 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
     # The order that motion and start speak for; the scalar is last if they say nothing.
     ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
     fitting = _fitting(positions, ways)
-    level = [way for way, each in ways.items() if abs(abs(each[0, 3]) - 1.0) < _IDENTITY_WITHIN]
+    # An odometry starts at the identity.
+    level = [way for way, (first, *_) in ways.items() if np.isclose(abs(first[3]), 1.0, rtol=0.0)]
     reason = ""
     if fitting == ["first"]:
         reason = "the motion keeps a steady direction that way"
@@ -267,10 +267,8 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
 
 def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
     """Quaternions (N, 4) from roll, pitch and yaw (about the fixed axes x, y, z) or heading."""
-    names = [
-        each for each in ("roll", "pitch", "yaw", "heading") if each in table.columns.quantities
-    ]
-    *tilt, angle = _in_si(table, names, _ANGLES).T
+    names = [each for each in ("roll", "pitch", "yaw", "heading") if each in table.at]
+    *tilt, angle = _in_si(table, names, "angle").T
     if not tilt:
         table.guess("no columns of roll and pitch: taken as 0")
     roll, pitch = tilt or np.zeros((2, len(angle)))
@@ -309,7 +307,7 @@ def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]
     lengths = np.linalg.norm(steps, axis=1)
     # Of a sensor that stands still, the noise of the positions adds up to a path.
     is_step = lengths > step / 3
-    if is_step.sum() < _FEWEST_STEPS:
+    if is_step.sum() < _STEPS_IN_EXTENT / 5:
         return [*ways]
     directions, rows = steps[is_step] / lengths[is_step, None], rows[:-1][is_step]
     scatters = {}

@@ -1,8 +1,13 @@
-"""Reading a trajectory from a text file in any format."""
+"""Reading trajectories: TUM, KITTI, EuRoC, tables with named columns, files of other programs
+(``foreign.py``), bags, and numbers in memory.
+"""
 
+import csv
+import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,14 +16,82 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hand_eye_calib.arrays import IntArray
+from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.io.files import read_bytes, read_text
+from hand_eye_calib.io.limits import LONGEST_LINE
+from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import AUTO, FileOptions, Table, read_table
+from hand_eye_calib.io.trajectory_files.table import (
+    DIGITS,
+    MATRIX,
+    NUMBER,
+    POSITION,
+    QUATERNION,
+    RATES,
+    UNNAMED,
+    Table,
+    are_columns,
+)
 from hand_eye_calib.text import told_apart
 
-# Time between poses that have no stamps.
+#: The format that the lines look like.
+AUTO = "auto"
+TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+
+# Of the formats whose columns have an order: their names, and what a row is.
+_FORMATS: dict[str, tuple[Sequence[str], str]] = {
+    "tum": (("t", *POSITION, *QUATERNION), f"8 numbers, {TUM_COLUMNS}"),
+    "kitti": (MATRIX, "12 numbers, the first three rows of a pose"),
+    "euroc": (
+        ("t [ns]", *POSITION, "qw", "qx", "qy", "qz"),
+        "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
+    ),
+}
+# A stamp, a position and a quaternion, whose order is to be found.
+_UNNAMED = ("t", *POSITION, *UNNAMED)
+# What four columns without names are.
+_OF_FOUR = {"positions": ("t", *POSITION), "rates": ("t", *RATES)}
+_TIMES = "times.txt"
+_LINE = re.compile(r"\S[^\n]*")
+_DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+([eE][-+]?\d+)?)")
+# Time between poses that are paired without stamps.
 _STEP_NS = 100_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`. ``pair_by`` is of all
+    files that belong together: "time", or "row" or "name" (of images) in place of stamps.
+
+    Raises
+    ------
+    ConfigError
+        For what is not known or does not go together.
+    """
+
+    format: str = "tum"
+    columns: str | None = None
+    times: str | Path | None = None
+    stamp_unit: str | None = None
+    repair: bool = False
+    measures: str = AUTO
+    pair_by: str = PAIR_BY[0]
+
+    def __post_init__(self) -> None:
+        for what, given, known in (
+            ("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,)),
+            ("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO)),
+        ):
+            if given not in known:
+                raise ConfigError(f"unknown {what} {given!r}; known are {', '.join(known)}")
+        for value, of, what in (
+            (self.columns, "csv", "columns are named for"),
+            (self.times, "kitti", "a file of times belongs to"),
+        ):
+            if value is not None and self.format not in (of, AUTO):
+                raise ConfigError(f"{what} format {of} only; the format is {self.format}")
 
 
 class FileReading(NamedTuple):
@@ -106,36 +179,39 @@ def read_trajectory(
             raise ConfigError(
                 "topic and tf are for bags: give one of them and none of the options of text files"
             )
-        from hand_eye_calib.io.bags import PoseBag
-        from hand_eye_calib.io.transforms import TfSource
-
-        with PoseBag(path) as bag:
-            of = TfSource.parse(tf) if tf else topic or ""
-            trajectory, notes = bag.trajectory(of, measures)
-            notes = [*bag.warnings, *notes]
-    elif (has_options and not path) or (path and times is not None and not file_of_times):
+        return _of_bag(path, topic, tf, measures)
+    if (has_options and not path) or (path and times is not None and not file_of_times):
         raise ConfigError(
             "format, columns and a file of times are for text files, other times for objects"
         )
+    options = FileOptions(
+        format=format,
+        columns=columns,
+        times=file_of_times,
+        stamp_unit=stamp_unit,
+        repair=repair,
+        measures=measures,
+    )
+    if path is not None:
+        table = read_table(path, options)
     else:
-        options = FileOptions(
-            format=format,
-            columns=columns,
-            times=file_of_times,
-            stamp_unit=stamp_unit,
-            repair=repair,
-            measures=measures,
-        )
-        if path is not None:
-            table = read_table(path, options)
-        else:
-            from hand_eye_calib.io.trajectory_files.objects import table_of_object
+        from hand_eye_calib.io.trajectory_files.objects import table_of_object
 
-            table = table_of_object(source, times)
-        trajectory, repairs, guesses = _read(table, options)
-        notes = [*guesses, *repairs]
-    for text in notes:
+        table = table_of_object(source, times)
+    trajectory, repairs, guesses = _read(table, options)
+    for text in [*guesses, *repairs]:
         warnings.warn(text, UserWarning, stacklevel=2)
+    return trajectory
+
+
+def _of_bag(path: Path, topic: str | None, tf: str | None, measures: str) -> Trajectory:
+    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.transforms import TfSource
+
+    with PoseBag(path) as bag:
+        trajectory, notes = bag.trajectory(TfSource.parse(tf) if tf else topic or "", measures)
+        for text in [*bag.warnings, *notes]:
+            warnings.warn(text, UserWarning, stacklevel=3)
     return trajectory
 
 
@@ -159,13 +235,15 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
         If a file cannot be read, or no convention fits the motion of all with the same columns.
     """
     tables = [read_table(*each) for each in files]
-    pairs = _pairs(tables, files[0][1].pair_by)
+    pairs: Sequence[IntArray | None] = [None] * len(files)
+    if files[0][1].pair_by != PAIR_BY[0]:
+        pairs = _pairs(tables, files[0][1].pair_by)
     read = [
         _read(table, options, rows)
         for (_, options), table, rows in zip(files, tables, pairs, strict=True)
     ]
-    for header in {table.header for table in tables if table.conventions}:
-        of_one = [k for k, table in enumerate(tables) if table.header == header]
+    for header in {table.names for table in tables if table.conventions}:
+        of_one = [k for k, table in enumerate(tables) if table.names == header]
         conventions = [tables[k].conventions for k in of_one]
         if len({each[0] for each in conventions}) > 1:
             common = [way for way in conventions[0] if all(way in each for each in conventions)]
@@ -204,14 +282,15 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
     return [reading.trajectory for reading in readings]
 
 
-def _pairs(tables: Sequence[Table], pair_by: str) -> list[IntArray | None]:
-    """The rows of each table that belong to those of the others, if stamps do not tell."""
-    if pair_by == "time":
-        return [None] * len(tables)
-    counts = [len(table) for table in tables]
+def _pairs(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
+    """The rows of each table that belong to those of the others, without their stamps."""
+    counts = [len(table.line_numbers) for table in tables]
     if pair_by == "row" and len({*counts}) > 1:
         raise InputError(f"to be paired by row, files need as many poses each; found {counts}")
-    keys = [[*table.images] if pair_by == "name" else [*range(len(table))] for table in tables]
+    keys = [
+        [*table.images] if pair_by == "name" else [*range(count)]
+        for table, count in zip(tables, counts, strict=True)
+    ]
     common = sorted(set.intersection(*map(set, keys)))
     if not common:
         named = [len(each) for each in keys]
@@ -226,27 +305,152 @@ def _read(
     table: Table, options: FileOptions, rows: IntArray | None = None, convention: str = ""
 ) -> FileReading:
     """The trajectory of a table, or of some of its rows in place of its stamps."""
-    if not len(table):
+    if not table.line_numbers:
         raise InputError(f"{table.path}: no poses in it; expected lines of {table.expected}")
-    if rows is None and not table.stamps:
-        raise ConfigError(
-            f"{table.path}: the poses have no stamps; name their column t, give `times`, or pair "
-            "poses by row with `pair_by`"
-        )
-    stamps_ns = stamps_in_ns(table, options.stamp_unit) if rows is None else np.array([])
-    kind = table.columns.measures
-    values = poses_of(table, convention)
+    repairs: list[str] = []
     if rows is None:
-        rows, repairs = in_order(table, stamps_ns, options.repair)
-        stamps_ns = stamps_ns[rows]
+        stamps_ns = stamps_in_ns(table, options.stamp_unit)
+        rows = np.arange(len(stamps_ns))
     else:
-        stamps_ns, repairs = np.arange(len(rows)) * _STEP_NS, []
-    builders: Mapping[str, Callable[..., Trajectory]] = {"rates": Trajectory.from_rates}
-    build = builders.get(kind, Trajectory.from_quat_xyzw)
-    trajectory = build(stamps_ns, *(each[rows] for each in values))
-    if kind not in ("poses", "rates"):
-        table.guess(f"{kind} alone, as its columns have it")
-    kind = kind if options.measures == AUTO else options.measures
+        stamps_ns = np.zeros(len(table.line_numbers), dtype=np.int64)
+        stamps_ns[rows] = np.arange(len(rows)) * _STEP_NS
+    values = poses_of(table, convention)
+    if (np.diff(stamps_ns[rows]) <= 0).any():
+        rows, repairs = in_order(table, stamps_ns, options.repair)
+    builders: dict[str, Callable[..., Trajectory]] = {"rates": Trajectory.from_rates}
+    build = builders.get(table.measures, Trajectory.from_quat_xyzw)
+    trajectory = build(stamps_ns[rows], *(each[rows] for each in values))
+    if table.measures not in ("poses", "rates"):
+        table.guess(f"{table.measures} alone, as its columns have it")
+    kind = table.measures if options.measures == AUTO else options.measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
     return FileReading(trajectory, repairs, table.guesses)
+
+
+# ---- text
+
+
+def read_table(path: str | Path, options: FileOptions) -> Table:
+    """The rows of a file in its format, or in the one that it looks like.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, a line cannot be used, or columns have no names.
+    """
+    data = read_bytes(path)
+    head = data[:LONGEST_LINE].removeprefix(b"\xef\xbb\xbf").lstrip()
+    for pattern, read in PROGRAMS.items():
+        if re.search(pattern, head):
+            return foreign_table(path, data, read, options.columns, options.measures)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected lines of a trajectory") from None
+    number, cells, names, format, header = _beginning(path, text)
+    columns, times, guesses = options.columns, options.times, list[str]()
+    if options.format != AUTO or columns or times:
+        format = options.format if options.format != AUTO else "csv" if columns else "kitti"
+        header = _FORMATS[format][0] if format != "csv" else names
+    else:
+        header = header or _OF_FOUR.get(options.measures) if len(cells) == 4 else header
+        if format != "tum":
+            guesses = [f"{path} looks like format {format}; to change that, give `format`"]
+        beside = Path(path).with_name(_TIMES)
+        if format == "kitti" and beside.is_file():
+            times = beside
+            guesses.append(f"stamps read from {beside}; to change that, give `times`")
+    is_header = names is cells and (format == "csv" or are_columns(names))
+    if columns:
+        header = [name.strip() for name in columns.split(",")]
+        is_header = not any(map(NUMBER.fullmatch, cells))
+    if header is None and cells:
+        raise InputError(
+            f"{path}: the first line names no columns, so that their order is unknown; name the "
+            f"{len(cells)} with `columns`, such as t,x,y,z,qx,qy,qz,qw or t,wx,wy,wz"
+        )
+    header = (*(header or _UNNAMED),)
+    if format == "euroc":
+        header += ("",) * (len(cells) - len(header))
+    measures = options.measures if format == "csv" else AUTO
+    table = Table(path, header, measures, _FORMATS.get(format, ("", ""))[1], format)
+    table.guesses = guesses
+    if cells:  # a file without data is not gone through again
+        table.fill(_lines(path, text, number if is_header else 0), _cells)
+    if format == "kitti" and times is not None:
+        table.stamps = _stamps_of(times, table)
+    return table
+
+
+def _lines(path: str | Path, text: str, after: int | None = None) -> Iterator[tuple[int, str]]:
+    """The lines of a text that are not blank, with their numbers; those after one that are no
+    comments.
+    """
+    number, end = 1, 0
+    for line in _LINE.finditer(text):
+        number += text.count("\n", end, line.start())
+        end = line.end()
+        if end - line.start() > LONGEST_LINE:
+            raise InputError(f"{path}, line {number}: longer than {LONGEST_LINE} characters")
+        if after is None or (number > after and text[line.start()] != "#"):
+            yield number, line[0].rstrip()
+
+
+def _cells(text: str) -> list[str]:
+    """The cells of a line: separated by commas, semicolons or white space."""
+    if "," not in text and ";" not in text:
+        return text.split()
+    delimiter = ";" if ";" in text else ","
+    row = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))
+    cells = [cell.strip() for cell in row]
+    if delimiter == ";" and "," in text:
+        return [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
+    return cells
+
+
+def _beginning(
+    path: str | Path, text: str
+) -> tuple[int, list[str], Sequence[str] | None, str, Sequence[str] | None]:
+    """What the beginning of a text tells: number and cells of the first line that is no comment (0
+    and none without one); the names of the columns, which are that line, unless it is a row of
+    numbers, otherwise the last comment above it that has as many cells; the format, tum in doubt,
+    so that its reader says what is wrong; and the columns of that format, if they are known.
+    """
+    comments: dict[int, list[str]] = {}
+    first = 0, "", list[str](), True
+    for number, line in _lines(path, text):
+        cells = _cells(line.lstrip("#").strip())
+        is_row = all(NUMBER.fullmatch(cell) for cell in cells if cell)
+        if not line.startswith("#"):
+            first = number, line, cells, is_row
+            break
+        if not is_row:
+            comments[len(cells)] = cells
+    number, line, cells, is_row = first
+    found: tuple[str, Sequence[str] | None]
+    names: Sequence[str] | None = comments.get(len(cells)) if is_row else cells
+    is_separated, n_cells = "," in line or ";" in line, len(cells)
+    if names and (names is cells or are_columns(names)):
+        is_tum = " ".join(names).lower().endswith(TUM_COLUMNS.partition(" ")[2])
+        found = ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", names)
+    elif not is_separated and n_cells != 4:
+        found = ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
+    elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= DIGITS["ns"]:
+        found = "euroc", _FORMATS["euroc"][0]
+    else:
+        found = "csv", _UNNAMED if n_cells == 8 else None
+    return number, cells, names, *found
+
+
+def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
+    """The stamps of poses from a file of their own."""
+    lines = _lines(times, read_text(times, "stamps"), after=0)
+    table = Table(times, ["t"], "stamps", "a stamp")
+    table.fill(lines, lambda text: text.split()[:1])
+    if len(table.stamps) != len(poses.line_numbers):
+        raise InputError(
+            f"{poses.path}: {len(poses.line_numbers)} poses, but {times} has "
+            f"{len(table.stamps)} stamps; they belong to different recordings"
+        )
+    return table.stamps

@@ -1,248 +1,158 @@
-"""The numbers of a trajectory file, row by row, before they become poses: which format its lines
-have, and what stands in which column.
+"""The numbers of a trajectory, row by row, before they become poses: what the columns are by their
+names, and what stands in them.
 """
 
-import csv
-import os
 import re
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
-from io import TextIOWrapper
-from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.files import open_regular
-from hand_eye_calib.io.limits import LARGEST_TEXT, LONGEST_LINE
-from hand_eye_calib.io.trajectory_files.columns import (
-    MATRIX,
-    POSITION,
-    QUATERNION,
-    RATES,
-    UNNAMED,
-    Columns,
-    are_columns,
-    choose_columns,
-    listed,
-)
-from hand_eye_calib.io.trajectory_files.foreign import rows_of
+from hand_eye_calib.config import STAMP_UNITS
+from hand_eye_calib.errors import InputError
+from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.text import shortened, shown_value
 
-_Path = str | Path
-# A line and its number, from 1.
-Line = tuple[int, str]
+POSITION = ("x", "y", "z")
+QUATERNION = ("qx", "qy", "qz", "qw")
+# Coefficients of a quaternion whose order is not known.
+UNNAMED = ("q1", "q2", "q3", "q4")
+# The first three rows of a pose's matrix.
+MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
+RATES = ("wx", "wy", "wz")
+TWIST = ("vx", "vy", "vz", *RATES)
+# Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
+# plane, fewer.
+_POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
+_PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
+_ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"), UNNAMED)
+_PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
 
-#: The format that the lines look like.
-AUTO = "auto"
-TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+# What stands before the axis in names of angular rates, velocities and quaternions.
+_BEGINNINGS = {
+    "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_ w_rs_s_",
+    "v": "v",
+    "q": "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_",
+}
+_OF_POSITION = "{0} t{0} p{0} p_{0} pos_{0} position_{0} translation_{0} p_rs_r_{0} "
+# Last parts of column names, lower case, words joined by underscores; exports of bags have whole
+# paths such as .pose.pose.position.x.
+_ALIASES = {
+    "t": "t time timestamp timestamps stamp gpstime header_stamp",
+    "x": _OF_POSITION.format("x") + "easting",
+    "y": _OF_POSITION.format("y") + "northing",
+    "z": _OF_POSITION.format("z") + "altitude",
+    "lat": "lat latitude",
+    "lon": "lon long lng longitude",
+    "height": "height h_ell ellipsoidal_height altitude alt",
+    "roll": "roll roll_angle",
+    "pitch": "pitch pitch_angle",
+    "yaw": "yaw yaw_angle theta",
+    "heading": "heading true_heading hdg azimuth",
+    "secs": "header_stamp_secs header_stamp_sec stamp_secs stamp_sec secs sec",
+    "nsecs": "header_stamp_nsecs header_stamp_nanosec stamp_nsecs stamp_nanosec nsecs nanosec",
+    "image": "image",
+    **{
+        f"{kind}{axis}": " ".join(f"{name}{axis}" for name in names.split())
+        for kind, names in _BEGINNINGS.items()
+        for axis in "xyzw"
+    },
+    **{name: name for name in (*MATRIX, *UNNAMED)},
+}
+# Names that stand for a part of an orientation, even if it is not known which.
+_ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.I).search
 
-# A stamp in nanoseconds since 1970 has at least so many digits.
-_DIGITS_OF_NS = 17
-# A number, or a time as of ISO 8601.
-_NUMBER = re.compile(
+# Units as names have them, with a slash for what separates words.
+_UNITS = {
+    **{unit: unit for unit in ("m", "mm", "cm", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)},
+    **dict.fromkeys(("degree", "degrees", "°"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("dps", "°/s"), "deg/s"),
+}
+#: Digits before the point of stamps since 1970; of seconds, fewer.
+DIGITS = {"ns": 17, "us": 14, "ms": 11}
+#: A number, or a time as of ISO 8601.
+NUMBER = re.compile(
     r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan|[-+]?inf|\d{4}-\d\d-\d\d[t ]\d.*", re.IGNORECASE
 )
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-
-_TIMES = "times.txt"
-# What four columns without names are.
-_OF_FOUR = {"positions": ("t", *POSITION), "rates": ("t", *RATES)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FileOptions:
-    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`. ``pair_by`` is of all
-    files that belong together: "time", or "row" or "name" (of images) in place of stamps.
-
-    Raises
-    ------
-    ConfigError
-        For what is not known or does not go together.
-    """
-
-    format: str = "tum"
-    columns: str | None = None
-    times: str | Path | None = None
-    stamp_unit: str | None = None
-    repair: bool = False
-    measures: str = AUTO
-    pair_by: str = PAIR_BY[0]
-
-    def __post_init__(self) -> None:
-        for what, given, known in (
-            ("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,)),
-            ("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO)),
-        ):
-            if given not in known:
-                raise ConfigError(f"unknown {what} {given!r}; known are {', '.join(known)}")
-        for value, of, what in (
-            (self.columns, "csv", "columns are named for"),
-            (self.times, "kitti", "a file of times belongs to"),
-        ):
-            if value is not None and self.format not in (of, AUTO):
-                raise ConfigError(f"{what} format {of} only; the format is {self.format}")
-
-
-# ---- lines
-
-
-def lines_of(
-    path: _Path, expected: str = "a trajectory", after: int | None = None
-) -> Iterator[Line]:
-    """The lines of a text file that are not blank, with their numbers; those after one that are no
-    comments. They are read anew each time: a list would take many times the memory of the text.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
-    try:
-        with TextIOWrapper(open_regular(path), encoding="utf-8-sig") as file:
-            if os.fstat(file.fileno()).st_size > LARGEST_TEXT:
-                raise InputError(f"cannot read {path}: it is larger than {LARGEST_TEXT} bytes")
-            for number, text in enumerate(file, 1):
-                if len(text) > LONGEST_LINE:
-                    raise InputError(
-                        f"{path}, line {number}: longer than {LONGEST_LINE} characters"
-                    )
-                text = text.strip()
-                if text and (after is None or (number > after and not text.startswith("#"))):
-                    yield number, text
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected lines of {expected}") from None
-
-
-def _cells_of(text: str) -> list[str]:
-    """The cells of a line: separated by commas, semicolons or white space."""
-    if "," not in text and ";" not in text:
-        return text.split()
-    delimiter = ";" if ";" in text else ","
-    row = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))
-    cells = [cell.strip() for cell in row]
-    if delimiter == ";" and "," in text:
-        return [
-            each.replace(",", ".") if _DECIMAL_COMMA.fullmatch(each) else each for each in cells
-        ]
-    return cells
-
-
-def _is_row(cells: Sequence[str]) -> bool:
-    """Whether all cells of a line are numbers or empty."""
-    return bool(cells) and all(_NUMBER.fullmatch(cell) for cell in cells if cell)
-
-
-class Head(NamedTuple):
-    """What the beginning of a file tells: number and cells of the first line that is no comment (0
-    and none without one); the names of the columns, which are that line, unless it is a row of
-    numbers, otherwise the last comment above it that has as many cells; the format, tum in doubt,
-    so that its reader says what is wrong; and the columns of that format, if they are known.
-    """
-
-    number: int
-    cells: list[str]
-    names: Sequence[str] | None
-    format: str
-    header: Sequence[str] | None
-
-    @classmethod
-    def of(cls, path: _Path) -> Self:
-        """Look at a file."""
-        comments: dict[int, list[str]] = {}
-        for line in lines_of(path):
-            cells = _cells_of(line[1].lstrip("#").strip())
-            if not line[1].startswith("#"):
-                break
-            if not _is_row(cells):
-                comments[len(cells)] = cells
-        else:
-            line, cells = (0, ""), []
-        names = comments.get(len(cells)) if _is_row(cells) or not cells else cells
-        is_separated, n_cells = "," in line[1] or ";" in line[1], len(cells)
-        found: tuple[str, Sequence[str] | None] = "csv", _UNNAMED if n_cells == 8 else None
-        if names and (names is cells or are_columns(names)):
-            is_tum = " ".join(names).lower().endswith(TUM_COLUMNS[10:])
-            found = ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", names)
-        elif not is_separated and n_cells != 4:
-            found = ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
-        elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= _DIGITS_OF_NS:
-            found = "euroc", _FORMATS["euroc"][0]
-        return cls(line[0], cells, names, *found)
-
-
-# ---- tables
 
 
 @dataclass
 class Table:
     """The rows of a file: their line numbers, stamps (none without a column of them), and values,
-    one row after the other.
+    one row after the other; the names of their images, if there is a column of them.
 
-    Attributes
-    ----------
-    path : str or path-like
-        What messages call it.
-    expected : str
-        What a row should be, for messages.
-    columns : Columns
-    format : str
-        One of :data:`~hand_eye_calib.config.TRAJECTORY_FORMATS`.
-    header : tuple of str
-        The names of all columns; empty without.
-    images : sequence of str
-        The name of each row's image; empty without.
-    guesses : list of str
-        What a person should know of how the file was read.
-    conventions : list of str
-        Those of its angles that the motion does not contradict, the usual first.
+    ``path`` is what messages call it, ``names`` are those of all columns. ``measures`` says what
+    to read, one of config.MEASURES, "twists" for velocities, or "auto", which becomes what the
+    columns are; ``expected`` is what a row should be, for messages. Found are the column of each
+    quantity (``at``), such as "x" or "qw", those of the stamp (``stamp_at``: one, or that of
+    seconds and that of nanoseconds), and the ``units`` of quantities and of "t" in the names.
+    ``guesses`` are what a person should know of how the file was read, ``conventions`` those of
+    its angles that the motion does not contradict, the usual first.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, or several have the same meaning.
     """
 
-    path: _Path
-    expected: str
-    columns: Columns
+    path: object
+    names: Sequence[str]
+    measures: str = "auto"
+    expected: str = ""
     format: str = "csv"
-    header: tuple[str, ...] = ()
-    images: Sequence[str] = ()
     line_numbers: "array[int]" = field(default_factory=lambda: array("q"))
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
+    images: list[str] = field(default_factory=list)
     guesses: list[str] = field(default_factory=list)
     conventions: list[str] = field(default_factory=list)
 
-    def __len__(self) -> int:
-        return len(self.line_numbers)
+    def __post_init__(self) -> None:
+        found, units = named_columns(self.names)
+        listed = shortened(", ".join(self.names), LONGEST_NAME)
+        self.expected = self.expected or f"{len(self.names)} columns: {listed}"
+        self.measures, measured = _measured(found, self.names, self.measures)
+        # The stamp of the message's header rather than the time of its arrival.
+        stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",) * ("t" in found)
+        if missing := [name for name in measured if name not in found]:
+            raise InputError(
+                f"{self.path}: no column for {', '.join(missing)} among {listed}; name all columns "
+                "with `columns`, such as t,x,y,z,qw,qx,qy,qz"
+            )
+        for name in (*stamp, *measured):
+            if len(found[name]) > 1:
+                several = shortened(", ".join(self.names[k] for k in found[name]), LONGEST_NAME)
+                raise InputError(
+                    f"{self.path}: columns {several} could all be {name}; name them with `columns`"
+                )
+        self.at = {name: found[name][0] for name in measured}
+        self.stamp_at = [found[name][0] for name in stamp]
+        self._image_at = found.get("image", ())
+        self.units = {name: units[at] for name, at in self.at.items() if units[at]}
+        self.units["t"] = "ns" if len(stamp) > 1 else units[self.stamp_at[0]] if stamp else ""
 
-    @property
-    def values(self) -> FloatArray:
-        """(N, k) array: the values of each row."""
-        return np.asarray(self.numbers, dtype=float).reshape(-1, len(self.columns.quantities))
-
-    def columns_of(self, names: Sequence[str]) -> FloatArray:
-        """(N, k) array: the values of some quantities."""
-        places = [*self.columns.quantities]
-        return self.values[:, [places.index(name) for name in names]]
+    def values(self, names: Iterable[str] = ()) -> FloatArray:
+        """(N, k) array: the values of some quantities, or of all."""
+        places, all_values = [*self.at], np.asarray(self.numbers).reshape(-1, len(self.at))
+        return all_values[:, [places.index(name) for name in names]] if names else all_values
 
     def fill(
-        self,
-        lines: Iterable[tuple[int, Any]],
-        cells_of: Callable[[Any], list[str]],
-        n_columns: int,
+        self, lines: Iterable[tuple[int, Any]], cells_of: Callable[[Any], Sequence[str]]
     ) -> Self:
-        """Add rows from their text.
+        """Add rows from their line numbers and texts.
 
         Raises
         ------
         InputError
             At the first line with another number of cells, or with something that is no number.
         """
-        stamp_at, at = self.columns.stamp, [*self.columns.quantities.values()]
+        stamp_at, at, n_columns = self.stamp_at, [*self.at.values()], len(self.names)
         for number, text in lines:
             cells = cells_of(text)
             if len(cells) != n_columns:
@@ -252,11 +162,12 @@ class Table:
                 )
             try:
                 if stamp_at:
-                    self.stamps.append(_stamp([cells[index] for index in stamp_at]))
+                    self.stamps.append(_stamp(*(cells[index] for index in stamp_at)))
                 self.numbers.extend(float(cells[index]) for index in at)
             except ValueError as error:
                 reason = f"expected {self.expected}; {shortened(str(error))}"
                 raise InputError(f"{self.path}, line {number}: {reason}") from None
+            self.images.extend(cells[index] for index in self._image_at)
             self.line_numbers.append(number)
         return self
 
@@ -271,115 +182,88 @@ class Table:
             raise InputError(f"{self.path}, line {self.line_numbers[index]}: {message(index)}")
 
 
-def _stamp(cells: Sequence[str]) -> Decimal:
+def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
+    """Columns of each quantity, of those that have any: of one of its names; if there is none, of
+    paths that end in one; and the units in the names, empty for none.
+    """
+    plain, units = zip(*map(_split, names), strict=True) if names else ((), ())
+    found: dict[str, list[int]] = {}
+    for wanted, aliases in _ALIASES.items():
+        known = aliases.split()
+        # Of paths, the longest end that is known: position_x rather than x.
+        ends = tuple(f"_{alias}" for alias in known if "_" in alias)
+        columns = [at for at, name in enumerate(plain) if name in known]
+        columns = columns or [at for at, name in enumerate(plain) if name.endswith(ends)]
+        if columns:
+            found[wanted] = columns
+    return found, [*units]
+
+
+def are_columns(names: Sequence[str]) -> bool:
+    """Whether these are names of columns, or some other text."""
+    found = named_columns(names)[0].keys()
+    return any({*group} <= found for group in (*_POSITIONS, *_PLANAR_POSITIONS, RATES))
+
+
+def _measured(
+    found: Mapping[str, Any], names: Sequence[str], measures: str
+) -> tuple[str, Sequence[str]]:
+    """What the columns measure, and the quantities to read for that: poses and the preferred
+    quantities in doubt, so that what is missing is named.
+    """
+
+    known = [*_POSITIONS, *_PLANAR_POSITIONS, *_ORIENTATIONS, *_PLANAR_ORIENTATIONS]
+    known = [group for group in known if {*group} <= found.keys()]
+    flat = next((group for group in known if group in (*_POSITIONS, *_PLANAR_POSITIONS)), ())
+    turn = next((group for group in known if group in _ORIENTATIONS), ())
+    heading = next((group for group in known if group in _PLANAR_ORIENTATIONS), ())
+    if measures == "auto":
+        oriented = {*sum((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), ())}
+        measures = "poses"
+        if flat and not (found.keys() & oriented or any(map(_ORIENTED, names))):
+            measures = "positions"
+        elif not found.keys() & {*sum(_POSITIONS, ())}:
+            measures = "rates" if {*RATES} <= found.keys() else "rotations" if turn else "poses"
+    if measures == "poses" and MATRIX[0] in found:
+        return measures, MATRIX
+    orientation: Sequence[str] = turn or heading or QUATERNION
+    is_planar = measures == "positions" or orientation in _PLANAR_ORIENTATIONS
+    position = flat if flat and (is_planar or flat in _POSITIONS) else POSITION
+    parts = {"rates": RATES, "twists": TWIST, "positions": position, "rotations": orientation}
+    parts["stamps"] = ()
+    return measures, parts.get(measures, (*position, *orientation))
+
+
+def _split(name: str) -> tuple[str, str]:
+    """A column's name without its unit, and the unit, empty if there is none:
+    ``.pose.position.x [mm]`` to pose_position_x and mm, wx_deg_s to wx and deg/s.
+    """
+    name = name.strip().lower()
+    words = re.findall("[a-z0-9°]+", re.sub(r"\[.*?\]|\(.*?\)", "", name))
+    if in_brackets := re.search(r"[\[(]\s*([^\])]*?)\s*(?:\^?-1)?\s*[\])]$", name):
+        return "_".join(words), _UNITS.get(re.sub(r"[\s/_]+", "/", in_brackets[1]), "")
+    is_time = re.match("(t|time.*|stamp.*)$", words[0] if words else "") is not None
+    for count in (2, 1):
+        unit = _UNITS.get("/".join(words[-count:]), "")
+        if len(words) > count and unit and (unit in STAMP_UNITS) == is_time:
+            return "_".join(words[:-count]), unit
+    return "_".join(words), ""
+
+
+def _stamp(text: str, nanoseconds: str = "") -> Decimal:
     """A stamp as it is written, with no binary floating point in between; nanoseconds of one in two
     columns; of a time of ISO 8601, in UTC if it names no zone, microseconds count.
     """
-    if len(cells) == 2:
-        return Decimal(int(cells[0]) * STAMP_UNITS["s"] + int(cells[1]))
+    if nanoseconds:
+        return Decimal(int(text) * STAMP_UNITS["s"] + int(nanoseconds))
     try:
-        stamp = Decimal(cells[0])
+        stamp = Decimal(text)
     except InvalidOperation:
-        if not _NUMBER.fullmatch(cells[0]):
-            raise ValueError(f"found {cells[0]!r} for the timestamp") from None
-        moment = datetime.fromisoformat(cells[0])
+        if not NUMBER.fullmatch(text):
+            raise ValueError(f"found {text!r} for the timestamp") from None
+        moment = datetime.fromisoformat(text)
         moment = moment.replace(tzinfo=moment.tzinfo or UTC)
         return Decimal(int(moment.timestamp())) + Decimal(moment.microsecond).scaleb(-6)
     if not stamp.is_finite() or stamp.adjusted() > 30:
-        raise ValueError(f"found {cells[0]!r} for the timestamp")
+        raise ValueError(f"found {text!r} for the timestamp")
     return stamp
-
-
-# ---- formats
-
-# Of the formats whose columns have an order: their names, what a row is, and how it is split.
-_FORMATS: dict[str, tuple[Sequence[str], str, Callable[[str], list[str]]]] = {
-    "tum": (("t", *POSITION, *QUATERNION), f"8 numbers, {TUM_COLUMNS}", str.split),
-    "kitti": (MATRIX, "12 numbers, the first three rows of a pose", str.split),
-    "euroc": (
-        ("t [ns]", *POSITION, "qw", "qx", "qy", "qz"),
-        "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
-        lambda text: [*map(str.strip, text.split(","))][:8],
-    ),
-}
-# A stamp, a position and a quaternion, whose order is to be found.
-_UNNAMED = ("t", *POSITION, *UNNAMED)
-
-
-def read_table(path: _Path, options: FileOptions) -> Table:
-    """The rows of a file in its format, or in the one that it looks like.
-
-    Raises
-    ------
-    InputError
-        If a line cannot be used, or columns have no names.
-    """
-    if (found := rows_of(path, options.columns)) is not None:
-        rows = enumerate(found.rows, 1)
-        table = table_of(path, found.header, rows, lambda row: [*map(str, row)], options.measures)
-        table.guesses, table.images = [f"{path}: {note}" for note in found.notes], found.images
-        return table
-    head, guesses = Head.of(path), list[str]()
-    format, columns, times = options.format, options.columns, options.times
-    if format != AUTO or columns or times:
-        format = format if format != AUTO else "csv" if columns else "kitti"
-        header = _FORMATS[format][0] if format != "csv" else head.names
-    else:
-        format, header = head.format, head.header
-        header = header or _OF_FOUR.get(options.measures) if len(head.cells) == 4 else header
-        if format != "tum":
-            guesses = [f"{path} looks like format {format}; to change that, give `format`"]
-        beside = Path(path).with_name(_TIMES)
-        if format == "kitti" and beside.is_file():
-            times = beside
-            guesses.append(f"stamps read from {beside}; to change that, give `times`")
-    after = head.number if head.names is head.cells else 0
-    if columns:
-        header = [name.strip() for name in columns.split(",")]
-        after = 0 if any(map(_NUMBER.fullmatch, head.cells)) else head.number
-    if header is None and head.cells:
-        raise InputError(
-            f"{path}: the first line names no columns, so that their order is unknown; name the "
-            f"{len(head.cells)} with `columns`, such as t,x,y,z,qx,qy,qz,qw or t,wx,wy,wz"
-        )
-    _, expected, cells_of = _FORMATS.get(format, ((), "", _cells_of))
-    # A file without data is not gone through again.
-    lines = lines_of(path, after=after if format == "csv" else 0) if head.cells else iter(())
-    measures = options.measures if format == "csv" else AUTO
-    table = table_of(path, header or _UNNAMED, lines, cells_of, measures, expected)
-    if format == "kitti" and times is not None:
-        table.stamps = _stamps_of(times, table)
-    table.guesses, table.format = guesses, format
-    return table
-
-
-def _stamps_of(times: _Path, poses: Table) -> list[Decimal]:
-    """The stamps of poses from a file of their own."""
-    table, lines = Table(times, "a stamp", Columns([0], {})), lines_of(times, "stamps", after=0)
-    table.fill(lines, lambda text: text.split()[:1], 1)
-    if len(table) != len(poses):
-        raise InputError(
-            f"{poses.path}: {len(poses)} poses, but {times} has {len(table)} stamps; they belong "
-            "to different recordings"
-        )
-    return table.stamps
-
-
-def table_of(
-    path: _Path,
-    names: Sequence[str],
-    lines: Iterable[tuple[int, Any]],
-    cells_of: Callable[[Any], list[str]],
-    measures: str = AUTO,
-    expected: str = "",
-) -> Table:
-    """The numbers of lines whose columns have names.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, or a line cannot be used.
-    """
-    columns = choose_columns(path, names, measures)
-    expected = expected or f"{len(names)} columns: {listed(names)}"
-    return Table(path, expected, columns, header=tuple(names)).fill(lines, cells_of, len(names))

@@ -10,7 +10,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.files import write_atomically
 from hand_eye_calib.io.trajectory_files.poses import seconds
-from hand_eye_calib.io.trajectory_files.table import TUM_COLUMNS
+from hand_eye_calib.io.trajectory_files.reading import TUM_COLUMNS
 
 
 def write_trajectory(
