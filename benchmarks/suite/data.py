@@ -18,13 +18,18 @@ from reproduction.published import load_kitti_long, load_kitti_short
 REFERENCE = "B5"
 # Pairs with B5; the KITTI drives have 448 and 2,343 poses in common.
 SHORT, LONG = 443, 2338
-# Messages of both streams together for the engine, and of each for the bag.
-ENGINE_MESSAGES, BAG_MESSAGES = 40_000, 20_000
+# Messages of both streams together.
+MESSAGES = 40_000
+STREAMS = ("parent", "child")
+START_NS = 1_700_000_000_000_000_000
 T_PARENT_CHILD = se3.exp(np.array([0.3, -0.1, 0.2, 0.3, -0.5, 1.2]))
 
 _POSES_AT_A_TIME = 100_000
 _PERIOD_NS = 100_000_000
 _SIGMA = np.repeat([0.01, 0.002], 3)  # m, rad
+# Of the poses of messages: B5 at 400 Hz spans 12 ms, with a centimetre there would be nothing to
+# solve.
+_SIGMA_OF_MESSAGES = np.repeat([2e-5, 5e-6], 3)  # m, rad
 
 
 @dataclass(frozen=True)
@@ -48,31 +53,50 @@ class Drive:
 def drives(sizes):
     """Source of the two drives of published lengths, and a Drive for every number of pairs."""
     found = {n_pairs: simulated_drive(n_pairs + 5) for n_pairs in sizes}
-    published = _published()
-    return "published" if published else "simulated", {
-        size: published.get(size, drive) for size, drive in found.items()
-    }
-
-
-def _published():
-    folder = Path(
-        os.environ.get(
-            "HAND_EYE_CALIB_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"
-        )
-    )
+    shared = Path(__file__).resolve().parents[3] / "shared" / "data"
+    folder = Path(os.environ.get("HAND_EYE_CALIB_DATA", shared)) / "valimaki2023"
     try:
-        cases = {
-            SHORT: load_kitti_short(folder / "valimaki2023"),
-            LONG: load_kitti_long(folder / "valimaki2023"),
-        }
+        cases = {SHORT: load_kitti_short(folder), LONG: load_kitti_long(folder)}
     except InputError:
-        return {}
+        return "simulated", found
+    for size, case in cases.items():
+        poses = PosePairs(case.parent.stamps_ns, case.parent.poses, case.child.poses)
+        found[size] = Drive(poses, case.T_parent_child)
+    return "published", found
+
+
+def messages(first, count, rate_hz):
+    """Trajectories of both sensors, of poses number ``first`` to ``first + count`` of a smooth
+    motion about all axes, with noise.
+    """
+    numbers = first + np.arange(count)
+    s = numbers / rate_hz
+    turns = np.stack(
+        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1
+    )
+    places = np.stack([20 * np.sin(0.05 * s), 20 * np.sin(0.07 * s), 0.5 * np.cos(0.8 * s)], axis=1)
+    Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
+    noise = np.random.default_rng(first).normal(size=(2, count, 6)) * _SIGMA_OF_MESSAGES
+    stamps_ns = START_NS + numbers * round(1e9 / rate_hz)
+    return (
+        Trajectory(stamps_ns, Ts_pw_p @ se3.exp(noise[0]), "parent_sensor", "world"),
+        Trajectory(
+            stamps_ns, Ts_pw_p @ T_PARENT_CHILD @ se3.exp(noise[1]), "child_sensor", "world"
+        ),
+    )
+
+
+def parts(first, count, rate_hz):
+    """Stamps, positions and quaternions of both streams as lists, as messages have them, a dict by
+    stream.
+    """
     return {
-        size: Drive(
-            PosePairs(case.parent.stamps_ns, case.parent.poses, case.child.poses),
-            case.T_parent_child,
+        stream: (
+            trajectory.stamps_ns.tolist(),
+            trajectory.poses[:, :3, 3].tolist(),
+            se3.to_quat_xyzw(trajectory.poses).tolist(),
         )
-        for size, case in cases.items()
+        for stream, trajectory in zip(STREAMS, messages(first, count, rate_hz), strict=True)
     }
 
 

@@ -1,10 +1,14 @@
-"""Rows measured within this process: from synchronised poses to the answer, and the engine."""
+"""Rows measured within this process: from synchronised poses to the answer, the engine, bags."""
 
 import sys
+import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from hand_eye_calib.assessment.covariance import assess
 from hand_eye_calib.assessment.metrics import absolute_errors
@@ -12,18 +16,20 @@ from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
+from hand_eye_calib.io.bags import PoseBag, write_bag
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.registry import Method
-from suite import opencv
-from suite.baseline import FLOOR
-from suite.data import LONG, REFERENCE, SHORT
+from suite.baseline import FLOOR, OPENCV
+from suite.data import LONG, REFERENCE, SHORT, messages, parts
 from suite.measuring import measure, measure_in_turn, row_of
 
 # Up to these sizes a row is part of every run, and of a full one.
 _USUAL = {"other methods": 10_000, "adaptive": 10_000}
 _FULL = {"other methods": 100_000, "adaptive": 100_000}
 _JACKKNIFE = 100_000
+OPENCV_METHODS = ("PARK", "TSAI", "HORAUD", "ANDREFF", "DANIILIDIS")
+TOPICS = ("/lidar/odometry", "/camera/odometry")
 
 
 def solver_rows(drive, is_full):
@@ -80,69 +86,91 @@ def solver_rows(drive, is_full):
         yield row("reference auto", lambda: select_reference(poses, Method("dnlo")))
 
 
-def opencv_rows(drives, all_methods):
-    """OpenCV on the short drive, and on the long one with what was fastest there, or with all."""
-    cv2 = opencv.load()
-    if cv2 is None:
-        print(
-            "opencv: not installed, its rows are left out; pip install 'opencv-python-headless<5'",
-            file=sys.stderr,
-        )
+def opencv_rows(drives):
+    """OpenCV on the short drive, and on the long one with what was fastest there."""
+    try:
+        import cv2
+    except ImportError:
+        advice = "its rows are left out; pip install 'opencv-python-headless<5'"
+        print(f"opencv: not installed, {advice}", file=sys.stderr)
         return
-    methods, fastest = opencv.METHODS, []
+    methods = OPENCV_METHODS
     for size in (SHORT, LONG):
-        drive = drives[size]
-        found = []
+        poses, found = drives[size].poses, []
         for method in methods:
             row, T_parent_child = measure(
                 f"opencv {method.lower()}",
                 size,
-                lambda drive=drive, method=method: opencv.calibrate(
-                    cv2, method, drive.poses.Ts_pw_p, drive.poses.Ts_cw_c
+                lambda method=method, poses=poses: opencv(
+                    cv2, method, poses.Ts_pw_p, poses.Ts_cw_c
                 ),
             )
-            metres, radians = absolute_errors(T_parent_child, drive.T_parent_child)
+            metres, radians = absolute_errors(T_parent_child, drives[size].T_parent_child)
             found.append(replace(row, error_m=metres, error_rad=radians))
         yield from found
         quickest = min(found, key=lambda row: row.seconds)
-        fastest.append(replace(quickest, name="opencv, the fastest"))
-        if not all_methods:
-            methods = [method for method in methods if quickest.name == f"opencv {method.lower()}"]
-    yield from fastest
+        yield replace(quickest, name=OPENCV)
+        methods = [method for method in methods if quickest.name == f"opencv {method.lower()}"]
+
+
+def opencv(cv2, method, Ts_pw_p, Ts_cw_c):
+    """T_parent_child (4, 4) by OpenCV's ``calibrateHandEye``, what a user would run instead.
+
+    Its "gripper to base" is our pose of the parent in its world, its "target to camera" the inverse
+    of our pose of the child in its: then its "camera to gripper" is T_parent_child. It makes a pair
+    of every two poses.
+    """
+    Ts_child_world = se3.inverse(Ts_cw_c)
+    rotation, translation = cv2.calibrateHandEye(
+        list(Ts_pw_p[:, :3, :3]),
+        list(Ts_pw_p[:, :3, 3]),
+        list(Ts_child_world[:, :3, :3]),
+        list(Ts_child_world[:, :3, 3]),
+        method=getattr(cv2, f"CALIB_HAND_EYE_{method}"),
+    )
+    return se3.from_rotation_translation(rotation, np.ravel(translation))
 
 
 def engine_rows(n_messages):
     """Time per message of the engine: at the median, and at the 99th percentile."""
-    messages = zip(*(column.tolist() for column in _messages(n_messages)), strict=True)
-    times = np.array(list(_stopwatch(Calibrator().add_pose, messages)))
-    halves = np.array_split(times, 5)
-    yield row_of("add_pose, median", n_messages, [np.median(half) for half in halves])
-    yield row_of(
-        "add_pose, 99th percentile", n_messages, [np.percentile(half, 99) for half in halves]
-    )
+    calibrator, times = Calibrator(), []
+    streams = parts(0, n_messages // 2, 100)
+    for pose in range(n_messages // 2):
+        for stream, (stamps_ns, positions, quats) in streams.items():
+            start = time.perf_counter_ns()
+            calibrator.add_pose(stream, stamps_ns[pose], positions[pose], quats[pose])
+            times.append((time.perf_counter_ns() - start) * 1e-9)
+    fifths = np.array_split(times, 5)
+    yield row_of("add_pose, median", n_messages, [np.median(part) for part in fifths])
+    tails = [np.percentile(part, 99) for part in fifths]
+    yield row_of("add_pose, 99th percentile", n_messages, tails)
 
 
-def _stopwatch(take, messages):
-    for message in messages:
-        start = time.perf_counter_ns()
-        take(*message)
-        yield (time.perf_counter_ns() - start) * 1e-9
+def bag_rows(n_messages):
+    """Of every storage two Odometry topics, read by us, and iterated over with every message
+    deserialised by rosbags.
+    """
+    for storage in ("mcap", "sqlite3", "rosbag1"):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "recording.bag" if storage == "rosbag1" else "recording")
+            write_messages(path, n_messages, storage)
+            for name, work in (("rosbags alone", _by_rosbags), ("bag: read", _by_us)):
+                yield measure(f"{name}, {storage}", n_messages, lambda: work(path))[0]  # noqa: B023
 
 
-def _messages(count):
-    """Streams, stamps, positions and quaternions of two sensors at 100 Hz, in turn."""
-    s = np.arange(count // 2) / 100.0
-    turns = np.stack(
-        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1
-    )
-    Ts = se3.from_rotation_translation(
-        se3.rotation_exp(turns), np.stack([20 * np.sin(0.05 * s), s, np.cos(0.8 * s)], axis=1)
-    )
-    stamps_ns = np.add.outer((s * 1e9).astype(np.int64), [0, 3_000_000]).ravel()
-    names = np.tile(["parent", "child"], len(s))
-    return (
-        names,
-        stamps_ns,
-        np.repeat(Ts[:, :3, 3], 2, axis=0),
-        np.repeat(se3.to_quat_xyzw(Ts), 2, axis=0),
-    )
+def write_messages(path, n_messages, storage="mcap"):
+    """A bag of both streams on TOPICS."""
+    trajectories = messages(0, n_messages // 2, 100)
+    streams = zip(trajectories, ["nav_msgs/msg/Odometry"] * 2, strict=True)
+    write_bag(path, dict(zip(TOPICS, streams, strict=True)), storage)
+
+
+def _by_rosbags(path):
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, _, data in reader.messages(reader.connections):
+            reader.deserialize(data, connection.msgtype)
+
+
+def _by_us(path):
+    with PoseBag(path) as bag:
+        bag.poses(*TOPICS)

@@ -7,14 +7,12 @@ import numpy as np
 from rich import box, table
 from rich.console import Console
 
-from suite.baseline import FLOOR, aims
+from suite.baseline import FLOOR, OPENCV, aims
 from suite.data import LONG, REFERENCE, SHORT
 
 _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"))
-_BEGIN, _END = (
-    "<!-- tables of benchmarks/run.py: begin -->\n",
-    "<!-- tables of benchmarks/run.py: end -->\n",
-)
+_MARK = "<!-- tables of benchmarks/run.py: {} -->\n"
+_BEGIN, _END = _MARK.format("begin"), _MARK.format("end")
 
 
 class Table(NamedTuple):
@@ -38,11 +36,7 @@ def tables(source, rows, memory):
             )
         )
     found.append(_others([row for row in rows if row.size not in sizes], memory))
-    aimed_at = [
-        [what, aim, measured, "yes" if is_met else "no"]
-        for what, aim, measured, is_met in aims(rows, memory)
-    ]
-    return [*found, Table("What is aimed at", ["aim", "measured", "met"], aimed_at)]
+    return [*found, Table("What is aimed at", ["aim", "measured", "met"], aims(rows, memory))]
 
 
 def show(found):
@@ -106,7 +100,7 @@ def _side_by_side(title, rows):
                 f"{np.degrees(row.error_rad):.3f}",
             ]
             for row in rows
-            if row.error_m is not None and not row.name.startswith("opencv,")
+            if row.error_m is not None and row.name != OPENCV
         ],
     )
 
@@ -114,9 +108,6 @@ def _side_by_side(title, rows):
 def _others(rows, memory):
     lines = [[row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows]
     for size, (before, peak, data) in memory.items():
-        sizes = (
-            f"{peak / 1e6:.0f} MB, {before / 1e6:.0f} before and {data / 1e6:.0f} for the "
-            "pairs among it"
-        )
-        lines.append(["peak memory of dnlo fast", f"{size:,}", sizes])
+        of_what = f"{before / 1e6:.0f} before and {data / 1e6:.0f} for the pairs among it"
+        lines.append(["peak memory of dnlo fast", f"{size:,}", f"{peak / 1e6:.0f} MB, {of_what}"])
     return Table("Processes, bags, messages", ["size", "measured"], lines)
