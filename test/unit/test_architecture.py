@@ -96,18 +96,14 @@ def test_imports_go_one_way_and_libraries_stay_in_their_rooms():
     assert breaches(SOURCE) == []
 
 
-def modules_of(package_root):
-    """Dotted name to path of every file, without the package's name; "" is its __init__.py."""
-    names = {}
+def file_imports(package_root):
+    """File to the files of the package that it imports, both as dotted names; "" is the package's
+    __init__.py.
+    """
+    modules = {}
     for path in sorted(package_root.rglob("*.py")):
         parts = path.relative_to(package_root).with_suffix("").parts
-        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return names
-
-
-def file_imports(package_root):
-    """File to the files of the package that it imports, both as dotted names."""
-    modules = modules_of(package_root)
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     graph = {}
     for module, path in modules.items():
         targets = set()
@@ -125,40 +121,21 @@ def file_imports(package_root):
 def test_no_files_import_each_other_in_a_circle():
     graph = file_imports(SOURCE)
     assert "engine.snapshot" in graph["engine.calibrator"]
-    # The public API names the homes of its names, and nothing below it imports it.
     TopologicalSorter(graph).prepare()
     TopologicalSorter(ENGINE).prepare()
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "c"),
-    [
-        ("from hand_eye_calib.geometry import b", "def f():\n    from .a import x", ""),
-        ("from . import b", "from .c import x", "import hand_eye_calib.geometry.a"),
-    ],
-)
-def test_a_circle_of_files_is_caught(tmp_path, a, b, c):
-    (tmp_path / "geometry").mkdir()
-    for name, text in {"../__init__": "", "__init__": "", "a": a, "b": "", "c": c}.items():
-        (tmp_path / "geometry" / f"{name}.py").write_text(text + "\n")
-    TopologicalSorter(file_imports(tmp_path)).prepare()
-    (tmp_path / "geometry" / "b.py").write_text(b + "\n")
-    with pytest.raises(CycleError):
-        TopologicalSorter(file_imports(tmp_path)).prepare()
+    with pytest.raises(CycleError):  # the public API names the homes of its names
+        TopologicalSorter(graph | {"engine.snapshot": {"engine.calibrator"}}).prepare()
 
 
 @pytest.mark.parametrize(
     ("file", "line", "message"),
     [
-        ("geometry/se3.py", "from ..solvers import dnl", "geometry must not import solvers"),
         (
             "geometry/se3.py",
-            "def late():\n    from hand_eye_calib import solvers",
+            "def late():\n    from ..solvers import dnl",
             "geometry must not import solvers",
         ),
         ("errors.py", "from hand_eye_calib import calibrate", "errors must not import root"),
-        ("ros/node.py", "from hand_eye_calib.cli import main", "ros must not import cli"),
-        ("cli/main.py", "import rclpy", "rclpy may be imported only in ros/"),
         (
             "cli/main.py",
             "import importlib\nimportlib.import_module('matplotlib.pyplot')",
