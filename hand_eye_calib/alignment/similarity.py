@@ -28,7 +28,9 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
-_SUBSETS, _SUBSET_SIZES, _REFINED_STARTS, _MAX_RANKED_PAIRS = 32, (12, 24, 48), 3, 300
+# Starts: so many random subsets of each of these sizes, of so many pairs; and how many starts are
+# refined.
+_SUBSETS, _SUBSET_SIZES, _MAX_RANKED_PAIRS, _REFINED_STARTS = 32, (12, 24, 48), 300, 3
 _MAX_STEPS, _STEP_TOLERANCE = 30, 1e-6
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
@@ -59,7 +61,9 @@ MIN_PAIRS, _SCALE_LAGS_S = 20, (3.0, 1.0, 8.0)
 # the fit leaves less than this of the motion unexplained: many jumps could imitate a scale.
 _MIN_DIFFERENCE, _MIN_SIGMAS, _MAX_UNEXPLAINED_TO_DIFFER = 0.01, 5.0, 0.1
 
-_SCALE, _OFFSET, _UNKNOWNS = 6, 7, 8
+# Unknowns: (rho, phi), the logarithm of the scale, and the offset.
+_UNKNOWNS = [*"xyz", "roll", "pitch", "yaw", "scale", "offset"]
+_SCALE, _OFFSET = map(_UNKNOWNS.index, ("scale", "offset"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +78,11 @@ class SimilarityFit:
         s: factor from the child's unit of length to the parent's.
     offset_s : float
         d: seconds to add to the child's stamps, beyond what was added already. 0 without twists.
-    covariance : (8, 8) array
-        Of (rho, phi, log s, d), by the delete-a-block jackknife over time. Zero for d without
-        twists.
+    sigmas : (8,) array
+        Standard deviations of (rho, phi, log s, d), by the delete-a-block jackknife over time. Zero
+        for d without twists.
+    scale_sigma, offset_sigma_s : float
+        Those of s and d.
     sensitivity : (6, 2) array
         Derivative of (rho, phi) by log s and by d.
     offsets_of_blocks : (2, B) array
@@ -84,9 +90,9 @@ class SimilarityFit:
         that. Zero without twists.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
-    rms_translation, rms_rotation : float
-        Root mean square of the translations (m) and of the parent's rotation angles (rad), to
-        compare the residuals with. The translations are the parent's or the child's times s,
+    unexplained_translation, unexplained : float
+        Unexplained share of the translations, and of the motion, translation and rotation together:
+        the former over the root mean square of the parent's translations or of the child's times s,
         whichever are smaller: a scale near zero explains nothing, however small the residuals. If
         the scale is kept at 1, whichever are larger.
     """
@@ -94,39 +100,20 @@ class SimilarityFit:
     T_parent_child: FloatArray
     scale: float
     offset_s: float
-    covariance: FloatArray
+    sigmas: FloatArray
+    scale_sigma: float
+    offset_sigma_s: float
     sensitivity: FloatArray
     offsets_of_blocks: FloatArray
     sigma_translation: float
     sigma_rotation: float
-    rms_translation: float
-    rms_rotation: float
-
-    @property
-    def unexplained(self) -> float:
-        """Unexplained share of the motion, of translation and rotation together."""
-        of_rotation = self.sigma_rotation / max(self.rms_rotation, 1e-12)
-        return float(np.hypot(self.unexplained_translation, of_rotation))
-
-    @property
-    def unexplained_translation(self) -> float:
-        """Unexplained share of the translations."""
-        return self.sigma_translation / max(self.rms_translation, 1e-12)
+    unexplained_translation: float
+    unexplained: float
 
     @property
     def explains_translation(self) -> bool:
         """Whether the fit explains enough of the translations to trust its scale and offset."""
         return self.unexplained_translation < _MAX_UNEXPLAINED_TRANSLATION
-
-    @property
-    def scale_sigma(self) -> float:
-        """Standard deviation of the scale."""
-        return self.scale * float(np.sqrt(self.covariance[_SCALE, _SCALE]))
-
-    @property
-    def offset_sigma_s(self) -> float:
-        """Standard deviation of the time offset, s."""
-        return float(np.sqrt(self.covariance[_OFFSET, _OFFSET]))
 
 
 def fit_similarity(
@@ -308,7 +295,7 @@ class _Problem:
         self.skew_b = se3.skew(self.translation_b)
         self.rms_a, self.rms_b = _rms(self.translation_a), _rms(self.translation_b)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
-        self.free = np.ones(_UNKNOWNS, dtype=bool)
+        self.free = np.ones(len(_UNKNOWNS), dtype=bool)
         self.free[_SCALE], self.free[_OFFSET] = not same_unit, twists is not None
         twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
         # Derivatives of B by d. Adding to the child's stamps moves its poses at given instants
@@ -328,7 +315,7 @@ class _Problem:
         these per axis (m, rad).
         """
         rotation, back = T[:3, :3], T[:3, :3].T
-        of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _UNKNOWNS + 1))
+        of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, len(_UNKNOWNS) + 1))
         of_translation[:, :, :3] = _times(self.chord_a, rotation)
         of_translation[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
         of_translation[:, :, _SCALE] = -scale * self.translation_b @ back
@@ -361,9 +348,9 @@ class _Problem:
         """X, scale and offset after Gauss-Newton steps with robust weights until they are small."""
         offset_s = 0.0
         for _ in range(_MAX_STEPS):
-            moments = np.zeros((_UNKNOWNS + 1, _UNKNOWNS + 1))
+            moments = np.zeros((len(_UNKNOWNS) + 1,) * 2)
             for part in self.rows(T, scale, offset_s)[0]:
-                flat = part.reshape(-1, _UNKNOWNS + 1)
+                flat = part.reshape(-1, len(_UNKNOWNS) + 1)
                 moments += flat.T @ flat
             step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
@@ -387,23 +374,29 @@ class _Problem:
         # The jackknife: one-step answers without each block.
         answers = _solve(total - normal, gradient - gradient.sum(axis=0), self.free)
         answers -= answers.mean(axis=0)
-        extrinsic = np.arange(_UNKNOWNS) < 6
+        extrinsic = np.arange(len(_UNKNOWNS)) < _SCALE
         by = [_solve(total, -total[:, column], extrinsic)[:6] for column in (_SCALE, _OFFSET)]
         weights = normal[:, _OFFSET, _OFFSET]
         offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
         # Of the stream that moves less or, with one unit of length, of the one that moves more.
         lengths = (self.rms_a, scale * self.rms_b)
+        rms_translation = min(lengths) if self.free[_SCALE] else max(lengths)
+        of_translation = sigma_translation / max(rms_translation, 1e-12)
+        of_rotation = sigma_rotation / max(self.rms_rotation, 1e-12)
+        sigmas = np.sqrt(np.diag((len(blocks) - 1) / len(blocks) * answers.T @ answers))
         return SimilarityFit(
             T_parent_child=T,
             scale=scale,
             offset_s=offset_s,
-            covariance=(len(blocks) - 1) / len(blocks) * answers.T @ answers,
+            sigmas=sigmas,
+            scale_sigma=scale * float(sigmas[_SCALE]),
+            offset_sigma_s=float(sigmas[_OFFSET]),
             sensitivity=np.column_stack(by),
             offsets_of_blocks=np.stack([offsets, weights]),
             sigma_translation=sigma_translation,
             sigma_rotation=sigma_rotation,
-            rms_translation=min(lengths) if self.free[_SCALE] else max(lengths),
-            rms_rotation=self.rms_rotation,
+            unexplained_translation=of_translation,
+            unexplained=float(np.hypot(of_translation, of_rotation)),
         )
 
 

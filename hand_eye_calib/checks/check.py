@@ -224,7 +224,7 @@ def _check_agreeing(
     """What else there is to say of streams that agree as they are, on one clock, and of the same
     streams as they were given.
     """
-    of_fit = fit.T_parent_child, np.sqrt(np.diag(fit.covariance)[:6])
+    of_fit = fit.T_parent_child, fit.sigmas[:6]
     best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
     if copied := check_independent(streams.parent, streams.child, aligned.child):
         return [*copied, *check_same(*best)]

@@ -212,10 +212,8 @@ def linearise(
         Errors that the poses were freed of.
     """
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
-    step, metres = (
-        turned(back_c, np.diff(course.path, axis=0)),
-        back_c @ np.diff(course.along, axis=0),
-    )
+    step = turned(back_c, np.diff(course.path, axis=0))
+    metres = back_c @ np.diff(course.along, axis=0)
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)

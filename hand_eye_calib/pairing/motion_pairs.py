@@ -114,18 +114,17 @@ def pairs_between(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, i: IntArray, j: IntArray
 ) -> MotionPairs:
     """MotionPairs from the instants i to the instants j, (K,) int arrays."""
-    return MotionPairs(_relative(Ts_pw_p, i, j), _relative(Ts_cw_c, i, j), i, j)
-
-
-def _relative(Ts_world_sensor: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
-    start, end = Ts_world_sensor.take(i, axis=0), Ts_world_sensor.take(j, axis=0)
-    # The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
-    # first costs ten digits.
-    end[:, :3, 3] -= start[:, :3, 3]
-    relative = np.empty_like(end)
-    np.matmul(np.swapaxes(start[:, :3, :3], 1, 2), end[:, :3], out=relative[:, :3])
-    relative[:, 3] = 0.0, 0.0, 0.0, 1.0
-    return relative
+    motions = []
+    for Ts_world_sensor in (Ts_pw_p, Ts_cw_c):
+        start, end = Ts_world_sensor.take(i, axis=0), Ts_world_sensor.take(j, axis=0)
+        # The translation difference is taken before rotating: with map coordinates of 1e6 m,
+        # inverting first costs ten digits.
+        end[:, :3, 3] -= start[:, :3, 3]
+        relative = np.empty_like(end)
+        np.matmul(np.swapaxes(start[:, :3, :3], 1, 2), end[:, :3], out=relative[:, :3])
+        relative[:, 3] = 0.0, 0.0, 0.0, 1.0
+        motions.append(relative)
+    return MotionPairs(motions[0], motions[1], i, j)
 
 
 def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = _MAX_PAIRS) -> MotionPairs:

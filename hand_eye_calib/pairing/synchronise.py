@@ -6,7 +6,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.stats import median
@@ -94,23 +94,18 @@ def synchronise(
         return PosePairs.empty()
     at = at or slower_stream(parent.stamps_ns, child.stamps_ns)
     slow, fast = (parent, child) if at == "parent" else (child, parent)
-    keep = _interpolable(fast.stamps_ns, slow.stamps_ns, max_gap_s)
+    # Wanted stamps at which the faster stream has a pose, or may be interpolated.
+    after = np.searchsorted(fast.stamps_ns, slow.stamps_ns)
+    inside = after < len(fast)
+    after = np.minimum(after, len(fast) - 1)
+    gap_ns = fast.stamps_ns[after] - fast.stamps_ns[np.maximum(after - 1, 0)]
+    exact = fast.stamps_ns[after] == slow.stamps_ns
+    keep = inside & (exact | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))
     stamps_ns = slow.stamps_ns[keep]
     is_one = len(fast) == 1
     fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0) if is_one else fast.at(stamps_ns)
     both = (slow.poses[keep], fast_poses) if at == "parent" else (fast_poses, slow.poses[keep])
     return PosePairs(stamps_ns, *both)
-
-
-def _interpolable(available_ns: IntArray, wanted_ns: IntArray, max_gap_s: float) -> BoolArray:
-    """Mask of the wanted stamps at which a stream has a pose or may be interpolated."""
-    after = np.searchsorted(available_ns, wanted_ns)
-    inside = after < len(available_ns)
-    after = np.minimum(after, len(available_ns) - 1)
-    exact = available_ns[after] == wanted_ns
-    before = np.maximum(after - 1, 0)
-    gap_ns = available_ns[after] - available_ns[before]
-    return inside & (exact | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))
 
 
 def select_keyframes(
