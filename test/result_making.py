@@ -64,7 +64,7 @@ def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
         )
         for axis, sigma in zip(NAMES, sigmas, strict=True)
     )
-    fields = {"status": SolveStatus.OK, "floor": None, "cross_check": None} | fields
+    fields = {"status": SolveStatus.OK, "cross_check": None} | fields
     covariance = to_child @ np.diag(sigmas**2) @ to_child.T
     return dataclasses.replace(
         calibration(), T_parent_child=T, covariance=covariance, observability=dofs, **fields
