@@ -11,10 +11,9 @@ from typing import TypeAlias
 
 from hand_eye_calib.errors import ConfigError
 
-# Shorter lengths (m) are in mm, from the second on in m.
-_MM_BELOW, _M_FROM = 0.00995, 0.995
-# Longer durations (s) are in min, and in h.
-_MIN_FROM, _H_FROM = 90.0, 5_400.0
+# Lengths up to so many metres, and durations up to so many seconds, have this unit and factor.
+_LENGTHS = ((0.00995, "mm", 1000), (0.995, "cm", 100), (math.inf, "m", 1))
+_DURATIONS = ((90.0, "s", 1), (5_400.0, "min", 60), (math.inf, "h", 3600))
 _MOST_DECIMALS = 6
 _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 
@@ -24,7 +23,7 @@ def length(metres: float) -> str:
     size = abs(metres)
     if size >= 10:
         return f"{metres:,.{1 if size < 100 else 0}f} m"
-    unit, factor = ("mm", 1000) if size < _MM_BELOW else ("cm", 100) if size < _M_FROM else ("m", 1)
+    unit, factor = next(each[1:] for each in _LENGTHS if not size > each[0])
     return f"{two_digits(factor * metres)} {unit}"
 
 
@@ -100,11 +99,8 @@ def given_or_estimated(value: float, sigma: float, unit: str) -> str:
 
 def duration(seconds: float) -> str:
     """Seconds, minutes or hours."""
-    if seconds >= _H_FROM:
-        return f"{seconds / 3600:.0f} h"
-    if seconds >= _MIN_FROM:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds:.{1 if seconds < 10 else 0}f} s"
+    unit, factor = next(each[1:] for each in _DURATIONS if not seconds > each[0])
+    return f"{seconds / factor:.{1 if seconds < 10 else 0}f} {unit}"
 
 
 def share(value: float) -> str:

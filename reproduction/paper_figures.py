@@ -11,13 +11,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from hand_eye_calib.report import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from reproduction.results import Summary
 
@@ -121,7 +121,7 @@ def draw_errors(
 
 
 def _new_page(height: float, title: str, note: str) -> Figure:
-    figure = style.new_figure(7.2, height)
+    figure = Figure(figsize=(7.2, height), layout="constrained")
     figure.suptitle(title, fontsize=9, fontweight="bold", x=0.01, ha="left")
     figure.supxlabel(note, fontsize=6.5, x=0.01, ha="left", color=_GREY)
     return figure

@@ -165,22 +165,24 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         from hand_eye_calib.cli import stops
 
         return deliver(*stops.solved(arguments), arguments)
-    if len(paths) > 1 and any(map(reading.journal_in, paths)):
-        return _run_together(arguments, [[path] for path in paths])
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
     if arguments.topics or (len(paths) > 2 and not are_bags):
         from hand_eye_calib.cli.rig import calibrate_rig
 
         return calibrate_rig(arguments, as_given)
     options = options_from(arguments)
-    try:
-        if are_bags:
-            recording = reading.read_recording(paths, sources_from(arguments), options)
-        else:
-            recording = reading.read_pair(arguments, options)
-    except reading.SeveralRecordings as several:
-        note(f"{several.reason}; they give one result, as recordings of one rig")
-        return _run_together(arguments, several.groups)
+    if not are_bags:
+        recording = reading.read_pair(arguments, options)
+    else:
+        from hand_eye_calib.cli import bags
+
+        if len(paths) > 1 and any(map(bags.journal_in, paths)):
+            return _run_together(arguments, [[path] for path in paths])
+        try:
+            recording = bags.read_recording(paths, sources_from(arguments), options)
+        except bags.SeveralRecordings as several:
+            note(f"{several.reason}; they give one result, as recordings of one rig")
+            return _run_together(arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     bag = paths[0] if are_bags else None

@@ -13,21 +13,8 @@ examples:
   hand_eye_calib calibrator --ros-args -r parent_odom:=/lidar/odometry -r child_odom:=/camera/odom
   hand_eye_calib calibrator --ros-args --params-file calibrator.yaml
 
-subscribed topics (-r NAME:=TOPIC):
-  parent_odom, child_odom        poses of both sensors: Odometry, PoseStamped, TransformStamped ...
-  child2_odom, child3_odom, ...  poses of further child sensors (other_children)
-  /tf, /tf_static                with parent_tf, child_tf, base_frame, installed:=tf, publish_tf
-
-published topics:
-  ~/extrinsic                    geometry_msgs/TransformStamped: pose of the child in the parent
-  ~/extrinsic_with_covariance    geometry_msgs/PoseWithCovarianceStamped
-  ~/progress                     std_msgs/String: the whole state as JSON
-  /diagnostics                   diagnostic_msgs/DiagnosticArray
-  /tf_static                     with publish_tf, once the goal is reached
-
-services:
-  ~/solve, ~/save, ~/reset       std_srvs/Trigger
-  ~/set_enabled                  std_srvs/SetBool: stop or resume accepting poses
+It takes the poses of both sensors from parent_odom and child_odom and publishes ~/extrinsic.
+docs/node.md has all topics and services.
 
 parameters (-p NAME:=VALUE):
 """

@@ -79,8 +79,6 @@ def _opened(
 ) -> "tuple[dict[str, str], list[Trajectory], list[str]]":
     """Where both streams are from, their poses, and what was wrong with the stamps."""
     from hand_eye_calib.cli import reading
-    from hand_eye_calib.config import CalibratorConfig
-    from hand_eye_calib.io.bags import PoseBag
 
     paths = arguments.paths
     is_bag = reading.are_bags(paths)
@@ -89,13 +87,15 @@ def _opened(
     if not is_bag:
         names = dict(zip(STREAMS, map(str, paths), strict=True))
         return names, *reading.read_files(arguments, paths, options)
+    from hand_eye_calib.cli import bags
+    from hand_eye_calib.config import CalibratorConfig
+    from hand_eye_calib.io.bags import PoseBag
+
     config = CalibratorConfig.from_options(options)
     with PoseBag(paths[0]) as bag:
-        sources, measures = reading.select(bag, sources_from(arguments), config)
+        sources, measures = bags.select(bag, sources_from(arguments), config)
         names = {stream: str(source) for stream, source in sources.items()}
-        return names, *reading.read_sources(
-            bag, zip(sources.values(), measures.values(), strict=True)
-        )
+        return names, *bags.read_sources(bag, zip(sources.values(), measures.values(), strict=True))
 
 
 def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:

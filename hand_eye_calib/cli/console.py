@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from typing import TypeVar
 
 from hand_eye_calib.config import CalibratorConfig
@@ -16,6 +17,20 @@ from hand_eye_calib.option import option_name
 _Item = TypeVar("_Item")
 
 STREAMS = ("parent", "child")
+
+
+class Exit(IntEnum):
+    """Exit codes: failed or bad input; wrong usage; solved, but an axis is unobservable or the
+    verdict is DO NOT USE; and what a shell reports for SIGINT and SIGPIPE.
+    """
+
+    GOOD = 0
+    FAILED = 1
+    USAGE = 2
+    NOT_ALL = 3
+    INTERRUPTED = 130
+    BROKEN_PIPE = 141
+
 
 # How a terminal shows the verdict that a line begins with: bold green, yellow, red.
 _STYLES = {"USE": "\x1b[1;32m", "USE WITH CARE": "\x1b[1;33m", "DO NOT USE": "\x1b[1;31m"}
@@ -57,7 +72,7 @@ def note(text: object) -> None:
     print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
-def fail(error: object, code: int) -> int:
+def fail(error: object, code: int = Exit.FAILED) -> int:
     """Print in one line what went wrong; returns ``code``."""
     print(f"hand_eye_calib: error: {printable(as_typed(str(error)))}", file=sys.stderr)
     return code

@@ -14,15 +14,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
-from hand_eye_calib.cli.console import as_typed, fail
+from hand_eye_calib.cli.console import Exit, as_typed, fail
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.limits import limit_memory
 from hand_eye_calib.option import did_you_mean
 from hand_eye_calib.text import shown_value
-
-EXIT_FAILED, EXIT_USAGE = 1, 2
-EXIT_INTERRUPTED = 128 + 2  # what a shell reports for SIGINT and SIGPIPE
-EXIT_BROKEN_PIPE = 128 + 13
 
 COMMANDS = {
     "calibrate": "calibrate from two trajectory files, a bag or a journal",
@@ -84,7 +80,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
         sys.stdout.flush()
         return code
     except HandEyeCalibError as error:
-        return fail(error, EXIT_USAGE if isinstance(error, ConfigError) else EXIT_FAILED)
+        return fail(error, Exit.USAGE if isinstance(error, ConfigError) else Exit.FAILED)
     except ModuleNotFoundError as error:
         name = error.name or "hand_eye_calib"
         package = name.partition(".")[0]
@@ -96,18 +92,18 @@ def exit_code_of(run: Callable[[], int]) -> int:
                 f"this needs ROS 2's Python packages ({name} is missing): source the setup file of "
                 "a ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
             )
-        return fail(text, EXIT_FAILED)
+        return fail(text)
     except BrokenPipeError:
         # Keeps the interpreter from complaining when it flushes at exit: the reader has gone.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_BROKEN_PIPE
+        return Exit.BROKEN_PIPE
     except OSError as error:
         if error.filename is None:
             raise
         name = shown_value(error.filename)
-        return fail(f"cannot use {name}: {error.strerror}; choose another", EXIT_FAILED)
+        return fail(f"cannot use {name}: {error.strerror}; choose another")
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return Exit.INTERRUPTED
 
 
 def module_of(command: str) -> ModuleType:
@@ -133,7 +129,7 @@ class CommandParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print one line on stderr and exit with code 2."""
         text = as_typed(f"{message} (see {self.prog} --help)")
-        self.exit(EXIT_USAGE, f"hand_eye_calib: error: {text}\n")
+        self.exit(Exit.USAGE, f"hand_eye_calib: error: {text}\n")
 
 
 def _run(argv: Sequence[str]) -> int:

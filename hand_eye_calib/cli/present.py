@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli.console import (
+    Exit,
     as_typed,
     fail,
     note,
@@ -32,7 +33,6 @@ from hand_eye_calib.text import (
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
 
-_EXIT_FAILED, _EXIT_NOT_ALL = 1, 3
 _WIDTH = 100
 _ROTATIONS = ("roll", "pitch", "yaw")
 
@@ -68,7 +68,7 @@ def deliver(
 
         write_report(arguments.out, calibration, snapshot, inputs)
     for one in calibration.reasons[:1] if calibration.status.failure else ():
-        fail(f"{one.sentence}; do not use this result, {one.what_to_do}", _EXIT_FAILED)
+        fail(f"{one.sentence}; do not use this result, {one.what_to_do}")
     return exit_code(calibration)
 
 
@@ -102,9 +102,9 @@ def _with_robot(
 def exit_code(calibration: Calibration) -> int:
     """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
     if calibration.status.failure:
-        return _EXIT_FAILED
+        return Exit.FAILED
     hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
-    return _EXIT_NOT_ALL if hidden or calibration.verdict is Verdict.DO_NOT_USE else 0
+    return Exit.NOT_ALL if hidden or calibration.verdict is Verdict.DO_NOT_USE else Exit.GOOD
 
 
 def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
 from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
-from hand_eye_calib.cli.reading import read_files, read_sources, refuse_recordings, source_of
+from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import json_text
@@ -28,6 +28,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
     if topics := arguments.topics:
+        from hand_eye_calib.cli.bags import read_sources, refuse_recordings, source_of
         from hand_eye_calib.io.bags import PoseBag
 
         names, sources = topics, [*map(source_of, topics)]

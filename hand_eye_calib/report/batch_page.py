@@ -11,37 +11,30 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.figure import Figure
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import printable
-from hand_eye_calib.report.figures import Drawn
+from hand_eye_calib.report.figures import UNITS, Drawn
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.style import (
     BAD,
     BAND,
     GRID,
     INK,
+    LOOK,
     MUTED,
-    WIDTH,
     as_svg,
-    new_figure,
     page_style,
 )
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
-from hand_eye_calib.text import counted, listing, with_sigma
+from hand_eye_calib.text import axes_in_words, counted, listing, with_sigma
 
 Plain = Mapping[str, Any]
 
 _AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
-_PANELS = ("x, mm", "y, mm", "z, mm", "about x, deg", "about y, deg", "about z, deg")
-_TO_SHOWN = np.repeat([1000.0, np.degrees(1.0)], 3)
-# A band of the common value in its own standard deviations.
-_BAND = 2.0
 _GRAVITY = ("bad", "warn", "good")
-# More vehicles and figures, and figures that make the page larger than so many characters, are left
-# out.
-_MOST_VEHICLES, _MOST_FIGURES, _LARGEST_PAGE = 40, 12, 1_900_000
 
 
 def render_batch(
@@ -61,8 +54,8 @@ def render_batch(
     )
     counts = Counter(cell[2] for cell in cells)
     ordered = sorted(vehicles.items(), key=lambda one: _GRAVITY.index(TONES[one[1].verdict.value]))
-    figures, left = [], _LARGEST_PAGE - len(json.dumps(cells))
-    for number, (_, result) in enumerate(ordered[:_MOST_FIGURES], start=1):
+    figures, left = [], LOOK.page - len(json.dumps(cells))
+    for number, (_, result) in enumerate(ordered[: LOOK.vehicles], start=1):
         figures.append(_trend(result, number))
         left -= len(figures[-1].svg)
         if left < 0:
@@ -74,10 +67,10 @@ def render_batch(
         counted(len(rows), "recording"),
         listing([f"{count} {verdict}" for verdict, count in counts.most_common()]),
         batch=title.rpartition("/")[2],
-        vehicles_left_out=max(0, len(ordered) - _MOST_VEHICLES),
+        vehicles_left_out=max(0, len(ordered) - LOOK.vehicles),
         vehicles=[
             (name, result, _values(row_of_result(result.to_dict())))
-            for name, result in ordered[:_MOST_VEHICLES]
+            for name, result in ordered[: LOOK.vehicles]
         ],
         figures=figures,
         rows=cells,
@@ -90,7 +83,7 @@ def _trend(result: Calibration, number: int) -> Drawn:
     """The figure of a vehicle's recordings; ``number`` is that of the vehicle on the page."""
     said = (
         "Difference of each recording from the common value along and about the parent's axes, "
-        "with its standard deviation. The band is two standard deviations of the common value. "
+        "with its standard deviation. The band is three standard deviations of the common value. "
         "Squares do not belong to the others."
     )
     title, svg = "Each recording against the common extrinsic", draw_trend(result, number)
@@ -124,11 +117,13 @@ def draw_trend(result: Calibration, number: int) -> str:
     at = np.array(date2num(dates))
     apart = np.array([bool(each.left_out) for each in recordings])
     with page_style():
-        figure = new_figure(WIDTH, 3.9)
+        figure = Figure(figsize=(LOOK.width, 3.9), layout="constrained")
         panels = figure.subplots(2, 3, sharex=True).ravel()
-        columns = zip(_AXES, panels, _PANELS, _BAND * result.sigmas, _TO_SHOWN, strict=True)
-        for axis, panel, title, band, factor in columns:
-            panel.set_title(title, loc="left")
+        for axis, panel, band in zip(_AXES, panels, LOOK.sigmas * result.sigmas, strict=True):
+            factor, _ = UNITS["x" if axis in "xyz" else "yaw"]
+            unit = "cm" if axis in "xyz" else "deg"
+            name = axes_in_words([axis]).removeprefix("the rotation ")
+            panel.set_title(f"{name}, {unit}", loc="left")
             points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
             values = np.where(np.isfinite(points), points, np.nan).T
             _draw_axis(panel, at, values, band, factor, apart)

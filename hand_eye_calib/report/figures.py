@@ -19,8 +19,8 @@ from hand_eye_calib.report.style import (
     BAD,
     CHILD,
     INK,
+    LOOK,
     PARENT,
-    WIDTH,
     as_svg,
     page_style,
     plain_decades,
@@ -30,11 +30,8 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import Residuals
 from hand_eye_calib.text import amount, angle, counted, length, listing, share
 
-# Points drawn of a line, and of dots that each stand alone.
-_MOST_ON_A_LINE, _MOST_DOTS, _MOST_OUTLIERS = 1500, 600, 300
-
 # From m and rad to the units of the figures.
-_UNITS = {"x": (100.0, "translation (cm)"), "yaw": (180 / np.pi, "rotation (deg)")}
+UNITS = {"x": (100.0, "translation (cm)"), "yaw": (180 / np.pi, "rotation (deg)")}
 
 _WHAT_COINCIDES = {
     "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
@@ -128,13 +125,13 @@ def _figure(
     """A figure with its panels; margins are given in inches, because measuring the text takes more
     time than all else.
     """
-    figure = Figure(figsize=(WIDTH, height))
+    figure = Figure(figsize=(LOOK.width, height))
     right, between = 0.12, 0.15
-    width = (WIDTH - left - right - gap * (columns - 1)) / columns
+    width = (LOOK.width - left - right - gap * (columns - 1)) / columns
     tall = (height - top - bottom - between * (rows - 1)) / rows
     spacing = {
-        "left": left / WIDTH,
-        "right": 1 - right / WIDTH,
+        "left": left / LOOK.width,
+        "right": 1 - right / LOOK.width,
         "bottom": bottom / height,
         "top": 1 - top / height,
         "wspace": gap / width,
@@ -147,7 +144,7 @@ def _figure(
 @page_style()
 def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     tracks = evidence
-    shown = _downsample(len(tracks.times_s), _MOST_ON_A_LINE)
+    shown = _downsample(len(tracks.times_s), LOOK.points)
     factor, unit = _time_axis(tracks.times_s[-1])
     # A camera moves in its x and z: x and y would be a view from the side.
     across = int(np.argmin(np.ptp(tracks.parent, axis=0)))
@@ -207,7 +204,7 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
     height = 1.0 + 1.6 * len(sizes)
     figure, panels = _figure(height, len(sizes), 1, left=0.7, bottom=0.8, top=0.1, sharex=True)
     for panel, (name, values) in zip(panels, sizes.items(), strict=True):
-        to_unit, of_axis = _UNITS[name]
+        to_unit, of_axis = UNITS[name]
         _draw_residuals(panel, times, np.maximum(values * to_unit, 1e-5), is_out)
         panel.set_ylabel(of_axis)
     panels[-1].set_xlabel(label)
@@ -234,8 +231,8 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
 def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:
     """Sizes (K,) of residuals, above zero, and which were rejected."""
     dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
-    dots = dots[_downsample(len(dots), _MOST_DOTS)]
-    crosses = crosses[np.argsort(-values[crosses])[:_MOST_OUTLIERS]]
+    dots = dots[_downsample(len(dots), LOOK.points)]
+    crosses = crosses[np.argsort(-values[crosses])[: LOOK.points]]
     used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
     rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
     panel.plot(times[dots], values[dots], "o", **used)

@@ -15,20 +15,16 @@ from hand_eye_calib.report.style import (
     CHILD,
     GREEN,
     INK,
+    LOOK,
     MUTED,
     PARENT,
-    WIDTH,
     page_style,
     plain_label,
 )
 from hand_eye_calib.results.calibration import Calibration
 
 # The three views: which axes of the parent go across and up, and what that is on a vehicle.
-_VIEWS = ((0, 1, "from above"), (0, 2, "from the side"), (1, 2, "from behind"))
-# Of the distance between the sensors: axes of a sensor, the smallest ellipse that can be seen. And
-# the least distance (m).
-_AXIS, _SEEN, _LEAST = 0.22, 0.06, 0.05
-_SIGMAS = 3.0
+_VIEWS = {"xy": "from above", "xz": "from the side", "yz": "from behind"}
 
 
 class ShownFigure(Figure):
@@ -58,7 +54,7 @@ def plot(calibration: Calibration) -> Figure:
     >>> hec.plot(result).savefig("result.png")
     """
     with page_style(figure_facecolor="white", savefig_facecolor="white"):
-        figure = ShownFigure(figsize=(WIDTH, 3.3), layout="constrained")
+        figure = ShownFigure(figsize=(LOOK.width, 3.3), layout="constrained")
         FigureCanvasAgg(figure)
         draw_views(figure.subplots(1, 3), calibration)
         figure.suptitle(calibration.headline, fontsize=8, fontweight="bold", wrap=True)
@@ -73,7 +69,7 @@ def said_of_views(*calibrations: Calibration) -> str:
     larger = _enlarged(calibrations)
     text = "Axes of all sensors: x red, y green, z blue."
     if known.any():
-        text += f" Ellipse: {_SIGMAS:g} standard deviations of the position"
+        text += f" Ellipse: {LOOK.sigmas:g} standard deviations of the position"
         text += f", drawn {larger:,.0f} times as large." if larger > 1 else "."
     if not known.all():
         unknown = [axis for axis, each in zip("xyz", known.T, strict=True) if not each.all()]
@@ -85,9 +81,9 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
     """Draw three views into three panels: of the parent sensor, and of the child sensors of one or
     several results in its frame.
     """
-    axis_m = _AXIS * _extent(calibrations)
-    for panel, (across, up, title) in zip(panels, _VIEWS, strict=True):
-        seen = [across, up]
+    axis_m = LOOK.axis * _extent(calibrations)
+    for panel, (axes, title) in zip(panels, _VIEWS.items(), strict=True):
+        seen = ["xyz".index(axis) for axis in axes]
         _draw_sensor(panel, np.eye(4)[seen], calibrations[0].parent_frame, PARENT, axis_m, 6)
         for calibration in calibrations:
             T = calibration.T_parent_child
@@ -100,7 +96,7 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
                 covariance = R @ calibration.covariance_with_floor[:3, :3] @ R.T
                 values, vectors = np.linalg.eigh(covariance)
                 wide, high = (
-                    2 * _SIGMAS * _enlarged(calibrations) * np.sqrt(np.maximum(values, 0.0))
+                    2 * LOOK.sigmas * _enlarged(calibrations) * np.sqrt(np.maximum(values, 0.0))
                 )
                 turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
                 ellipse = Ellipse((at[0], at[1]), wide, high, angle=turned, color=CHILD, alpha=0.3)
@@ -109,7 +105,7 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
             for line, fixed, known in zip(lines, at[::-1], is_known, strict=True):
                 if not known:
                     line(fixed, color=CHILD, ls="--", lw=1.0)
-        panel.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", title=title)
+        panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.3)
 
@@ -129,13 +125,13 @@ def _draw_sensor(
 
 def _extent(calibrations: Sequence[Calibration]) -> float:
     distances = [float(np.linalg.norm(each.translation)) for each in calibrations]
-    return max(*distances, _LEAST)
+    return max(*distances, LOOK.least_m)
 
 
 def _enlarged(calibrations: Sequence[Calibration]) -> float:
     """How many times as large the ellipses are drawn, to be seen: 1, 2, 5, 10 ..."""
     sigmas = np.array([each.sigmas_with_floor[:3] for each in calibrations])
-    widest = _SIGMAS * float(np.max(sigmas[np.isfinite(sigmas)], initial=0.0))
-    wanted = _SEEN * _extent(calibrations) / max(widest, 1e-9)
+    widest = LOOK.sigmas * float(np.max(sigmas[np.isfinite(sigmas)], initial=0.0))
+    wanted = LOOK.seen * _extent(calibrations) / max(widest, 1e-9)
     steps = [step * 10**power for power in range(6) for step in (1, 2, 5)]
     return float(next((step for step in steps if step >= wanted), steps[-1]))

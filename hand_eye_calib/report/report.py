@@ -21,6 +21,7 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import figures_of
+from hand_eye_calib.report.style import LOOK
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
@@ -58,12 +59,8 @@ _WORDS = {
 _AXIS_NAMES = {axis: f"along {axis}" for axis in TRANSLATIONS}
 _AXIS_NAMES |= {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "about z (yaw)"}
 
-# A bar reaches from a thousandth of the target to ten times the target, by its logarithm.
-_BAR_DECADES, _BAR_ABOVE = 4.0, 1.0
-
 # Names of sensors that came without one.
 _NAMELESS = ("parent_sensor", "child_sensor")
-_DISTANCE_M = 10.0
 # Figures for whoever uses the result; the others are evidence for whoever doubts it.
 _SHOWN_FIRST = ("views", "trajectories")
 
@@ -156,12 +153,13 @@ def _at_distance(calibration: Calibration) -> str:
     if not np.isfinite(calibration.sigmas).all():
         return ""
     errors = []
-    for point in _DISTANCE_M * np.eye(3):
+    for point in LOOK.distance_m * np.eye(3):
         J = np.hstack([np.eye(3), -se3.skew(point)])
         errors.append(np.linalg.eigvalsh(J @ calibration.covariance_with_floor @ J.T)[-1])
+    child = printable(calibration.child_frame)
     return (
-        f"An object {_DISTANCE_M:.0f} m from {printable(calibration.child_frame)} is misplaced by "
-        f"up to {length(float(np.sqrt(max(errors))))} (one standard deviation, constant odometry "
+        f"An object {LOOK.distance_m:.0f} m from {child} is misplaced by up to "
+        f"{length(float(np.sqrt(max(errors))))} (one standard deviation, constant odometry "
         "errors included)."
     )
 
@@ -216,7 +214,8 @@ def _bar(ratio: float) -> float:
         return 1.0
     if not np.isfinite(ratio):
         return 100.0
-    return float(np.clip(100 * (1 - (_BAR_ABOVE - math.log10(ratio)) / _BAR_DECADES), 1, 100))
+    decades = LOOK.bar_above - math.log10(ratio)
+    return float(np.clip(100 * (1 - decades / LOOK.bar_decades), 1, 100))
 
 
 # ---------------------------------------------------------------- data and provenance

@@ -8,11 +8,10 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
@@ -33,7 +32,34 @@ _VARIABLES = {
     GREEN: "good",
 }
 
-WIDTH = 8.6  # inches; a page shows them at about 96 pixels an inch
+
+class Look(NamedTuple):
+    """Sizes of pages and their figures.
+
+    width : of a figure, inches; a page shows them at about 96 pixels an inch.
+    sigmas : standard deviations that an ellipse or a band reaches to.
+    axis, seen : length of a sensor's axes, and of the smallest ellipse that can be seen, in shares
+        of the distance between the sensors. least_m : the least such distance, m.
+    distance_m : of the object whose error is told, m.
+    bar_decades, bar_above : powers of ten that a bar reaches over, and over its target.
+    points : most points drawn of a line, and of dots that each stand alone.
+    vehicles, page : most vehicles on the page of a batch, and characters of it with their figures.
+    """
+
+    width: float = 8.6
+    sigmas: float = 3.0
+    axis: float = 0.22
+    seen: float = 0.06
+    least_m: float = 0.05
+    distance_m: float = 10.0
+    bar_decades: float = 4.0
+    bar_above: float = 1.0
+    points: int = 1000
+    vehicles: int = 20
+    page: int = 1_900_000
+
+
+LOOK = Look()
 
 _INK = ("text.color", "axes.labelcolor", "axes.titlecolor", "xtick.labelcolor", "ytick.labelcolor")
 _SMALL = ("xtick.labelsize", "ytick.labelsize", "legend.fontsize")
@@ -74,13 +100,6 @@ def page_style(**more: Any) -> Iterator[None]:
         # Text is drawn by the browser, with its own fonts.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """A figure of so many inches, laid out by itself."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def plain_decades(axis: Axis, marks: Sequence[float] = (1,)) -> None:
