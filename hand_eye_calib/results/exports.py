@@ -265,10 +265,10 @@ def export_text(result: Result, name: str, headline: str, is_usable: bool) -> st
     if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
     lines = [
-        f"{name}, by hand_eye_calib {package_version()}. {headline}",
+        f"{name}, by hand_eye_calib {package_version()}. {headline}.",
         f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
-        f"Clocks: t({result.parent_frame}) = t({result.child_frame}) + "
-        f"{_number(result.time_offset_s)} s, "
+        f"Clocks: t({result.parent_frame}) = t({result.child_frame}) "
+        f"{'-' if result.time_offset_s < 0 else '+'} {_number(abs(result.time_offset_s))} s, "
         + ("estimated." if result.time_offset_sigma_s else "given, not estimated."),
     ]
     if is_inverted:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -260,6 +261,28 @@ def test_the_parsers_of_others_read_the_same(tmp_path):
     np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-9)
 
 
+def test_urdf_and_colmap_read_the_same(tmp_path):
+    """With yourdfpy and pycolmap, which are too large to be installed for this alone."""
+    yourdfpy = pytest.importorskip("yourdfpy")
+    calibration = result("base_link", "camera")
+    save_result(calibration, tmp_path)
+    joint = (tmp_path / "extrinsic.urdf.xacro").read_text()
+    links = '<link name="base_link"/><link name="camera"/>'
+    path = tmp_path / "robot.urdf"
+    path.write_text(joint.replace("<robot", '<robot name="r"').replace("<joint", links + "<joint"))
+    T = yourdfpy.URDF.load(str(path)).get_transform("camera", "base_link")
+    np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-9)
+
+    pycolmap = pytest.importorskip("pycolmap")
+    path = tmp_path / "rig_config.json"
+    path.write_text(calibration.export("colmap"))
+    (rig,) = pycolmap.read_rig_config(path)
+    parent, child = rig.cameras
+    assert (parent.ref_sensor, parent.image_prefix) == (True, "base_link")
+    T = child.cam_from_rig.matrix()
+    np.testing.assert_allclose(T, calibration.T_child_parent[:3], atol=1e-9)
+
+
 def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):
     save_result(result("imu", "camera"), tmp_path / "result")
     assert main(["info", str(tmp_path / "result"), "--as", "kalibr"]) == 0
@@ -269,3 +292,56 @@ def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):
     command = ["compare", str(tmp_path / "result"), "--with", str(tmp_path / "camchain.yaml")]
     assert main(command) == 0
     assert "same" in capsys.readouterr().out
+
+
+# ---- the pages
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "exports"
+CAMERA = se3.from_rotation_translation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.12, 0.05, 0.3])
+LIDAR = se3.from_rotation_translation([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.12, 0.05, 0.3])
+# Frames of each page's example.
+PAGES = {
+    "autoware": ("sensor_kit_base_link", "velodyne_top", LIDAR),
+    "lidar_inertial": ("imu_link", "lidar", LIDAR),
+    "visual_inertial": ("imu_link", "cam0", CAMERA),
+    "px4": ("base_link", "vio", CAMERA),
+    "vehicles": ("velodyne", "cam0", CAMERA),
+    "vision": ("tool0", "camera", CAMERA),
+}
+SHOWN = re.compile(r"(--as (\w+)\n```\n\n```\w+\n)(.*?)```", re.DOTALL)
+
+
+def shown(page):
+    """The page with what the program writes in place of its block."""
+    parent, child, T = PAGES[page.stem]
+    calibration = good_calibration(
+        parent_frame=parent,
+        child_frame=child,
+        T_parent_child=T,
+        time_offset_s=-0.0125 if page.stem == "px4" else 0.0125,
+        time_offset_sigma_s=0.0002,
+    )
+    text, count = SHOWN.subn(
+        lambda found: f"{found[1]}{calibration.export(found[2])}```", page.read_text()
+    )
+    assert count == 1
+    return text
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
+def test_pages_show_what_the_program_writes(page):
+    version = re.compile(r"(?<=by hand_eye_calib )[\w.+]+(?=\. )")
+    assert version.sub("", page.read_text()) == version.sub("", shown(page))
+
+
+def test_every_format_is_on_a_page():
+    pages = {page.stem: page.read_text() for page in DOCS.glob("*.md")}
+    assert pages.keys() == PAGES.keys()
+    rows = re.findall(r"(?m)^\| (\w+) \|", "".join(pages.values()))
+    assert {*rows, "autoware", "px4"} - {"Format"} == {*FORMATS}
+    assert all("**If it is inverted**" in text for text in pages.values())
+
+
+if __name__ == "__main__":
+    for each in DOCS.glob("*.md"):
+        each.write_text(shown(each))
