@@ -56,9 +56,9 @@ _SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
 _SCATTER_OF_VEHICLE = np.repeat([0.020, np.radians(0.10)], 3)
 _VEHICLE = 4.0
 
-# Standard deviations (m, rad) that stand for "nothing known", and share from which on one does.
+# Standard deviations (m, rad) that stand for "nothing known", and from which on one does.
 UNKNOWN = np.sqrt(np.r_[np.full(3, 100.0), np.full(3, 10.0)])
-_UNKNOWN_SHARE = 0.1
+UNKNOWN_FROM = 0.1 * UNKNOWN
 
 # Log odds beyond these are certain.
 _CERTAIN = 50.0
@@ -175,7 +175,7 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
     chi2 = float(values @ np.linalg.solve(covariance, values))
-    sigmas = np.where(sigmas > _UNKNOWN_SHARE * UNKNOWN, np.inf, sigmas)
+    sigmas = np.where(sigmas > UNKNOWN_FROM, np.inf, sigmas)
     visible = (LARGEST_OF_SIX + NINE_TIMES_OUT_OF_TEN) * sigmas
     verdicts = tuple(
         Change.MOVED if ratio > LARGEST_OF_SIX else Change.SAME if seen else Change.CANNOT_TELL

@@ -25,10 +25,10 @@ from hand_eye_calib.results.records import AxisScatter, CrossCheck
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import MEDIAN_NORMAL, median
 
-# A result is compared with the method that takes least time, at these baselines, from at most so
-# many poses; the halves of a result without a baseline are solved at the last but one.
-_METHOD, _BASELINES, _MOST_POSES = "dnlo", (1, 3, 8, 20), 3_000
-_MIN_POSES = 20
+# A result is compared with the method that takes least time, at these baselines, from at most and
+# at least so many poses; the halves of a result without a baseline are solved at the last but one.
+_METHOD = "dnlo"
+_BASELINES, _MOST_POSES, _MIN_POSES = (1, 3, 8, 20), 3_000, 20
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3

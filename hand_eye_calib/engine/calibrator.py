@@ -5,6 +5,7 @@ files.
 """
 
 import contextlib
+from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -71,14 +72,19 @@ class StreamStatistics:
     last_stamp_ns: int | None = None
 
 
+# Numbers of a pose.
+_WIDTH = 7
+
+
 class _PoseBuffer:
     """Poses of one sensor, in order of their stamps; the name of its frame, empty until it is
     known; and its statistics.
     """
 
     def __init__(self) -> None:
-        self.stamps_ns: list[int] = []
-        self._poses: list[tuple[float, ...]] = []  # x y z qx qy qz qw
+        # Arrays of Python take poses one by one as fast as lists, and become NumPy's at once.
+        self.stamps_ns = array("q")
+        self._poses = array("d")  # x y z qx qy qz qw
         self._dropped_until_ns = -(2**63)
         self.frame = ""
         self.statistics = StreamStatistics()
@@ -92,11 +98,11 @@ class _PoseBuffer:
         if stamp_ns <= self._dropped_until_ns:
             counts.refused_late += 1
             return False
-        if self.stamps_ns[index : index + 1] == [stamp_ns]:
+        if index < len(self) and self.stamps_ns[index] == stamp_ns:
             counts.refused_duplicate += 1
             return False
         self.stamps_ns.insert(index, stamp_ns)
-        self._poses.insert(index, pose)
+        self._poses[_WIDTH * index : _WIDTH * index] = array("d", pose)
         counts.received += 1
         first_ns, last_ns = counts.first_stamp_ns, counts.last_stamp_ns
         counts.first_stamp_ns = stamp_ns if first_ns is None else min(first_ns, stamp_ns)
@@ -110,7 +116,7 @@ class _PoseBuffer:
     def trajectory(self, until_ns: int = 2**63) -> Trajectory:
         """The poses up to a stamp, and the ones after it that interpolation up to it looks at."""
         end = bisect_right(self.stamps_ns, until_ns) + REACH
-        poses = np.array(self._poses[:end]).reshape(-1, 7)
+        poses = np.array(self._poses[: _WIDTH * end]).reshape(-1, _WIDTH)
         stamps_ns = np.array(self.stamps_ns[:end], dtype=np.int64)
         return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
 
@@ -120,7 +126,7 @@ class _PoseBuffer:
         """
         split = max(bisect_right(self.stamps_ns, until_ns) - REACH, 0)
         self.statistics.dropped_unpaired += split * unpaired
-        del self.stamps_ns[:split], self._poses[:split]
+        del self.stamps_ns[:split], self._poses[: _WIDTH * split]
         self._dropped_until_ns = until_ns
 
 

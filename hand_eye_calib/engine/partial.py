@@ -42,8 +42,8 @@ _SUSPECT_PATH, _UNRELATED_PATH, _UNRELATED_ROTATION = 0.1, 0.3, 0.5
 # quantile of their angles above which they count.
 _SPAN, _TURNING = 10, 0.75
 
-# Rates in another unit are off by this factor, within a share of it.
-_DEGREES, _UNIT_WITHIN = float(np.degrees(1.0)), 0.2
+# Rates in degrees instead of radians are off by that factor, within this share of it.
+_UNIT_WITHIN = 0.2
 
 # Where the frame of an odometry is, and where an antenna or a prism measures, is known to this (m)
 # along each axis.
@@ -246,10 +246,10 @@ def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, .
         max(float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING)), 1e-12)
         for Ts in (steps.Ts_parenti_parentj, steps.Ts_childi_childj)
     )
-    stream, ratio = "child", of_child / of_parent
+    stream, ratio, degrees = "child", of_child / of_parent, float(np.degrees(1.0))
     if config.child_measures != "rates":
         stream, ratio = "parent", of_parent / of_child
-    if min(abs(ratio / _DEGREES - 1.0), abs(ratio * _DEGREES - 1.0)) >= _UNIT_WITHIN:
+    if min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0)) >= _UNIT_WITHIN:
         return ()
     unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
     return (finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as),)

@@ -12,7 +12,7 @@ from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity, finding, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.snapshot import CONVENTIONS, Snapshot
+from hand_eye_calib.engine.snapshot import CONVENTIONS, MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -26,12 +26,9 @@ Options: TypeAlias = Mapping[str, Any]
 _MENDED = ("time_offset", "scale", "units")
 _REPAIRS = (*CONVENTIONS["parent"], *CONVENTIONS["child"])
 
-# A model's own time offset moves poses along their velocities. From this one (s) on, poses are
-# paired anew instead; positions alone later, as their model knows the offset better than speeds do.
-_MOST_MOVED_S, _MOST_MOVED_POSITIONS_S = 0.003, 0.05
-
-# A time offset (s) that is used, but not without a warning, unless somebody asked for it.
-_UNASKED_S = 1.0
+# Positions alone are paired anew from this offset (s) on: their model knows it better than speeds
+# do.
+_MOST_MOVED_POSITIONS_S = 0.05
 
 # Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
 # model holds, and less if there is no noise.
@@ -108,7 +105,7 @@ def review(
         left_s = clock.largest_s(snapshot.child.duration_s)
         if clock.spread_s < 0.5 * left_s:
             moved_s = max(abs(moved_s), left_s - 0.5 * clock.spread_s)
-    most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else _MOST_MOVED_S
+    most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else MOST_MOVED_S
     if "time_offset" not in given and abs(moved_s) >= most_s:
         options = {"time_offset": "estimate", **options}
     second = _improved(first, options, by=least)
@@ -204,7 +201,7 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     )
     warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
     calibration = replace(found.calibration, warnings=warnings)
-    if "time_offset" in options and abs(offset_s) > _UNASKED_S:
+    if "time_offset" in options and abs(offset_s) > UNASKED_S:
         sizes: dict[str, Any] = {
             "offset_s": offset_s,
             "size_s": abs(offset_s),

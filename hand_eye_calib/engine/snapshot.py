@@ -28,9 +28,9 @@ CONVENTIONS = {
 # Options that have no meaning for streams that are no poses but with these values.
 _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
 
-# A time offset (s) of positions or rotations is used if it is closer than this to the one that they
-# were paired with; they are paired anew if it is farther away than this.
-_BELIEVABLE_S, _NEGLIGIBLE_S = 1.0, 0.005
+# An offset (s) that a model finds moves poses along their velocities: from this one on, they are
+# paired anew instead. One that nobody asked for is not taken without doubt from that one on.
+MOST_MOVED_S, UNASKED_S = 0.003, 1.0
 
 # Pose pairs of whole trajectories that are used unless an option says otherwise: the noise model
 # takes 8 kB for each, and hours at ten a second hold as many.
@@ -176,9 +176,9 @@ class Snapshot:
         estimate = estimate_lever_arm if of_positions else estimate_rotation
         result = estimate(self.pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, float(self.config.time_offset)
-        if not abs(found_s - given_s) < _BELIEVABLE_S:
+        if not abs(found_s - given_s) < UNASKED_S:
             return replace(result, time_offset_s=given_s)
-        if len(self.kept) or not abs(found_s - given_s) > _NEGLIGIBLE_S:
+        if len(self.kept) or not abs(found_s - given_s) > MOST_MOVED_S:
             return result
         # Interpolated where the other stream has its poses, rather than moved along its velocity.
         config = replace(self.config, time_offset=found_s)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.log import ONCE_S, NodeLog
+from hand_eye_calib.live.log import GOES_ON_S, ONCE_S, NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
 from hand_eye_calib.live.state import (
@@ -32,9 +34,6 @@ from hand_eye_calib.session.goal import Goal
 
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
-
-# The line about the result, and the sentence that says what to do now, are logged so often (s).
-_SAID_EVERY_S = 60.0
 
 # The streams are checked at most this often (s), which costs a second or two each time.
 _CHECK_PERIOD_S = 30.0
@@ -126,8 +125,6 @@ class SolveCycle:
     result : Calibration or None
         The session's result, which is told, published, saved and broadcast: the newest usable one;
         once the goal is reached, the one kept, whose warnings say why the newest is not.
-    snapshot : Snapshot or None
-        The poses and options that gave that result.
     """
 
     def __init__(
@@ -152,7 +149,7 @@ class SolveCycle:
     def restart(self) -> None:
         """Begin a new session: no result yet."""
         self.result: Calibration | None = None
-        self.snapshot: Snapshot | None = None
+        self._solved: tuple[Calibrator, dict[str, Any]] | None = None
         self._solved_at_s = 0.0
         self._seen = NO_MOTION
         self._failure: Failure | None = None
@@ -167,6 +164,13 @@ class SolveCycle:
         self.goal = Goal(targets)
         self._certain, self._told = {}, ()
         self._is_unchecked, self._check_due_s = True, 0.0
+
+    def snapshot(self) -> Snapshot | None:
+        """The poses and options that gave the result; None without one."""
+        if self._solved is None:
+            return None
+        calibrator, certain = self._solved
+        return with_options(calibrator.snapshot(), certain)
 
     # ------------------------------------------------------------------ solving
 
@@ -210,7 +214,7 @@ class SolveCycle:
         self._asked_in_flight, self._asked = self._asked, []
         if check := self._must_check(now_s):
             self._is_unchecked, self._check_due_s = False, now_s + _CHECK_PERIOD_S
-        self._submitted = self._session.calibrator.snapshot()
+        self._submitted = deepcopy(self._session.calibrator)
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
 
     # ------------------------------------------------------------------ answers
@@ -250,7 +254,7 @@ class SolveCycle:
         progress = self.goal.add(newest, self._seen, self.checks.faults())
         result = self.goal.best or newest
         if result is newest:
-            self.snapshot = with_options(self._submitted, self._certain)
+            self._solved = self._submitted, self._certain
         else:
             kept = f"kept is the result of {result.n_poses} poses, as the newest is worse"
             told = (*result.warnings, f"{kept}: {describe(newest)}")
@@ -259,11 +263,11 @@ class SolveCycle:
         self._publish(self.result)
         if not progress.is_faulty and progress.sentence:
             write = self._log.warning if progress.will_not_get_there else self._log.info
-            write(progress.sentence, _SAID_EVERY_S, key=f"now {progress.done}")
-        every_s = _SAID_EVERY_S if progress.done == was_done else 0.0
+            write(progress.sentence, GOES_ON_S, key=f"now {progress.done}")
+        every_s = GOES_ON_S if progress.done == was_done else 0.0
         return self.result.status is SolveStatus.OK, self._say(self.result, every_s)
 
-    def _say(self, calibration: Calibration, every_s: float = _SAID_EVERY_S) -> str:
+    def _say(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
         """A line about a calibration with its reasons and warnings. What is new of that is logged:
         the reasons once the motion has had its chance, as the progress says what to do before.
         """

@@ -12,15 +12,12 @@ from hand_eye_calib.io.bags.messages import measured_as
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.stamp_guard import Judgement, StampGuard
+from hand_eye_calib.live.stamp_guard import SILENT_AFTER_S, Judgement, StampGuard
 from hand_eye_calib.live.state import InputState, Level
-
-# An input without a message for so long is silent, and a bad message is reported for so long (s).
-_SILENT_AFTER_S, _BAD_INPUT_FOR_S = 2.0, 10.0
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
-# Reports (one a second) over which rates and shares are taken.
+# Reports, one a second, over which rates and shares are taken, and a bad message is reported.
 _REPORTS = 10
 
 
@@ -169,7 +166,7 @@ class PoseInput:
 
     def is_silent(self, steady_s: float) -> bool:
         """Whether messages have come, but not lately."""
-        return self._arrived_s is not None and steady_s - self._arrived_s > _SILENT_AFTER_S
+        return self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
         """What has come in; to be called once a second. ``may_rest`` if silence is nothing to look
@@ -199,7 +196,7 @@ class PoseInput:
         if self._arrived_s is None:
             text = f"no message on {self.topic} yet"
             return Level.WARN, ": ".join(filter(None, [text, self.problem]))
-        if steady_s - self._bad_at_s < _BAD_INPUT_FOR_S:
+        if steady_s - self._bad_at_s < _REPORTS:
             return Level.ERROR, f"{self.topic}: {self._bad}"
         if self.is_silent(steady_s):
             text = f"{self.topic} has been silent for {steady_s - self._arrived_s:.0f} s"

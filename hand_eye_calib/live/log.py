@@ -9,6 +9,9 @@ from hand_eye_calib.errors import printable
 # A warning or an error is written once for each reason: in a session, and in so many seconds.
 ONCE_S = 1800.0
 
+# What goes on, such as a result that becomes better, is written so often (s).
+GOES_ON_S = 60.0
+
 _NUMBERS = re.compile(r"[\d.,+-]+")
 
 

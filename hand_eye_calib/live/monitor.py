@@ -21,6 +21,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment.floor import floor_of_pairs
 from hand_eye_calib.assessment.moved import (
+    UNKNOWN_FROM,
     log_ratio,
     most_likely,
     noise_covariance,
@@ -37,61 +38,71 @@ from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.status import AXES
-from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
+from hand_eye_calib.session.compare import SEEN_TARGETS
+from hand_eye_calib.stats import LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN, student_weights
 from hand_eye_calib.text import amount, axes_in_words, listing
 
-# Log likelihood ratio from which on the mount has moved.
-THRESHOLD = 10.0
 
-# Motions over this time (ns) are compared, at most one in each of these steps.
-_LAG_NS, _STEP_NS, _SECOND_NS = 1_000_000_000, 100_000_000, 1_000_000_000
-_MOST_LATE = 1.5
+@dataclass(frozen=True)
+class Tuning:
+    """Numbers of the search; times are seconds of motion unless it is said."""
 
-# A second counts if the sensors move by this much within it (m, rad), and by so many times the
-# noise of the rotation.
-_LEAST_MOTION, _LEAST_ROTATION, _LEAST_OF_NOISE = 0.05, float(np.radians(1.5)), 3.0
+    # Log likelihood ratio from which on the mount has moved.
+    threshold: float = 10.0
+    # Motions over a second are compared, and not those that took so many times as long; at most one
+    # begins in each of these steps (ns).
+    most_late: float = 1.5
+    step_ns: int = 100_000_000
+    # A second counts if the sensors move by this much within it (m, rad), and by so many times the
+    # noise of the rotation.
+    least_motion_m: float = 0.05
+    least_rotation_rad: float = float(np.radians(1.5))
+    least_of_noise: float = 3.0
+    # The noise is learned from so many seconds before anything is judged; so many are kept.
+    learning_s: int = 120
+    memory_s: int = 1200
+    # Shortest time over which a shift is looked for: longer than the motions, so that one jump of a
+    # trajectory is no shift. And how many times there are up to those that are kept.
+    shortest_s: int = 3
+    lags: int = 16
+    # Time over which the noise is followed, and over which older motion is forgotten.
+    noise_memory_s: float = 900.0
+    old_memory_s: float = 20_000.0
+    # Factor on the variances that the installed extrinsic states; how much of the common-mode error
+    # differs from hour to hour (one standard deviation, as a share).
+    caution: float = 2.0
+    wander: float = 0.25
+    # Standard deviation of the child's scale in a second. A scale that drifts by 0.5 % is wrong for
+    # a minute; as errors that are new in each second, that is sqrt(60) times as much.
+    scale_sigma: float = 0.04
+    # Windows (s) whose scores show the long-run variance, which is taken anew every so many
+    # seconds. What is assumed of it beforehand counts as much as so many windows, and fewer say
+    # nothing. A shift spoils some: none counts for more than so many times the typical one.
+    windows_s: tuple[int, ...] = (10, 30, 90, 240)
+    long_run_every_s: int = 10
+    assumed: float = 10.0
+    assumed_windows: int = 4
+    most_of_typical: float = 20.0
+    # Share of the information of the shifts that are looked for, without which a shift may be
+    # anything.
+    ridge: float = 1e-3
+    # What can be seen is told for a session of so many seconds.
+    session_s: float = 600.0
 
-# Seconds of motion from which the noise is learned before anything is judged; those that are kept
-# for the longest lag; lags, each 1.5 times the one before. The shortest is longer than the motions,
-# so that one jump of a trajectory is no shift.
-LEARNING_S, MEMORY_S = 120, 1200
-_LAGS = np.unique(np.round(np.geomspace(3, MEMORY_S, 16)).astype(int))
+
+TUNING = Tuning()
+
+_LAGS = np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags).round().astype(int)
+_SECOND_NS = 1_000_000_000
 
 # What a knock may be: a translation, a rotation, both. A knock that only turns the sensor shows
 # sooner against the second.
 _KNOCKS = np.array([shift_covariance(radians=1e-6), shift_covariance(1e-6), shift_covariance()])
 
-# Time over which the noise is followed, and over which older motion is forgotten, in seconds of
-# motion.
-_NOISE_MEMORY_S, _OLD_MEMORY_S = 900.0, 20_000.0
-
-# Factor on the variances that the installed extrinsic states; how much of the common-mode error
-# differs from hour to hour (one standard deviation, as a share).
-_CAUTION, _WANDER = 2.0, 0.25
-
-# Standard deviation of the child's scale in a second. A scale that drifts by 0.5 % is wrong for a
-# minute; as errors that are new in each second, that is sqrt(60) times as much.
-_SCALE_SIGMA = 0.04
-
-# Windows (seconds of motion) whose scores show the long-run variance; fewer of them say nothing.
-# What is assumed of it beforehand counts as much as so many windows. It is taken anew every so many
-# seconds. A shift spoils some windows: none counts for more than so many times the typical one.
-_WINDOWS, _FEWEST_WINDOWS = (10, 30, 90, 240), 4
-_ASSUMED, _ASSUMED_WINDOWS = 10.0, 4.0
-_LONG_RUN_EVERY = 10
-_MOST_OF_TYPICAL = 20.0
-# Share of the information of the shifts that are looked for, without which a shift may be anything.
-_RIDGE = 1e-3
-
 # Of the session that is watched, poses are paired soon, and few are kept.
 LIMITS = BufferLimits(
     capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
 )
-
-# A shift is told from this many standard deviations on. An axis is watched if ten minutes of motion
-# would show a change of so many targets; changes of m or rad beyond these are as good as nothing.
-_CLEARLY, _TARGETS, _LONG_S = 3.0, 5.0, 600.0
-_UNKNOWN = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +125,7 @@ class Alarm:
             for axis, shift, sigma, ratio in zip(
                 AXES, self.shift.tolist(), self.sigmas.tolist(), ratios, strict=True
             )
-            if ratio >= min(_CLEARLY, ratios.max())
+            if ratio >= min(LARGEST_OF_SIX, ratios.max())
         ]
         since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="seconds")
         return f"the mount has moved: {listing(told)}, since about {since}"
@@ -141,7 +152,7 @@ class MountMonitor:
 
     def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
         self._installed = np.asarray(T_parent_child, dtype=float)
-        self._covariance = _CAUTION * np.asarray(covariance, dtype=float)
+        self._covariance = TUNING.caution * np.asarray(covariance, dtype=float)
         self._wander = np.zeros((6, 6))
         self._to_parent = np.kron(np.eye(2), self._installed[:3, :3])
         self._noise: FloatArray | None = None
@@ -157,7 +168,7 @@ class MountMonitor:
         self._motions_per_s = 0.0
         self.alarm: Alarm | None = None
         self.seconds = 0
-        self.long_run = _ASSUMED
+        self.long_run = TUNING.assumed
 
     def add(self, pose_pairs: PosePairs) -> Alarm | None:
         """Take the poses that follow those before.
@@ -191,18 +202,18 @@ class MountMonitor:
         """Motions over a second that end in these poses, by the second in which they begin."""
         if len(self._tail) and len(pose_pairs):
             late_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
-            if not 0 < late_ns <= _MOST_LATE * _LAG_NS:
+            if not 0 < late_ns <= TUNING.most_late * _SECOND_NS:
                 self._tail = PosePairs.empty()
         poses = PosePairs.concatenate(self._tail, pose_pairs)
-        poses = poses[np.unique(poses.stamps_ns // _STEP_NS, return_index=True)[1]]
+        poses = poses[np.unique(poses.stamps_ns // TUNING.step_ns, return_index=True)[1]]
         stamps_ns, seconds = poses.stamps_ns, poses.stamps_ns // _SECOND_NS
-        j = np.searchsorted(stamps_ns, stamps_ns + _LAG_NS)
+        j = np.searchsorted(stamps_ns, stamps_ns + _SECOND_NS)
         # A second is complete once a motion of the next one has its end.
         has_end = j < len(stamps_ns)
         under_way = int(seconds[has_end][-1]) if has_end.any() else -1
         self._tail = poses[seconds >= under_way]
         i = np.flatnonzero(has_end & (seconds < under_way) & (seconds > self._last_s))
-        i = i[stamps_ns[j[i]] - stamps_ns[i] <= _MOST_LATE * _LAG_NS]
+        i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.most_late * _SECOND_NS]
         self._last_s = max(self._last_s, under_way - 1)
         pairs, of_pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i]), seconds[i]
         return [
@@ -212,7 +223,7 @@ class MountMonitor:
     def _learn(self, stamp_ns: int, motions: MotionPairs) -> None:
         """Collect motions; once there are enough, learn the noise about their own answer."""
         self._learning.append((stamp_ns, motions))
-        if len(self._learning) < LEARNING_S:
+        if len(self._learning) < TUNING.learning_s:
             return
         learned, self._learning = self._learning, []
         found = [residuals_and_jacobians(each, self._installed) for _, each in learned]
@@ -221,17 +232,17 @@ class MountMonitor:
         self._noise, _ = noise_covariance(residuals)
         for _ in range(2):
             H, S, _ = _information(residuals, jacobians, self._noise)
-            shift = most_likely(H, S, _RIDGE)
+            shift = most_likely(H, S, TUNING.ridge)
             self._noise, _ = noise_covariance(residuals + jacobians @ shift)
         parent = np.concatenate([each.Ts_parenti_parentj for _, each in learned])
         child = np.concatenate([each.Ts_childi_childj for _, each in learned])
         index = np.arange(len(parent))
         pairs = MotionPairs(parent, child, index, index + 1)
-        speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1))) / (_LAG_NS * 1e-9)
+        speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
         floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed, speed_m_s)
         floor += shift_covariance(1e-3, 1e-4)  # never singular
         self._covariance = self._covariance + floor
-        self._wander = _WANDER**2 * floor
+        self._wander = TUNING.wander**2 * floor
         for second_ns, each in learned:
             self._take(second_ns, each)
 
@@ -242,19 +253,19 @@ class MountMonitor:
         by_scale = np.zeros((len(motions), 6, 1))  # of its logarithm
         by_scale[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
         jacobians = np.concatenate([jacobians, by_scale], axis=2)
-        if self.seconds % _LONG_RUN_EVERY == 0 and len(self._S) >= LEARNING_S:
-            self._centre = most_likely(self._H.sum(axis=0), self._S.sum(axis=0), _RIDGE)
+        if self.seconds % TUNING.long_run_every_s == 0 and len(self._S) >= TUNING.learning_s:
+            self._centre = most_likely(self._H.sum(axis=0), self._S.sum(axis=0), TUNING.ridge)
         shift = np.append(self._centre, 0.0)
         H, S, scatter = _information(residuals, jacobians, self._noise, shift)
-        share = H[:6, 6] / (H[6, 6] + self.long_run / _SCALE_SIGMA**2)
+        share = H[:6, 6] / (H[6, 6] + self.long_run / TUNING.scale_sigma**2)
         H, S = H[:6, :6] - np.outer(share, H[6, :6]), S[:6] - share * S[6]
-        if len(self._S) == MEMORY_S and self.alarm is None:
-            kept = 1.0 - 1.0 / _OLD_MEMORY_S
+        if len(self._S) == TUNING.memory_s and self.alarm is None:
+            kept = 1.0 - 1.0 / TUNING.old_memory_s
             self._old = kept * self._old[0] + self._H[-1], kept * self._old[1] + self._S[-1]
-        self._stamps_ns = np.append(np.int64(stamp_ns), self._stamps_ns)[:MEMORY_S]
-        self._H = np.concatenate([H[None], self._H])[:MEMORY_S]
-        self._S = np.concatenate([S[None], self._S])[:MEMORY_S]
-        share = 1.0 / _NOISE_MEMORY_S
+        self._stamps_ns = np.append(np.int64(stamp_ns), self._stamps_ns)[: TUNING.memory_s]
+        self._H = np.concatenate([H[None], self._H])[: TUNING.memory_s]
+        self._S = np.concatenate([S[None], self._S])[: TUNING.memory_s]
+        share = 1.0 / TUNING.noise_memory_s
         self._noise = (1.0 - share) * self._noise + share * scatter
         self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._S), 100)
 
@@ -262,14 +273,14 @@ class MountMonitor:
 
     def _judge(self) -> None:
         """Raise an alarm, or follow one that has become clearer."""
-        if self.seconds % _LONG_RUN_EVERY == 0 or self.seconds <= LEARNING_S:
+        if self.seconds % TUNING.long_run_every_s == 0 or self.seconds <= TUNING.learning_s:
             self.long_run = _long_run_variance(self._H, self._S, self.long_run)
         if len(self._S) < _LAGS[0]:
             return
         lags, H, S = self._sums()
         ratios = log_ratio(H, S, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
-        if ratios[best] < (self.alarm.log_ratio if self.alarm else THRESHOLD):
+        if ratios[best] < (self.alarm.log_ratio if self.alarm else TUNING.threshold):
             return
         covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
         since_ns, raised_ns = int(self._stamps_ns[lags[best] - 1]), int(self._stamps_ns[0])
@@ -323,7 +334,7 @@ class MountMonitor:
         # A shift along or about an axis of z standard deviations has the ratio z^2 / 2 less this.
         information = np.linalg.inv(covariance)
         _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ information)
-        seen_sigmas = np.sqrt(2.0 * THRESHOLD + log_volumes) + NINE_TIMES_OUT_OF_TEN
+        seen_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
         return np.repeat(seen_sigmas, 3) * self._sigmas(covariance)
 
 
@@ -333,8 +344,8 @@ def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
     rotation = np.median(se3.rotation_angle(parent[:, :3, :3]))
     distance = np.median(np.linalg.norm(parent[:, :3, 3], axis=1))
     of_noise = 0.0 if noise is None else np.sqrt(np.trace(noise[3:, 3:]) / 3)
-    least = max(_LEAST_ROTATION, _LEAST_OF_NOISE * float(of_noise))
-    return bool(rotation > least or distance > _LEAST_MOTION)
+    least = max(TUNING.least_rotation_rad, TUNING.least_of_noise * float(of_noise))
+    return bool(rotation > least or distance > TUNING.least_motion_m)
 
 
 def _information(
@@ -361,18 +372,20 @@ def _long_run_variance(H: FloatArray, S: FloatArray, known: float) -> float:
     largest over windows of several lengths, each about the answer of all; what is known while there
     are too few.
     """
-    answer = most_likely(H.sum(axis=0), S.sum(axis=0), _RIDGE)
+    answer = most_likely(H.sum(axis=0), S.sum(axis=0), TUNING.ridge)
     found = []
-    for length in _WINDOWS:
+    for length in TUNING.windows_s:
         n_windows = len(S) // length
-        if n_windows < _FEWEST_WINDOWS:
+        if n_windows < TUNING.assumed_windows:
             break
         newest = n_windows * length
         of_windows = H[:newest].reshape(n_windows, length, 6, 6).sum(axis=1)
         scores = S[:newest].reshape(n_windows, length, 6).sum(axis=1) - of_windows @ answer
-        squared = squared_shift(of_windows, scores, _RIDGE)
-        seen = np.minimum(squared, _MOST_OF_TYPICAL * np.median(squared)).sum() / 6
-        found.append((seen + _ASSUMED_WINDOWS * _ASSUMED) / (n_windows + _ASSUMED_WINDOWS))
+        squared = squared_shift(of_windows, scores, TUNING.ridge)
+        seen = np.minimum(squared, TUNING.most_of_typical * np.median(squared)).sum() / 6
+        found.append(
+            (seen + TUNING.assumed_windows * TUNING.assumed) / (n_windows + TUNING.assumed_windows)
+        )
     return max(found, default=known)
 
 
@@ -420,17 +433,17 @@ class MountWatch:
         monitor = self._monitor
         if monitor is None:
             return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
-        visible, alarm = monitor.visible(_LONG_S), monitor.alarm
+        visible, alarm = monitor.visible(TUNING.session_s), monitor.alarm
         if alarm is not None:
             text = str(alarm)
         elif monitor.is_learning:
-            text = f"learning the noise: {monitor.seconds} of {LEARNING_S} s of motion"
+            text = f"learning the noise: {monitor.seconds} of {TUNING.learning_s} s of motion"
         else:
-            hidden = visible > _TARGETS * np.array(self._session.calibrator.config.targets)
+            hidden = visible > SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
             unwatched = axes_in_words([AXES[index] for index in np.flatnonzero(hidden)])
             text = "the mount has not moved"
             text += f"; {unwatched} cannot be watched here" if unwatched else ""
-        told = np.where(visible < _UNKNOWN, visible, np.nan)
+        told = np.where(visible < UNKNOWN_FROM, visible, np.nan)
         return MountState(
             level=Level.ERROR if alarm else Level.OK,
             text=text,

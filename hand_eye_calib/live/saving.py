@@ -61,7 +61,7 @@ class Saver:
 
     def _save(self, options: NodeConfig) -> str:
         directory = options.output_directory
-        result, snapshot = self._cycle.result, self._cycle.snapshot
+        result, snapshot = self._cycle.result, self._cycle.snapshot()
         if not directory:
             raise ConfigError("set the parameter output_directory to a directory")
         if result is None or snapshot is None:

@@ -15,8 +15,8 @@ from hand_eye_calib.live.journal import SessionJournal, give, takers
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import JournalState, Level
 
-# How long a disk may hold up the end of the program.
-_GRACE_S = 0.3
+# How long (s) a disk, or a solve under way, may each hold up the end of the program.
+GRACE_S = 0.4
 
 
 class LiveSession:
@@ -160,7 +160,7 @@ class LiveSession:
     def stop_journal(self) -> None:
         """Write what is left, and leave the directory to others."""
         if self._journal is not None:
-            self._journal.stop(_GRACE_S)
+            self._journal.stop(GRACE_S)
             self._journal = None
 
     def journal_state(self, options: NodeConfig) -> JournalState:

@@ -22,9 +22,9 @@ from typing import Any, BinaryIO
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.check import CheckResult, can_check
+from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.checking import check
 from hand_eye_calib.engine.run import review, with_options
-from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration
@@ -57,12 +57,13 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """A snapshot to solve, and perhaps its streams to check, in a session of this number, with
-    options that an earlier check was certain of.
+    """Poses to solve, and perhaps their streams to check, in a session of this number, with options
+    that an earlier check was certain of. They come as the calibrator had them: making trajectories
+    of them would hold up the node's callbacks.
     """
 
     session: int
-    snapshot: Snapshot
+    calibrator: Calibrator
     check: bool = False
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -94,18 +95,19 @@ def answer(job: Job) -> Answer:
     calibration is the one with these.
     """
     start_s = time.monotonic()
-    found: dict[str, Any] = {"time_offset": job.snapshot.time_offset}
+    found: dict[str, Any] = {}
     calibration = None
     try:
-        snapshot = with_options(job.snapshot, job.options).resolved
+        as_came = job.calibrator.snapshot()
+        as_sent = with_options(as_came, job.options)
+        snapshot = as_sent.resolved
         found["time_offset"] = snapshot.time_offset
         found["seen"] = excitation(snapshot.pose_pairs)
         calibration = snapshot.estimate()
     except Exception as error:  # the node reports it
         found["failure"] = _failure(error)
     try:
-        if job.check and can_check(*job.snapshot.streams):
-            as_sent = with_options(job.snapshot, job.options)
+        if job.check and can_check(*as_came.streams):
             if calibration is None:
                 found["check"] = check(as_sent)
             else:

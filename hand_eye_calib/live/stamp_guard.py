@@ -12,21 +12,17 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-# A real change this far back is a jump of the clock, and a new session.
-BACKWARD_JUMP_NS = 1_000_000_000
-
 # So many messages that follow each other are believed: more than corrupt ones come together.
 WITNESSES = 6
 
-# Near another message: within so much (ns, periods). Messages that wait follow each other, and
-# those at the end of a stream follow it, within the longest pause (ns).
-_NEAR_NS, _NEAR_PERIODS, _LONGEST_PAUSE_NS = 1_000_000_000, 5, 60_000_000_000
+# Near another message: within so much (ns), or so many periods. A real change farther back is a
+# jump of the clock, and a new session. Messages that wait follow each other, and those at the end
+# of a stream follow it, within the longest pause (ns).
+NEAR_NS, _PERIODS, _LONGEST_PAUSE_NS = 1_000_000_000, 5, 60_000_000_000
 
-# A stream is silent after so long (s, periods).
-_SILENCE_S, _SILENCE_PERIODS = 2.0, 5
-
-# After one stream has jumped back, the others' messages of before are left out for so long (s).
-_OTHERS_FOLLOW_S = 2.0
+# A stream is silent after so long (s), or so many periods. After one stream has jumped back, the
+# others' messages of before are left out for as long.
+SILENT_AFTER_S = 2.0
 
 Stamped = tuple[int, Any]
 
@@ -74,7 +70,7 @@ class StampGuard:
 
     def flush(self, now_s: float) -> Judgement:
         """Judge the messages that wait if the stream is silent; to be called often."""
-        silence_s = max(_SILENCE_S, _SILENCE_PERIODS * self._period_ns() * 1e-9)
+        silence_s = max(SILENT_AFTER_S, _PERIODS * self._period_ns() * 1e-9)
         if not self._held or now_s - self._arrived_s < silence_s:
             return Judgement()
         # A short stream, or the last ones after a pause: as good as it gets.
@@ -86,7 +82,7 @@ class StampGuard:
         if now_s is None:
             self._begin()
         elif self.last_ns is not None:
-            self._outdated_until_s = now_s + _OTHERS_FOLLOW_S
+            self._outdated_until_s = now_s + SILENT_AFTER_S
             self._outdated_until_s += 2 * WITNESSES * self._period_ns() * 1e-9
 
     def resume(self, last_ns: int | None) -> None:
@@ -102,7 +98,7 @@ class StampGuard:
 
     def _is_near(self, stamp_ns: int) -> bool:
         apart_ns = min((abs(stamp_ns - each) for each in self._recent_ns), default=math.inf)
-        return apart_ns <= _NEAR_NS or apart_ns <= _NEAR_PERIODS * self._period_ns()
+        return apart_ns <= NEAR_NS or apart_ns <= _PERIODS * self._period_ns()
 
     def _take(self, messages: list[Stamped]) -> list[Stamped]:
         stamps_ns = [stamp_ns for stamp_ns, _ in messages]
@@ -119,7 +115,7 @@ class StampGuard:
         """Take the messages that wait."""
         members, self._held = self._held, []
         before_ns = statistics.median_low(self._recent_ns or [members[0][0]])
-        jumped = members[0][0] < before_ns - BACKWARD_JUMP_NS
+        jumped = members[0][0] < before_ns - NEAR_NS
         follows = self._arrived_s < self._outdated_until_s
         self._outdated_until_s = -math.inf
         if jumped:

@@ -14,6 +14,9 @@ from hand_eye_calib.plain import plain
 from hand_eye_calib.results.context import Comparison, Progress
 from hand_eye_calib.results.status import AXES
 
+# The node says how it is so often (s).
+REPORT_PERIOD_S = 1.0
+
 AxisValues = Mapping[str, float | None]
 
 

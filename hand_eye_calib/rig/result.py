@@ -15,7 +15,8 @@ from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.stats import CHI2
 from hand_eye_calib.text import angle, length
 
-_FORMAT, _VERSION = "hand_eye_calib/rig", 1
+_FORMAT = "hand_eye_calib/rig"
+_VERSION = 1
 
 # Variances (m^2, rad^2) of directions that are unknown are larger.
 _UNKNOWN = 1.0

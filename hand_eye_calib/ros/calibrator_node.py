@@ -24,21 +24,16 @@ from hand_eye_calib.io.transforms import TfSource
 from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
-from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.live.monitor import LIMITS, MountWatch
 from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, output_path
-from hand_eye_calib.live.state import NodeState
+from hand_eye_calib.live.state import REPORT_PERIOD_S, NodeState
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.tf import TF, Robot, RobotTree, TfBroadcaster, message_type
-
-_DISCOVERY_PERIOD_S = 0.2
-_STATE_PERIOD_S = 1.0
-# Inputs that have not delivered anything yet are named in the log so often.
-_SILENT_EVERY_S = 30.0
 
 
 class CalibratorNode(Node):
@@ -157,9 +152,8 @@ class CalibratorNode(Node):
         # Steady time: these go on while a bag, and with it simulated time, is paused.
         make = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._solve_timer = make(self._options.node.solve_period, self._on_solve_timer)
-        make(_DISCOVERY_PERIOD_S, self._discover)
-        make(_STATE_PERIOD_S, self._publish_state)
-        make(FLUSH_PERIOD_S, self._session.flush_journal)
+        make(FLUSH_PERIOD_S, self._discover)
+        make(REPORT_PERIOD_S, self._publish_state)
 
     # ---------------------------------------------------------------- timers
 
@@ -167,12 +161,13 @@ class CalibratorNode(Node):
         for each in self._inputs:
             each.discover()
             each.flush()
+        self._session.flush_journal()
 
     def _on_solve_timer(self) -> None:
         silent = [each for each in self._inputs if not each.has_poses]
         if silent and silent[0].is_enabled:
             text = "; ".join(each.describe_silence() for each in silent)
-            self._log.info(text, _SILENT_EVERY_S)
+            self._log.info(text, GOES_ON_S)
         self._cycle.start_if_due()
 
     def _publish_result(self, calibration: Calibration) -> None:

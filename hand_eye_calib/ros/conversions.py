@@ -14,16 +14,24 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.results.calibration import Calibration
 
-# Of a publisher: who comes later gets the last message. Of a subscription: every publisher's last
-# message fits.
-LATCHED, LISTENING = (
-    QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+# Messages that may wait in a queue: seconds of a fast stream, and every publisher's last message.
+_QUEUE = 1000
+
+_RELIABLE, _LASTING = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
+# Of a publisher: who comes later gets the last message. Of a subscription: every publisher's.
+LATCHED = QoSProfile(depth=1, reliability=_RELIABLE, durability=_LASTING)
+LISTENING = QoSProfile(depth=_QUEUE, reliability=_RELIABLE, durability=_LASTING)
+
+
+def quick() -> QoSProfile:
+    """Best effort, which hears reliable publishers too. A profile for each subscription: rclpy
+    writes its overrides into it.
+    """
+    return QoSProfile(
+        depth=_QUEUE,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
     )
-    for depth in (1, 1000)
-)
 
 
 def message_class(type_name: str) -> type[Any]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSPolicyKind, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -18,13 +18,13 @@ from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.live.input import PoseInput, with_stamp
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.ros.conversions import LISTENING, from_transform, message_class
+from hand_eye_calib.ros.conversions import LISTENING, from_transform, message_class, quick
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
 from hand_eye_calib.text import counted
 
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
-_TYPES = POSE_TYPES[1:]  # without auto
+_, *_TYPES = POSE_TYPES  # without auto
 
 # Messages taken in one callback beyond the first; services and timers have their turn then.
 _MOST_AT_ONCE = 50
@@ -32,17 +32,6 @@ _MOST_AT_ONCE = 50
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
 Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
-
-
-def _quick() -> QoSProfile:
-    """Best effort hears reliable publishers too; a queue for seconds of a fast stream. A profile
-    for each subscription: rclpy writes its overrides into it.
-    """
-    return QoSProfile(
-        depth=1000,
-        reliability=ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.VOLATILE,
-    )
 
 
 class TopicInput(PoseInput):
@@ -117,7 +106,7 @@ class TopicInput(PoseInput):
                 message_class(type_name),
                 self._relative_topic,
                 callback,
-                _quick(),
+                quick(),
                 # As bytes: making the objects of a message takes ten times as long as reading what
                 # is needed of it.
                 raw=True,
@@ -152,7 +141,7 @@ class TfInput(PoseInput):
         self._source, self._stream = source, TfStream(source, max_gap_s=0.0)
         self._subscriptions: dict[str, Subscription] = {}
         kind = message_type(f"{name}_tf")
-        for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, _quick())):
+        for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, quick())):
             heard: Any = partial(self._hear, topic)
             self._subscriptions[topic] = node.create_subscription(kind, topic, heard, qos)
 

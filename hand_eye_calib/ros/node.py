@@ -13,9 +13,6 @@ import traceback
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# How long a running solve may hold up the end of the program.
-SOLVE_GRACE_S = 0.5
-
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM.
@@ -79,6 +76,7 @@ def _run_node(signals: int) -> int:
     from rclpy.executors import SingleThreadedExecutor
 
     from hand_eye_calib.errors import HandEyeCalibError
+    from hand_eye_calib.live.session import GRACE_S
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
 
     # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
@@ -104,7 +102,7 @@ def _run_node(signals: int) -> int:
     executor.shutdown()
     if node is not None:
         try:
-            code = code if node.stop(SOLVE_GRACE_S) else 1
+            code = code if node.stop(GRACE_S) else 1
         except Exception:
             traceback.print_exc()
             code = 1

@@ -12,7 +12,6 @@ from typing import Any
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
@@ -29,17 +28,13 @@ from hand_eye_calib.ros.conversions import (
     LISTENING,
     covariance_about_parent_axes,
     from_transform,
+    quick,
     to_transform,
 )
 from hand_eye_calib.session.compare import with_comparison
 from hand_eye_calib.text import axes_in_words
 
 TF, STATIC_TOPIC, DYNAMIC_TOPIC = "tf", "/tf_static", "/tf"
-
-_QOS = {
-    STATIC_TOPIC: LISTENING,
-    DYNAMIC_TOPIC: QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT),
-}
 
 # The transform tree is listened to for so long before anything is broadcast (s): discovery takes up
 # to 2.4 s.
@@ -78,8 +73,8 @@ class RobotTree(FrameTree):
     def listen(self, topic: str = STATIC_TOPIC) -> None:
         """Listen to a topic from now on."""
         if topic not in self._subscriptions:
-            heard = partial(self._hear, topic)
-            subscription = self._node.create_subscription(message_type(), topic, heard, _QOS[topic])
+            heard, qos = partial(self._hear, topic), LISTENING if topic == STATIC_TOPIC else quick()
+            subscription = self._node.create_subscription(message_type(), topic, heard, qos)
             self._subscriptions[topic] = subscription
 
     def ignore(self, topic: str) -> None:

@@ -18,15 +18,15 @@ from std_srvs.srv import Trigger
 
 from hand_eye_calib.config import POSE_TYPES
 from hand_eye_calib.errors import printable
-from hand_eye_calib.live.state import NodeState
+from hand_eye_calib.live.state import REPORT_PERIOD_S, NodeState
 from hand_eye_calib.plain import from_plain
 from hand_eye_calib.ros.conversions import LATCHED
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.text import counted
 from hand_eye_calib.watch.board import Board
 
-# New nodes are looked for so often (s), so many are listened to, and so many topics are told of.
-_LOOK_S, _MOST_NODES, _MOST_TOPICS = 1.0, 50, 12
+# So many nodes are listened to, and so many topics with poses are told of, at most.
+_MOST = 20
 
 # A service that has not answered for so long will not (s): a solve takes seconds.
 _PATIENCE_S = 60.0
@@ -47,7 +47,7 @@ class Watcher:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._node.create_timer(_LOOK_S, self._look)
+        self._node.create_timer(REPORT_PERIOD_S, self._look)
         self._heard: set[str] = set()
         self._asked: dict[str, tuple[Client, Any, Future | None, float]] = {}
         self._look()
@@ -90,12 +90,12 @@ class Watcher:
         """
         found = self._node.get_topic_names_and_types()
         poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in POSE_TYPES]
-        told = tuple(self._told(*each) for each in poses[:_MOST_TOPICS])
+        told = tuple(self._told(*each) for each in poses[:_MOST])
         self._board.topics = told or ("none is published here",)
         for topic, types in found:
             name, _, last = topic.rpartition("/")
             is_one = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
-            if is_one and name not in self._heard and len(self._heard) < _MOST_NODES:
+            if is_one and name not in self._heard and len(self._heard) < _MOST:
                 self._heard.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)

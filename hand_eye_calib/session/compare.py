@@ -21,7 +21,7 @@ from hand_eye_calib.text import listing
 _Named = tuple[str, Calibration | Extrinsic]
 
 # An axis is the same if changes of so many targets would have been seen.
-_TARGETS = 5.0
+SEEN_TARGETS = 5.0
 
 
 def compare(
@@ -106,7 +106,7 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
         # What is the same in all recordings is in one of both only: the larger of both, by axis.
         scatter = floor + np.diag(np.maximum(np.diag(scatter - floor), 0.0))
     values = deviation(two.T_parent_child, one.T_parent_child)
-    limits = _TARGETS * np.array([target_of(axis, two) for axis in AXES])
+    limits = SEEN_TARGETS * np.array([target_of(axis, two) for axis in AXES])
     found = moved(values, covariance + scatter, limits)
     columns = (found.values.tolist(), found.sigmas.tolist(), found.visible.tolist())
     rows = zip(*columns, (each.value for each in found.verdicts), strict=True)

@@ -21,20 +21,17 @@ from hand_eye_calib.text import angle, axes_in_words, duration, length
 _SHARE = 0.7
 # ... or what the common-mode floor leaves of it, of the variance at least this share, ...
 _LEAST_ROOM = 0.25
-# ... at so many results in a row, ...
-_RESULTS = 2
-# ... after so many seconds of motion, and so many correlation times of errors that last.
+# ... at two results in a row, after so many seconds of motion, and so many correlation times of
+# errors that last.
 _MIN_MOTION_S, _CORRELATION_TIMES = 30.0, 10.0
 
-# Times left (s) that a person is told: they only shrink, by one step at a result.
+# Times left (s) that a person is told: they only shrink, by one step at a result. A motion that
+# would take longer than the last of them will not get there.
 _STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, np.inf])
 
 # Standard deviations are estimates too: a result with more motion replaces the best one unless its
 # own are larger by more than this factor.
 _AS_GOOD = 1.25
-
-# The motion will not get there if it would take longer than this (s).
-_TOO_LONG_S = 1200.0
 
 
 class Goal:
@@ -61,7 +58,7 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        self._motion_s, self._n_known = -1.0, 0
+        self._motion_s, self._was_known = -1.0, False
         self.best: Calibration | None = None
         self._best_information = 0.0
         self._steps = np.full(6, len(_STEPS_S) - 1)
@@ -94,11 +91,12 @@ class Goal:
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
         least_s = _least_motion_s(calibration)
         is_known = bool(is_within) and motion_s >= least_s
+        may_end = self.best is not None
         # Every result of a robot that stands still is the same result.
         if motion_s > self._motion_s:
-            self._motion_s, self._n_known = motion_s, self._n_known + 1 if is_known else 0
+            may_end |= is_known and self._was_known
+            self._motion_s, self._was_known = motion_s, is_known
         information = 1.0 / max(ratios[worst], 1e-12)
-        may_end = self.best is not None or (is_known and self._n_known >= _RESULTS)
         if is_within and may_end and information * _AS_GOOD**2 >= self._best_information:
             self.best = calibration
             self._best_information = max(information, self._best_information)
@@ -106,7 +104,7 @@ class Goal:
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(least_s - motion_s, 0.0))
         is_done = self.best is not None
-        stuck = not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _TOO_LONG_S
+        stuck = not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _STEPS_S[-2]
         left_s = self._told(left_s)
         sentence = self._sentence(
             calibration, seen, faults, AXES[worst], left_s[worst], bool(stuck)

@@ -10,6 +10,7 @@ from datetime import datetime
 from enum import Enum
 
 from hand_eye_calib.live.state import (
+    REPORT_PERIOD_S,
     Broadcast,
     InputState,
     Level,
@@ -20,16 +21,14 @@ from hand_eye_calib.live.state import (
 )
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
+from hand_eye_calib.stats import LARGEST_OF_SIX
 from hand_eye_calib.text import amount, duration, fixed, listing, two_digits
 
-# A node that has said nothing for so long is silent; it reports once a second (s).
-SILENT_AFTER_S = 3.5
+# A node that has said nothing for so long (s) is silent.
+SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 MOVED = "MOUNT MOVED"
 _ADVICE = " Check it. Then recalibrate, or acknowledge; a reset ends the alarm."
-
-# A shift is told from this many standard deviations on.
-_CLEARLY = 3.0
 
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
@@ -347,7 +346,7 @@ def _watched(axis: str, mount: MountState) -> Line:
     """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
     shift, sigma = mount.shift.get(axis) or 0.0, mount.shift_sigma.get(axis) or 0.0
     visible = mount.visible_10min.get(axis)
-    if abs(shift) > _CLEARLY * sigma:
+    if abs(shift) > LARGEST_OF_SIX * sigma:
         tone, text = Tone.BAD, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
     elif visible is not None:
         tone, text = Tone.GOOD, f"not moved (would see {amount(axis, visible)})"

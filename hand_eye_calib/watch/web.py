@@ -22,6 +22,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.live.state import REPORT_PERIOD_S
 from hand_eye_calib.text import AXIS_UNITS
 from hand_eye_calib.watch.board import Bar, Board, Line, Tone, View
 
@@ -29,8 +30,8 @@ PORT = 8765
 # Requests of the page, beside that of an axis measured by hand.
 BUTTONS = ("solve", "save", "reset", "recalibrate", "acknowledge")
 
-# The view is looked at so often, and something is sent at least so often (s).
-_LOOK_S, _SEND_S = 0.25, 1.0
+# The view is looked at so often (s).
+_LOOK_S = 0.25
 
 # A browser that takes nothing for so long is gone (s).
 _PATIENCE_S = 10.0
@@ -218,7 +219,7 @@ class _Handler(BaseHTTPRequestHandler):
             view = board.view(now_s)
             there = [name for name in SAVED if os.path.isfile(os.path.join(view.saved_in, name))]
             made = " ".join(fragment(view, there if view.saved_in else ()).splitlines())
-            if made != sent or now_s - sent_s >= _SEND_S:
+            if made != sent or now_s - sent_s >= REPORT_PERIOD_S:
                 yield f"data: {made if made != sent else ''}\n\n".encode()
                 sent, sent_s = made, now_s
 

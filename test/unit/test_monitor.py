@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.monitor import LEARNING_S, MEMORY_S, MountMonitor
+from hand_eye_calib.live.monitor import TUNING, MountMonitor
 from hand_eye_calib.pairing.synchronise import PosePairs
 
 X = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
@@ -68,7 +68,7 @@ def test_a_shift_is_found_with_its_axis_size_and_time(axis, size):
 
 def test_a_shift_that_was_there_from_the_beginning_is_found_after_learning():
     (alarm,) = fed(shifted(motion(400.0), 0.0, 5, np.radians(2.0)))[1]
-    assert alarm.raised_ns / SECOND_NS == pytest.approx(LEARNING_S, abs=10)
+    assert alarm.raised_ns / SECOND_NS == pytest.approx(TUNING.learning_s, abs=10)
 
 
 def test_what_is_installed_may_be_off_by_its_own_standard_deviation():
@@ -147,6 +147,6 @@ def test_a_scale_that_drifts_is_no_shift_and_hides_none():
 
 
 def test_memory_stays_constant():
-    monitor, _ = fed(motion(MEMORY_S + 200.0, rate_hz=4.0), chunk=400)
-    assert len(monitor._S) == MEMORY_S
+    monitor, _ = fed(motion(TUNING.memory_s + 200.0, rate_hz=4.0), chunk=400)
+    assert len(monitor._S) == TUNING.memory_s
     assert len(monitor._tail) < 20

@@ -1,6 +1,5 @@
 """The process that solves, without a node."""
 
-import dataclasses
 import os
 import signal
 import subprocess
@@ -41,12 +40,12 @@ solving.main()
 """
 
 
-def snapshot(**options):
+def poses(**options):
     calibrator = Calibrator(CalibratorConfig(**{"reference": "B3", **options}))
     parent = wandering_poses(250)
-    for stream, poses in (("parent", parent), ("child", child_of(parent))):
-        feed(calibrator, stream, as_trajectory(poses))
-    return calibrator.snapshot()
+    for stream, each in (("parent", parent), ("child", child_of(parent))):
+        feed(calibrator, stream, as_trajectory(each))
+    return calibrator
 
 
 class Started(SolvingProcess):
@@ -94,9 +93,9 @@ def wait_gone(pid):
     [{}, {"method": "adaptive", "time_offset": "estimate"}, {"method": "dnlo", "backend": "ipopt"}],
 )
 def test_gives_the_same_bits_as_here_whatever_libraries_print(start, options):
-    process, work = start(NOISY), snapshot(**options)
+    process, work = start(NOISY), poses(**options)
     process.submit(Job(5, work, check=True))
-    there, here = process.next(), answer(Job(5, snapshot(**options), check=True))
+    there, here = process.next(), answer(Job(5, poses(**options), check=True))
     assert there.session == 5
     for name in ("T_parent_child", "covariance", "objective", "sigmas"):
         values = [getattr(each.calibration, name) for each in (there, here)]
@@ -105,17 +104,19 @@ def test_gives_the_same_bits_as_here_whatever_libraries_print(start, options):
     assert there.seen.n_poses == here.seen.n_poses == 250
     assert (there.time_offset is None) == ("time_offset" not in options)
     if there.time_offset is not None:
-        assert there.time_offset.seconds == work.resolved.time_offset.seconds
+        assert there.time_offset.seconds == work.snapshot().resolved.time_offset.seconds
 
 
 def test_what_is_missing_and_defects_are_told_apart():
-    missing = answer(Job(0, Calibrator().snapshot(), check=True))
+    missing = answer(Job(0, Calibrator(), check=True))
     assert "no poses on the parent stream" in missing.failure.what
     assert (missing.failure.is_early, missing.failure.details) == (True, "")
     assert (missing.is_checked, missing.check) == (True, None)  # these tell too little
-    unusable = answer(Job(0, snapshot(parent_frame="one", child_frame="one"))).failure
+    unusable = answer(Job(0, poses(parent_frame="one", child_frame="one"))).failure
     assert (unusable.is_early, unusable.details) == (False, "")
-    defect = answer(Job(0, dataclasses.replace(snapshot(), config=None))).failure
+    broken = poses()
+    broken._config = None
+    defect = answer(Job(0, broken)).failure
     assert "AttributeError" in defect.what
     assert "Traceback" in defect.details
 
@@ -124,7 +125,7 @@ def test_killed_it_is_started_again_and_the_job_in_hand_has_failed(start):
     process = start(SLOW)
     for kill in range(2):
         old = process.pid
-        process.submit(Job(kill, snapshot()))
+        process.submit(Job(kill, poses()))
         os.kill(old, signal.SIGKILL)
         failure = Failure("the solving process was ended by SIGKILL", "it was started again")
         assert process.next() == Answer(kill, 0.0, failure=failure)
@@ -135,7 +136,7 @@ def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(start, mo
     monkeypatch.setattr(solving, "HANGS_AFTER_S", 0.5)
     process = start(SLOW)
     old = process.pid
-    process.submit(Job(7, snapshot(), check=True))
+    process.submit(Job(7, poses(), check=True))
     what = "the solving process had no answer after 0.5 s and was killed"
     assert process.next() == Answer(7, 0.0, failure=Failure(what, "it was started again"))
     assert process.pid != old
@@ -145,7 +146,7 @@ def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(start, mo
 def test_stop_does_not_wait_for_a_long_solve(start):
     for wait_s in (0.0, 0.2, 1.0):  # while it starts, reads, solves
         process = start(SLOW)
-        process.submit(Job(0, snapshot()))
+        process.submit(Job(0, poses()))
         time.sleep(wait_s)
         process.stop(timeout_s=0.1)
         wait_gone(process.pid)
@@ -161,7 +162,7 @@ from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.live.solving import Job, SolvingProcess
 process = SolvingProcess(lambda: None, {SLOW!r})
 if {command == "busy"}:
-    process.submit(Job(0, Calibrator().snapshot()))
+    process.submit(Job(0, Calibrator()))
 print(process.pid, flush=True)
 time.sleep(3600.0)
 """
@@ -187,10 +188,10 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     live = calibrator.snapshot()
     assert (len(live.kept) > 0) == (pairing_starts < 400)
     replayed = review(live.estimate(), live).calibration
-    found = answer(Job(1, live, check=True))
+    found = answer(Job(1, calibrator, check=True))
     assert found.options == {"time_offset": "estimate"}
     assert "solved with time_offset estimate" in found.told[0]
-    again = answer(Job(1, live, check=True, options=found.options))
+    again = answer(Job(1, calibrator, check=True, options=found.options))
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
     for each in (found, again):
         np.testing.assert_array_equal(each.calibration.T_parent_child, replayed.T_parent_child)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_eye_calib.live.stamp_guard import BACKWARD_JUMP_NS, WITNESSES, StampGuard
+from hand_eye_calib.live.stamp_guard import NEAR_NS, WITNESSES, StampGuard
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
@@ -50,7 +50,7 @@ INTERVALS_NS = np.random.default_rng(1).exponential(1e8, 1000).astype(int)
         ),
         stamps(10) + stamps(10, START_NS + 600 * 10**9),
         stamps(50) + stamps(3, START_NS + 60 * 10**9),
-        stamps(50) + stamps(50, START_NS + 50 * STEP_NS - BACKWARD_JUMP_NS // 2),
+        stamps(50) + stamps(50, START_NS + 50 * STEP_NS - NEAR_NS // 2),
     ],
     ids=["overtaken", "irregular", "10 times", "twice", "half", "tenth", "pause", "a few", "back"],
 )
@@ -102,8 +102,8 @@ def test_a_clock_that_is_wrong_for_up_to_five_messages_changes_nothing(offset_ns
         sequence[index] += sign * offset_ns
     jumps, taken, dropped = run(StampGuard(), sequence)
     assert not any(jumps)
-    assert taken + dropped == sequence or offset_ns > BACKWARD_JUMP_NS
-    assert len(dropped) == (times if offset_ns > BACKWARD_JUMP_NS else 0)
+    assert taken + dropped == sequence or offset_ns > NEAR_NS
+    assert len(dropped) == (times if offset_ns > NEAR_NS else 0)
     assert set(stamps(60)[:30] + stamps(60)[30 + times :]) <= set(taken)
 
 
