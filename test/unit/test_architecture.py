@@ -45,7 +45,7 @@ ALLOWED = ENGINE | {
     "root": GROUND
     | {"geometry", "results", "engine", "rig", "session", "io", "report", "simulation"},
     "live": {"io", *ENGINE},
-    "watch": {"errors", "text", "results", "live"},
+    "watch": {"errors", "stats", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "live", "watch", "ros", *ENGINE},
     "__main__": {"cli"},
