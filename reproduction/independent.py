@@ -7,6 +7,7 @@ each run.
 
 import hashlib
 import random
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.stops import read_arm_samples
-from hand_eye_calib.solvers.robot_world import solve
+from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
 from reproduction.recordings import between
 from reproduction.writing import markdown_table, study_parser
 
@@ -105,10 +106,10 @@ def ethz(folder: Path) -> Iterator[Row]:
         same += name.startswith(beginning)
         A, B = hand[[i for _, i, _ in fitted]], eye[[row for _, _, row in fitted]]
         started = time.process_time()
-        fit = solve(A, B)
+        fit = solve(Stops.of_one(A, B))
         seconds.append(time.process_time() - started)
         A, B = hand[[i for _, i, _ in held]], eye[[row for _, _, row in held]]
-        X, Z = fit.T_parent_child, fit.T_world_world
+        X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
         motions.append(closure_of_motions(X, A, B))
         poses.append(closure(A, X, Z, B))
     source = f"{names[0]} {digest(files[0])}, {same} of 5 splits"
@@ -126,7 +127,7 @@ def camodocal(folder: Path) -> Iterator[Row]:
     path = folder / "independent" / "camodocal_example" / "TransformPairsInput.yml"
     samples = read_arm_samples(path)
     A, B = samples.robot, samples.tracking
-    X = solve(A, B).T_parent_child
+    X = solve(Stops.of_one(A, B)).Ts_parent_child[0]
     motions = [se3.inverse(Ts[:-1]) @ Ts[1:] for Ts in (A, B)]
     angle_deg, apart_mm = closure(motions[0], X, X, motions[1])
     ours, published = f"{angle_deg:.2f} deg, {apart_mm:.2f} mm", "7.82 deg, 36.97 mm"
@@ -138,7 +139,7 @@ def moveit(folder: Path) -> Iterator[Row]:
     """The samples of MoveIt's tests, eye to hand: the camera in the robot's base."""
     path = folder / "independent" / "moveit_samples" / "pose_samples.json"
     samples = read_arm_samples(path)
-    T_base_camera = solve(samples.robot, samples.tracking).T_world_world
+    T_base_camera = solve(Stops.of_one(samples.robot, samples.tracking)).Ts_world_world[0]
     turned = (
         Rotation.from_euler("XYZ", [0.230, -2.540, 1.950]).as_matrix().T @ T_base_camera[:3, :3]
     )
@@ -146,6 +147,35 @@ def moveit(folder: Path) -> Iterator[Row]:
     ours = f"{values}, {np.degrees(se3.rotation_angle(turned)):.2f} deg from the published"
     published, source = "0.659 -0.249 0.830, to 1 %", f"{path.name} {digest(path)}"
     yield Row("MoveIt", "camera in the robot's base, m", ours, published, source)
+
+
+def wise(folder: Path) -> Iterator[Row]:
+    """Eight cameras that see sixteen tags: X of the tags and Z of the cameras in one solve."""
+    found = sorted((folder / "independent" / "wise_8_cameras").glob("*_A.csv"))
+    keys = [tuple(int(x) for x in re.findall(r"\d+", path.name)) for path in found]
+    tags, cameras = (sorted({key[side] for key in keys}) for side in (0, 1))
+    parts = []
+    for path, (tag, camera) in zip(found, keys, strict=True):
+        A, B = (_poses_wxyz(path.with_name(path.name.replace("_A", side))) for side in ("_A", "_B"))
+        which = np.full(len(A), tags.index(tag)), np.full(len(A), cameras.index(camera))
+        parts.append((A, B, *which))
+    stops = Stops(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    started = time.process_time()
+    fit = solve(stops)
+    seconds = time.process_time() - started
+    sigmas_mm = 1e3 * np.sqrt(_diagonal_of_Z(fit)[:, :3].mean(axis=1))
+    ours = f"{seconds:.1f} s, sigma {sigmas_mm.min():.1f}-{sigmas_mm.max():.1f} mm"
+    figure = f"{len(stops)} stops, {len(cameras)} cameras, {len(tags)} tags in one solve"
+    yield Row("Wise et al.", figure, ours, "none readable", f"{len(found)} pairs of files")
+
+
+def _diagonal_of_Z(fit: RobotWorld) -> FloatArray:
+    return np.diag(fit.covariance)[6 * len(fit.Ts_parent_child) :].reshape(-1, 6)
+
+
+def _poses_wxyz(path: Path) -> FloatArray:
+    rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    return np.asarray(se3.from_quat_xyzw(rows[:, 4:7], np.roll(rows[:, :4], -1, axis=1)))
 
 
 def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
@@ -248,7 +278,7 @@ def main() -> None:
     parser.add_argument("--segments", type=int, default=20, help="of Shrimp, for each length")
     arguments = parser.parse_args()
     folder = arguments.data_folder or parser.error("name the recordings with --data-folder")
-    rows = [row for study in (ethz, camodocal, moveit, ntu_viral) for row in study(folder)]
+    rows = [row for study in (ethz, camodocal, moveit, wise, ntu_viral) for row in study(folder)]
     text = page([*rows, *shrimp(folder, arguments.segments)])
     if arguments.page:
         arguments.page.write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import calibration_of
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration, Finding, Residuals
-from hand_eye_calib.solvers.robot_world import RobotWorld, solve
+from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
 
 # Poses of one sensor are taken for inverse if so the errors are smaller by this factor.
 _CLEARLY = 3.0
@@ -50,8 +50,8 @@ def calibrate_stops(
     (4, 4)
     """
     config = config or CalibratorConfig()
-    fit = solve(Ts_world_parent, Ts_world_child)
-    other = solve(Ts_world_parent, se3.inverse(Ts_world_child))
+    fit = solve(Stops.of_one(Ts_world_parent, Ts_world_child))
+    other = solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
     is_smaller = max(other.level_m / fit.level_m, other.level_rad / fit.level_rad) < 1.0 / _CLEARLY
     findings = [finding("inverse", "child")] if is_smaller and other.converged else []
     frames = "parent", "child", "parent_world", "child_world"
@@ -93,7 +93,7 @@ def calibrate_arm(
     named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
     Ts_target_camera = se3.inverse(tracking)
     fits = [
-        (solve(poses, Ts_target_camera), poses, parent, world)
+        (solve(Stops.of_one(poses, Ts_target_camera)), poses, parent, world)
         for poses, parent, world in ((robot, "hand", "base"), (se3.inverse(robot), "base", "hand"))
     ]
     fit, poses, parent, world = min(fits, key=lambda each: each[0].objective)
@@ -109,7 +109,7 @@ def _assessed(
     frames: tuple[str, str, str, str],
     findings: list[Finding],
 ) -> Calibration:
-    X, Z = fit.T_parent_child, fit.T_world_world
+    X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
     parent, child, parent_world, child_world = frames
     fused = fuse(X, combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
     errors = se3.log(se3.inverse(Z @ Ts_world_child) @ Ts_world_parent @ X)

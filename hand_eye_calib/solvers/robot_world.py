@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 
@@ -48,17 +48,52 @@ _PARTS = 6
 
 
 @dataclass(frozen=True)
+class Stops:
+    """Poses of both sensors at N stops.
+
+    Parameters
+    ----------
+    Ts_world_parent : (N, 4, 4) array
+        A_i, in the parent's world, such as hand poses in the frame of a robot's base.
+    Ts_world_child : (N, 4, 4) array
+        B_i, in the child's world, such as poses of a camera in the frame of a target.
+    child, world : (N,) int arrays
+        Which child sensor (camera) and which world of it (target) it was; zeros if there is one.
+    """
+
+    Ts_world_parent: FloatArray
+    Ts_world_child: FloatArray
+    child: IntArray
+    world: IntArray
+
+    @classmethod
+    def of_one(cls, Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> "Stops":
+        """One child and one world of it."""
+        zeros = np.zeros(len(Ts_world_parent), dtype=np.int64)
+        return cls(Ts_world_parent, Ts_world_child, zeros, zeros)
+
+    def __len__(self) -> int:
+        return len(self.child)
+
+    def __getitem__(self, which: IntArray | BoolArray) -> "Stops":
+        A, B = self.Ts_world_parent[which], self.Ts_world_child[which]
+        return Stops(A, B, self.child[which], self.world[which])
+
+
+@dataclass(frozen=True)
 class RobotWorld:
     """Solution of ``A_i X = Z B_i``.
 
     Attributes
     ----------
-    T_parent_child, T_world_world : (4, 4) arrays
-        X; and Z, the pose of the child's world in the parent's world.
-    covariance : (12, 12) array
-        Of the right perturbations (rho, phi) of X, then of Z, in the frames of the child and of its
-        world. Directions that the stops do not determine have large variances.
-    information : (12, 12) array
+    Ts_parent_child : (C, 4, 4) array
+        X of each child.
+    Ts_world_world : (W, 4, 4) array
+        Z: pose of each world of the children in the parent's world.
+    covariance : (6 (C + W), 6 (C + W)) array
+        Of the right perturbations (rho, phi) of all X, then all Z, in the frames of the children
+        and of their worlds. Directions that the stops do not determine have large variances.
+    information : (6 (C + W), 6 (C + W)) array
         Of the same, if the errors of each stop are independent and normal.
     weights : (N,) array
         Weight of each stop, 1 for the errors that the levels expect and less for larger ones.
@@ -69,8 +104,8 @@ class RobotWorld:
     converged : bool
     """
 
-    T_parent_child: FloatArray
-    T_world_world: FloatArray
+    Ts_parent_child: FloatArray
+    Ts_world_world: FloatArray
     covariance: FloatArray
     information: FloatArray
     weights: FloatArray
@@ -79,31 +114,31 @@ class RobotWorld:
     objective: float
     converged: bool
 
-    def undetermined(self) -> FloatArray:
+    def undetermined(self, child: int = 0) -> FloatArray:
         """Directions (6, k) of X, as right perturbations, that the stops do not determine."""
-        (own, to_other), (_, other) = self.information.reshape(2, 6, 2, 6).swapaxes(1, 2)
+        own = np.arange(len(self.information)) // 6 == child
+        to_others = self.information[np.ix_(own, ~own)]
+        others = np.linalg.pinv(self.information[np.ix_(~own, ~own)], hermitian=True)
         levels = np.repeat([self.level_m, self.level_rad], 3)
         # In units of the errors of a stop: the squared rotations between stops (rad^2).
-        alone = own - to_other @ np.linalg.pinv(other, hermitian=True) @ to_other.T
+        alone = self.information[np.ix_(own, own)] - to_others @ others @ to_others.T
         alone = alone * np.outer(levels, levels) / max(int(np.sum(self.weights > 0.0)), 1)
         powers, directions = np.linalg.eigh(alone)
         return directions[:, powers < _UNDETERMINED * self.level_rad**2]
 
 
-def solve(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> RobotWorld:
+def solve(stops: Stops) -> RobotWorld:
     """The most likely X and Z.
 
     Parameters
     ----------
-    Ts_world_parent : (N, 4, 4) array
-        A_i, in the parent's world, such as hand poses in the frame of a robot's base.
-    Ts_world_child : (N, 4, 4) array
-        B_i, in the child's world, such as poses of a camera in the frame of a target.
+    stops : Stops
+        At least three.
 
     Raises
     ------
     NotEnoughDataError
-        If there are fewer than three stops.
+        If there are fewer than three stops of a child or of one of its worlds.
 
     Notes
     -----
@@ -114,18 +149,20 @@ def solve(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> RobotWorld
     pose a camera measured), follow a Student-t distribution with one level for positions and one
     for rotations.
     """
-    A, B = Ts_world_parent, Ts_world_child
-    if len(A) < MIN_STOPS:
+    n_children, n_worlds = 1 + int(stops.child.max(initial=0)), 1 + int(stops.world.max(initial=0))
+    counts = np.zeros((n_children, n_worlds), dtype=np.int64)
+    np.add.at(counts, (stops.child, stops.world), 1)
+    if counts.max() < MIN_STOPS or not counts.any(axis=1).all() or not counts.any(axis=0).all():
         raise NotEnoughDataError(
-            f"{len(A)} stops are too few: at least {MIN_STOPS}, with rotations about two axes, are "
-            "necessary; 15 or more are better"
+            f"{len(stops)} stops are too few: at least {MIN_STOPS} of each sensor, with rotations "
+            "about two axes, are necessary; 15 or more are better"
         )
-    start, fits = _robust_start(A, B), []
+    starts, fits = _starts(stops, counts), []
     for in_world in (False, True):
-        rough = _fit(A, B, *start, in_world, _OUTLIER_TAILS, _ROUGH_ROUNDS)
-        kept, weights = rough.weights > 0.0, np.zeros(len(A))
-        near = rough.T_parent_child, rough.T_world_world
-        fit = _fit(A[kept], B[kept], *near, in_world, _TAILS, _ROUNDS)
+        rough = _fit(stops, *starts, in_world, _OUTLIER_TAILS, _ROUGH_ROUNDS)
+        kept, weights = rough.weights > 0.0, np.zeros(len(stops))
+        Xs, Zs = rough.Ts_parent_child, rough.Ts_world_world
+        fit = _fit(stops[kept], Xs, Zs, in_world, _TAILS, _ROUNDS)
         weights[kept] = fit.weights
         fits.append(replace(fit, weights=weights))
     return max(fits, key=_likelihood)
@@ -138,8 +175,9 @@ def _likelihood(fit: RobotWorld) -> float:
     return -fit.objective - 0.5 * left_out * (levels + _OUTLIER)
 
 
-def _closed_form(A: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """X and Z (4, 4) without weights."""
+def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
+    """X and Z (4, 4) of one child and one world."""
+    A, B = stops.Ts_world_parent, stops.Ts_world_child
     # The sum of tr(R_X' R_A' R_Z R_B), as a bilinear form of R_X and R_Z.
     form = np.einsum("nji,nka->iajk", A[:, :3, :3], B[:, :3, :3]).reshape(9, 9)
     left, _, right = np.linalg.svd(form)
@@ -156,74 +194,118 @@ def _closed_form(A: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def _robust_start(A: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The best of the closed forms of all stops and of a few, by the median distance times the
-    median angle of the errors.
-    """
-    random, choices = np.random.default_rng(0), [np.arange(len(A))]
-    if len(A) > 2 * _START_STOPS:
-        choices += [random.choice(len(A), _START_STOPS, replace=False) for _ in range(_STARTS)]
-    candidates = [_closed_form(A[choice], B[choice]) for choice in choices]
+def _robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
+    """The best of the closed forms of all stops and of a few, by the median error."""
+    random = np.random.default_rng(0)
+    choices = [np.arange(len(stops))]
+    if len(stops) > 2 * _START_STOPS:
+        choices += [random.choice(len(stops), _START_STOPS, replace=False) for _ in range(_STARTS)]
+    candidates = [_closed_form(stops[choice]) for choice in choices]
     X, Z = (np.stack(each)[:, None] for each in zip(*candidates, strict=True))
-    errors = se3.inverse(B) @ se3.inverse(Z) @ A @ X
+    errors = se3.inverse(stops.Ts_world_child) @ se3.inverse(Z) @ stops.Ts_world_parent @ X
+    return candidates[int(np.argmin(_logs_of_medians(errors)))]
+
+
+def _starts(stops: Stops, counts: IntArray) -> tuple[FloatArray, FloatArray]:
+    """X (C, 4, 4) of all children and Z (W, 4, 4) of all worlds, from the pair with most stops on.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If some of them share no stops, directly or through others, with the rest.
+    """
+    Xs, Zs = (np.zeros((count, 4, 4)) for count in counts.shape)
+    has_X, has_Z = (np.zeros(count, dtype=bool) for count in counts.shape)
+    while not (has_X.all() and has_Z.all()):
+        # Pairs of which one side is known; first, of all.
+        near = np.where(has_X[:, None] ^ has_Z, counts, 0) if has_X.any() else counts
+        if not near.any():
+            raise NotEnoughDataError("the stops of some sensors or targets are tied to no others")
+        child, world = (int(k) for k in np.unravel_index(np.argmax(near), near.shape))
+        pair = stops[(stops.child == child) & (stops.world == world)]
+        A, B = pair.Ts_world_parent, pair.Ts_world_child
+        if has_X[child]:
+            Zs[world] = _most_central(A @ Xs[child] @ se3.inverse(B))
+        elif has_Z[world]:
+            Xs[child] = _most_central(se3.inverse(A) @ Zs[world] @ B)
+        else:
+            Xs[child], Zs[world] = _robust_start(pair)
+        has_X[child] = has_Z[world] = True
+    return Xs, Zs
+
+
+def _most_central(Ts: FloatArray) -> FloatArray:
+    """The transform (4, 4) of (N, 4, 4) with the smallest median distance to the others."""
+    between = se3.inverse(Ts)[:, None] @ Ts
+    return Ts[int(np.argmin(_logs_of_medians(between)))]
+
+
+def _logs_of_medians(errors: FloatArray) -> FloatArray:
+    """By row of errors (M, N, 4, 4): log of the median distance times the median angle."""
     tiny = np.finfo(float).tiny
     distance_m = np.median(np.linalg.norm(errors[..., :3, 3], axis=-1), axis=1)
     angle_rad = np.median(se3.rotation_angle(errors[..., :3, :3]), axis=1)
-    return candidates[int(np.argmin(np.log(distance_m + tiny) + np.log(angle_rad + tiny)))]
+    return np.asarray(np.log(distance_m + tiny) + np.log(angle_rad + tiny))
 
 
 def _linearise(
-    A: FloatArray, B: FloatArray, X: FloatArray, Z: FloatArray, in_world: bool
+    stops: Stops, Xs: FloatArray, Zs: FloatArray, in_world: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors (N, 6), in the frame of the child or of its world, and their derivatives (N, 6, 12) by
-    X and Z.
+    """Errors (N, 6), in the frames of the children or of their worlds, and their derivatives
+    (N, 6, 12) by the X and the Z of each.
     """
-    predicted = se3.inverse(Z) @ A @ X
-    errors = se3.log(se3.inverse(B) @ predicted)
-    by_X = np.broadcast_to(np.eye(6), (len(A), 6, 6))
+    predicted = se3.inverse(Zs[stops.world]) @ stops.Ts_world_parent @ Xs[stops.child]
+    errors = se3.log(se3.inverse(stops.Ts_world_child) @ predicted)
+    by_X = np.broadcast_to(np.eye(6), (len(stops), 6, 6))
     jacobian = np.concatenate([by_X, -se3.adjoint(se3.inverse(predicted))], axis=2)
     if in_world:
-        moved = se3.adjoint(B)
+        moved = se3.adjoint(stops.Ts_world_child)
         errors, jacobian = (moved @ errors[..., None])[..., 0], moved @ jacobian
     return errors, jacobian
 
 
-def _lasting(gradients: FloatArray, information: FloatArray) -> float:
+def _information(rows: FloatArray, columns: IntArray, n_values: int) -> FloatArray:
+    """Information (n_values, n_values) of rows (N, 6, 12), which have values at columns (N, 12)."""
+    cells = n_values * columns[:, :, None] + columns[:, None]
+    products = np.swapaxes(rows, 1, 2) @ rows
+    whole = np.bincount(cells.ravel(), products.ravel(), n_values**2).astype(float)
+    return whole.reshape(n_values, n_values)
+
+
+def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) -> float:
     """Factor on the covariance, at least 1, for errors that last from stop to stop."""
-    parts = np.array_split(gradients, min(_PARTS, len(gradients)))
-    sums = np.array([part.sum(axis=0) for part in parts])
+    n, n_values = len(columns), len(information)
+    parts = np.array_split(np.arange(n), min(_PARTS, n))
+    sums = [np.bincount(columns[k].ravel(), gradients[k].ravel(), n_values) for k in parts]
     inverse = np.linalg.pinv(information, hermitian=True)
     spread = float(np.einsum("ki,ij,kj->", sums, inverse, sums))
-    return max(1.0, spread / (len(information) * (1.0 - 1.0 / len(parts))))
+    return max(1.0, spread / (n_values * (1.0 - 1.0 / len(parts))))
 
 
 def _fit(
-    A: FloatArray,
-    B: FloatArray,
-    X: FloatArray,
-    Z: FloatArray,
-    in_world: bool,
-    tails: float,
-    rounds: int,
+    stops: Stops, Xs: FloatArray, Zs: FloatArray, in_world: bool, tails: float, rounds: int
 ) -> RobotWorld:
     """Weights, levels and Gauss-Newton steps in turn."""
-    n = len(A)
+    n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
+    blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
+    columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
     # Values that the errors are fitted with make them smaller.
-    n_free = max(3.0 * n - 6.0, 0.5)
+    n_free = max(3.0 * n - 0.5 * n_values, 0.5)
     weights, converged = np.ones(n), False
     for _ in range(rounds):
-        errors, jacobian = _linearise(A, B, X, Z, in_world)
+        errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         variances = np.maximum(weights @ squared / n_free, _SMALLEST_VARIANCE)
         distance = squared @ (1.0 / variances)
         weights = (tails + 6.0) / (tails + distance)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
         rows = scale[..., None] * jacobian
-        information = (np.swapaxes(rows, 1, 2) @ rows).sum(axis=0)
+        information = _information(rows, columns, n_values)
         gradients = np.einsum("nki,nk->ni", rows, scale * errors)
-        gradient = gradients.sum(axis=0)
+        gradient = np.bincount(columns.ravel(), gradients.ravel(), n_values)
         step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0]
-        X, Z = X @ se3.exp(step[:6]), Z @ se3.exp(step[6:])
+        steps = step.reshape(-1, 6)
+        Xs, Zs = Xs @ se3.exp(steps[: len(Xs)]), Zs @ se3.exp(steps[len(Xs) :])
         converged = bool(-step @ gradient < _SMALL_STEP**2)
         if converged:
             break
@@ -231,15 +313,16 @@ def _fit(
     # modeling using the t distribution*, JASA 84, 1989, section 4.
     share = (tails + 6.0) / (tails + 8.0)
     rows = np.sqrt(share * np.repeat(1.0 / variances, 3))[:, None] * jacobian
-    fisher = (np.swapaxes(rows, 1, 2) @ rows).sum(axis=0)
-    weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), 2) / _UNKNOWN**2)
+    fisher = _information(rows, columns, n_values)
+    weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), n_values // 6) / _UNKNOWN**2)
     log_likelihood = (
         -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
     )
+    covariance = np.linalg.inv(fisher + weak) * _lasting(gradients, columns, information)
     return RobotWorld(
-        T_parent_child=X,
-        T_world_world=Z,
-        covariance=np.linalg.inv(fisher + weak) * _lasting(gradients, information),
+        Ts_parent_child=Xs,
+        Ts_world_world=Zs,
+        covariance=np.asarray(covariance, dtype=float),
         information=fisher,
         weights=np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0),
         level_m=float(np.sqrt(variances[0])),
