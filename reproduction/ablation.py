@@ -20,10 +20,9 @@ from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.synchronise import PosePairs
-from reproduction.coverage.classes import simulate
-from reproduction.coverage.mixed import MIXED, drawn_class
+from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import Rig, real_rigs
-from reproduction.writing import markdown_table, show, study_parser
+from reproduction.writing import markdown_table, seed_of, show, study_parser
 
 # Families of rigs by the beginnings of their names; the others are families of their own.
 _FAMILIES = ("kitti", "euroc", "zxl19", "tango")
@@ -91,8 +90,7 @@ def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
     """Random platforms: motion, rate, lever arm and noise drawn from the seed."""
     for name in MIXED:
         for number in range(repeats):
-            key = (seed, number, MIXED.index(name))
-            drive = simulate(drawn_class(name, np.random.default_rng(key)), key)
+            drive = make(name, seed, number)
             pairs = PosePairs(drive.parent.stamps_ns, drive.parent.poses, drive.child.poses)
             yield Case(name, pairs, False, drive.T_parent_child, np.zeros(6))
 
@@ -180,12 +178,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=10, help="recordings of each platform")
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     arguments = parser.parse_args()
-    drawn = int(np.random.SeedSequence().generate_state(1)[0])
-    seed = drawn if arguments.seed is None else arguments.seed
+    seed = seed_of(arguments.seed)
     repeats = 2 if arguments.quick else arguments.repeats
     cases = [*real_cases(arguments.data_folder), *simulated_cases(seed, repeats)]
-    print(f"seed {seed}, {len(cases)} recordings", flush=True)
-    show(arguments.page, {"ablation": table(cases)})
+    drawn_by = f"Seed {seed}, {len(cases)} recordings."
+    show(arguments.page, {"ablation": f"{drawn_by}\n\n{table(cases)}"})
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,10 +21,9 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
-from reproduction.coverage.classes import simulate
-from reproduction.coverage.mixed import MIXED, drawn_class
+from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import between, real_rigs
-from reproduction.writing import markdown_table, show, study_parser
+from reproduction.writing import markdown_table, seed_of, show, study_parser
 
 # Runs with any version since 0.1: answer and covariance, with the floor or without, of all streams.
 _SOLVE = """
@@ -60,17 +59,21 @@ class Case(NamedTuple):
     bound: FloatArray | None = None
 
 
-def real_cases(folder: Path, pieces: int, rng: np.random.Generator) -> Iterator[Case]:
-    """Recordings with a known answer, and pieces with a random start and length of each."""
+def real_cases(
+    folder: Path, pieces: int, rng: np.random.Generator, asked: Container[str] = ("time_offset",)
+) -> Iterator[Case]:
+    """Recordings with a known answer, and pieces with a random start and length of each, with those
+    of their options that are asked for.
+    """
     for rig in real_rigs(folder)[0]:
         if rig.truth is None or rig.is_refused or rig.name == "boreas":
             continue
-        clock = {name: each for name, each in rig.options.items() if name == "time_offset"}
+        options = {name: each for name, each in rig.options.items() if name in asked}
         truth = rig.truth.T_parent_child, rig.truth.sigmas
         family = rig.name.split("_")[0] if "kitti" not in rig.name else rig.name
         for recording in rig.recordings.values():
             streams = recording.parent, recording.child
-            yield Case(family, streams, clock, *truth)
+            yield Case(family, streams, options, *truth)
             first = max(each.stamps_ns[0] for each in streams)
             length = min(each.stamps_ns[-1] for each in streams) - first
             for _ in range(pieces):
@@ -78,15 +81,14 @@ def real_cases(folder: Path, pieces: int, rng: np.random.Generator) -> Iterator[
                 start = first + int(rng.uniform(0.0, 1.0 - share) * length)
                 piece = [between(each, start, start + int(share * length)) for each in streams]
                 if min(map(len, piece)) >= _FEWEST:
-                    yield Case(f"{family}, pieces", (piece[0], piece[1]), clock, *truth)
+                    yield Case(family, (piece[0], piece[1]), options, *truth)
 
 
 def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
     """Random platforms."""
     for number in range(repeats):
-        for index, name in enumerate(MIXED):
-            key = (seed, number, index)
-            drive = simulate(drawn_class(name, np.random.default_rng(key)), key)
+        for name in MIXED:
+            drive = make(name, seed, number)
             truth = drive.T_parent_child, np.zeros(6)
             yield Case(name, (drive.parent, drive.child), {}, *truth, drive.bound())
 
@@ -183,15 +185,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=4, help="recordings of each platform")
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     arguments = parser.parse_args()
-    drawn = int(np.random.SeedSequence().generate_state(1)[0])
-    seed = drawn if arguments.seed is None else arguments.seed
+    seed = seed_of(arguments.seed)
     cases = [*simulated_cases(seed, arguments.repeats)]
     if arguments.data_folder:
         rng = np.random.default_rng(seed)
         cases = [*real_cases(arguments.data_folder, arguments.pieces, rng), *cases]
-    print(f"seed {seed}, {len(cases)} recordings", flush=True)
     package = Path(__file__).resolve().parents[1]
-    show(arguments.page, {"gate": table(cases, package, arguments.against)})
+    drawn_by = f"Seed {seed}, {len(cases)} recordings."
+    show(arguments.page, {"gate": f"{drawn_by}\n\n{table(cases, package, arguments.against)}"})
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ alone give, against the truth and against whole poses.
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.coverage import motions
 from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
-from reproduction.recordings import real_rigs
 from reproduction.writing import markdown_table, show, study_parser, triple
 
 # Normal errors are within so many sigmas in nine cases of ten.
@@ -138,30 +136,6 @@ def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
         }
 
 
-def recorded_rows(data_folder: Path) -> Iterator[dict[str, object]]:
-    """Rows of the table of recordings with a known lever arm; sigmas with the common-mode floor."""
-    rigs = {rig.name: rig for rig in real_rigs(data_folder)[0]}
-    for which in ("euroc_stereo", "euroc_mono", "simple_kitti"):
-        rig = rigs[which]
-        for name, recording in rig.recordings.items():
-            assert rig.truth is not None
-            streams, lever_arm = (
-                (recording.parent, recording.child),
-                rig.truth.T_parent_child[:3, 3],
-            )
-            result = hec.calibrate(*streams, child_measures="positions")
-            whole = hec.calibrate(*streams, time_offset="estimate", scale="auto")
-            error, stated = result.T_parent_child[:3, 3] - lever_arm, result.sigmas_with_floor[:3]
-            of_poses = whole.T_parent_child[:3, 3] - lever_arm
-            yield {
-                "Positions against odometry": f"{which} {name}",
-                "Error x, y, z (mm)": triple(error, 1000.0, ".0f"),
-                "Sigma x, y, z (mm)": triple(stated, 1000.0, ".0f"),
-                "Largest error / sigma": f"{np.abs(error / stated).max():.1f}",
-                "Error of whole poses x, y, z (mm)": triple(of_poses, 1000.0, ".0f"),
-            }
-
-
 def simulated_rates(
     name: str, seed: int, duration_s: float = 60.0, rate_hz: float = 20.0
 ) -> tuple[Trajectory, Trajectory, FloatArray]:
@@ -205,13 +179,8 @@ def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the tables; returns the exit code."""
-    if arguments.what == "rates":
-        tables = {"rates": rate_rows(arguments.seeds)}
-    else:
-        tables = {"receivers": position_rows(arguments.seeds)}
-        if arguments.data_folder:
-            tables["recorded"] = recorded_rows(arguments.data_folder)
-    show(arguments.page, {name: markdown_table(rows) for name, rows in tables.items()})
+    name, rows = ("rates", rate_rows) if arguments.what == "rates" else ("receivers", position_rows)
+    show(arguments.page, {name: markdown_table(rows(arguments.seeds))})
     return 0
 
 

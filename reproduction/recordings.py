@@ -151,7 +151,7 @@ def _simple_kitti(folder: Path) -> list[Rig]:
             read_trajectory(folder / f"odometry_{drive}.tum"),
             read_trajectory(folder / f"truth_{drive}.tum"),
         )
-        for drive in ("05", "07")
+        for drive in ("05", "06", "07")
     }
     return [Rig(name="simple_kitti", recordings=recordings, truth=SIMPLE_KITTI)]
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from hand_eye_calib.errors import InputError
@@ -70,6 +71,11 @@ def study_parser(
     )
     parser.add_argument("--page", metavar="FILE", type=Path, help=page)
     return parser
+
+
+def seed_of(given: int | None) -> int:
+    """The seed that is given, or another one at every run."""
+    return int(np.random.SeedSequence().generate_state(1)[0]) if given is None else given
 
 
 def show(page: Path | None, tables: Mapping[str, str]) -> None:

@@ -13,7 +13,6 @@ from hand_eye_calib.cli.main import exit_code_of
 from reproduction.coverage import scores
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import KINDS, POOLED, Row, pooled
-from reproduction.coverage.mixed import MIXED
 from reproduction.coverage.page import page
 from reproduction.published import LEVELS, SIMULATED
 from reproduction.recordings import CYCLE, Rig, real_rigs
@@ -21,7 +20,7 @@ from reproduction.runner import in_parallel
 from reproduction.writing import study_parser, write_csv
 
 METHODS = tuple(scores.METHODS)
-TABLES = ("simulated", "mixed", "levels", "known answer", "rig", "parts", "cycle", "refused")
+TABLES = ("simulated", "levels", "known answer", "rig", "parts", "cycle", "refused")
 
 # Table, function and its arguments, the method among them, of a row.
 _Task = tuple[Any, ...]
@@ -77,11 +76,7 @@ def _measured(function: Callable[..., Row], *arguments: Any) -> Row:
 
 def tasks_of(method: str, seeds: int, rigs: Sequence[Rig], folder: Path | None) -> list[_Task]:
     """What is to be measured of a method."""
-    tasks: list[_Task] = [
-        (table, scores.class_row, name, method, seeds)
-        for table, names in (("simulated", CLASSES), ("mixed", MIXED))
-        for name in names
-    ]
+    tasks: list[_Task] = [("simulated", scores.class_row, name, method, seeds) for name in CLASSES]
     if folder is not None and (folder / "valimaki2023").is_dir():
         tasks += [
             ("levels", scores.level_row, folder / "valimaki2023", dataset, level, method)

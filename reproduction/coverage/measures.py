@@ -16,7 +16,6 @@ COVERAGE = 0.90
 # Names of the rows that hold all cases of a table.
 POOLED = {
     "simulated": "all classes",
-    "mixed": "all mixtures",
     "known answer": "all known answers",
     "rig": "all rigs",
     "parts": "all parts",

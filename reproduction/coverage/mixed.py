@@ -26,9 +26,9 @@ _RATES_HZ = (5.0, 10.0, 15.0, 20.0, 30.0)
 _MOST_POSES = 2500
 
 
-def make(name: str, seed: int) -> Simulated:
-    """The recording of a motion by this seed."""
-    key = (77, seed, MIXED.index(name))
+def make(name: str, *seeds: int) -> Simulated:
+    """The recording of a motion by these seeds."""
+    key = (*seeds, MIXED.index(name))
     return simulate(drawn_class(name, np.random.default_rng(key)), key)
 
 

@@ -15,7 +15,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.results.status import AXES
-from reproduction.coverage import classes, mixed
+from reproduction.coverage import classes
 from reproduction.coverage.measures import COVERAGE, Row
 from reproduction.published import load_simulated, path_to
 from reproduction.recordings import CYCLE, PARTS, Rig, Truth
@@ -58,14 +58,13 @@ def _row(table: str, name: str, method: str, found: Mapping[str, Mapping[str, fl
 
 
 def class_row(name: str, method: str, seeds: int) -> Row:
-    """Errors over the bound, NEES and coverage of a simulated class, fixed or mixed."""
-    is_mixed = name in mixed.MIXED
+    """Errors over the bound, NEES and coverage of a simulated class."""
     found = {}
     for seed in range(seeds):
-        recording = (mixed if is_mixed else classes).make(name, seed)
+        recording = classes.make(name, seed)
         one = answer(recording.parent, recording.child, METHODS[method])
         found[f"{seed}"] = _class_case(name, recording, one)
-    return _row("mixed" if is_mixed else "simulated", name, method, found)
+    return _row("simulated", name, method, found)
 
 
 def _class_case(

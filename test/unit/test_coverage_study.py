@@ -150,12 +150,10 @@ def test_coverage_with_the_floor_is_told_apart():
 
 def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
-    monkeypatch.setattr(study, "MIXED", ("mixed_arm",))
     rows = study.measure(study.tasks_of("dnlo", 2, [], None), ["dnlo"], 1)
     found = {one.name: one for one in rows}
     assert 0.3 < found["hand_white"].value("bound") < 3.0
     assert found["flat_agv"].value("refused") == 1.0
-    assert found["mixed_arm"].table == "mixed"
     assert set(found["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
     monkeypatch.delenv("HAND_EYE_CALIB_DATA", raising=False)
     monkeypatch.setattr(study, "measure", lambda *_: rows)
