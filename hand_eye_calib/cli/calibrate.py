@@ -31,7 +31,7 @@ examples:
   hand_eye_calib calibrate my_bag --list
   hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
   hand_eye_calib calibrate my_bag --parent-tf odom:lidar --child-topic /vio --out result
-  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+-0.02
+  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
   hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
   hand_eye_calib calibrate monday/bag tuesday/bag wednesday/bag --out together
   hand_eye_calib calibrate --batch 'fleet/**' --vehicle 'fleet/{vehicle}/' --out results

@@ -42,7 +42,7 @@ _OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for
 
 # Names in backticks; and names that are no words of the language, such as max_gap and prior.z,
 # wherever they stand, but not in a path, after dashes or in quotes.
-_NAMES = re.compile(r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._][a-z_]+)+)(?![\w/=-]|\.\w)")
+_NAMES = re.compile(r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._][a-z_]+)+)(?![\w/=-]|\.\w)( VALUE)?")
 
 
 def flag(name: str) -> str:
@@ -61,8 +61,10 @@ def as_typed(text: str) -> str:
     """
 
     def typed(match: re.Match[str]) -> str:
-        name = match[1] or match[2]
-        return f"--{flag(name)}" if name in _OPTIONS else match[0]
+        name, value = match[1] or match[2], match[3] or ""
+        if name in _OPTIONS and name.startswith("prior."):
+            return f"--prior {name.removeprefix('prior.')}{value.replace(' ', '=')}"
+        return f"--{flag(name)}{value}" if name in _OPTIONS else match[0]
 
     return _NAMES.sub(typed, text)
 

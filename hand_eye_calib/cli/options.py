@@ -85,11 +85,12 @@ def at_least(minimum: int) -> Callable[[str], int]:
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
-    # argparse takes -1e-3, -90deg+-2deg and the like for options otherwise.
+    # argparse takes -1e-3, -90deg+/-2deg and the like for options otherwise.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     rare = parser.add_argument_group("calibration options that are rarely needed")
-    for name in [*_COMMON, *(name for name in OPTION_FIELDS if name not in _COMMON)]:
+    rest = [name for name in OPTION_FIELDS if name not in _COMMON and "prior." not in name]
+    for name in (*_COMMON, *rest):
         field = OPTION_FIELDS[name]
         meta = field.metadata
         unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
@@ -103,9 +104,9 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
-    add, metavar = group.add_argument, "AXIS=VALUE+-SIGMA"
+    add, metavar = group.add_argument, "AXIS=VALUE+/-SIGMA"
     prior = (
-        "what is known of an axis beforehand, such as z=1.85+-0.02 (m) or yaw=-90deg+-2deg; AXIS "
+        "what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; AXIS "
         f"is one of {_AXES}; may be repeated"
     )
     add("--prior", metavar=metavar, action="append", type=_prior, default=[], help=prior)
@@ -118,7 +119,7 @@ def _prior(text: str) -> tuple[str, Any]:
     axis, equals, value = text.partition("=")
     name = f"prior.{axis}"
     if not equals or name not in OPTION_FIELDS:
-        raise ConfigError(f"expected AXIS=VALUE+-SIGMA with AXIS one of {_AXES}; got {text!r}")
+        raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}")
     return name, check_value(OPTION_FIELDS[name], value)
 
 

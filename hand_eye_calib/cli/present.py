@@ -177,7 +177,7 @@ def next_steps(
             steps += [motion] if motion else []
         reach = calibration.out_of_reach
         hidden = [axis for axis in calibration.unobservable() if axis not in reach]
-        extra += [f"--prior {axis}=VALUE+-SIGMA" for axis in hidden[:3]]
+        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in hidden[:3]]
     if extra:
         typed = shlex.join(arguments.typed)
         steps.append(f"hand_eye_calib {typed} {' '.join(dict.fromkeys(extra))}")

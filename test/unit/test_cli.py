@@ -208,7 +208,7 @@ def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"
     assert lines[1:5] == [
         "- z cannot be determined from this motion",
-        "  -> measure it by hand and give --prior-z VALUE+/-SIGMA",
+        "  -> measure it by hand and give --prior z=VALUE+/-SIGMA",
         "- many jumps",
         "  -> find out why",
     ]
@@ -300,7 +300,10 @@ def test_help_lists_every_option_with_its_default(run):
     assert out.startswith("usage: hand_eye_calib calibrate [OPTION ...] PATH ...\n")
     assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")
     words = " ".join(out.partition("\nexamples:")[0].split())
+    assert " --prior AXIS=VALUE+/-SIGMA " in words
     for field in dataclasses.fields(CalibratorConfig):
+        if field.name.startswith("prior_"):
+            continue
         name = f"--{option_name(field).replace('.', '-').replace('_', '-')}"
         entry = words[words.rindex(f" {name} ") :].replace("- ", "-")
         entry = entry[: entry.find(" --", 1)]
@@ -315,7 +318,7 @@ def test_help_lists_every_option_with_its_default(run):
         (["--keyframe-min-translation", "0.5"], {"keyframe_min_translation": 0.5}),
         (["--time-offset", "-1e-3"], {"time_offset": -1e-3}),
         (
-            ["--prior-z", "-1.85+/-0.02", "--prior", "yaw=-90deg+/-2deg"],
+            ["--prior", "z=-1.85+/-0.02", "--prior", "yaw=-90deg+/-2deg"],
             {"prior_z": "-1.85+/-0.02", "prior_yaw": "-90deg+/-2deg"},
         ),
         (["--scale", "none"], {}),
@@ -497,7 +500,7 @@ def test_messages_name_options_as_they_are_typed(capsys):
     note("give `scale` or `child_columns`, not `this`")
     fail("keyframe.min_interval: no scale", 1)
     assert capsys.readouterr().err == (
-        "hand_eye_calib: note: raise --max-gap, or give --prior-z; see 'max_gap' in "
+        "hand_eye_calib: note: raise --max-gap, or give --prior z; see 'max_gap' in "
         "/data/max_gap.txt and time_offset=3\n"
         "hand_eye_calib: note: give --scale or --child-columns, not `this`\n"
         "hand_eye_calib: error: --keyframe-min-interval: no scale\n"
