@@ -187,7 +187,7 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     assert " --z MEASURE_Z_BY_HAND --qx " in command
     assert "\nTo publish it (USE WITH CARE, once you have put in MEASURE_Z_BY_HAND)\n" in out
     (step,) = re.findall(r"^  hand_eye_calib (replay .*)$", out, flags=re.MULTILINE)
-    again = step.replace("VALUE+-SIGMA", "0.1±0.01")
+    again = step.replace("VALUE+/-SIGMA", "0.1±0.01")
     code, out, err = run(*shlex.split(again))
     assert (code, err) == (0, "")
     assert "MEASURE_Z_BY_HAND" not in out
