@@ -5,6 +5,9 @@ line and node print it as it is. Anything else that escapes is a defect of the p
 traceback.
 """
 
+from importlib import import_module
+from typing import Any
+
 
 def printable(text: str) -> str:
     r"""Escape control characters, such as ``\x1b`` and line ends: a name out of a file must not
@@ -48,3 +51,14 @@ class NotEnoughDataError(InputError):
 
 class MissingDependencyError(HandEyeCalibError, ImportError):
     """An optional package is needed for what was asked and is not installed."""
+
+
+def required(module: str, purpose: str, install: str) -> Any:
+    """A module that few need; a MissingDependencyError if it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError:
+        raise MissingDependencyError(
+            f"{purpose} needs {module.partition('.')[0]}, which is not installed: pip install "
+            f"'{install}'"
+        ) from None

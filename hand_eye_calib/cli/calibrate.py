@@ -72,14 +72,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--order", choices=("time", "none"), default="time", help=order)
     add_config_arguments(parser)
     add_output_arguments(parser)
-    add = parser.add_argument_group("images of a target, one for each pose of a hand").add_argument
+    add = parser.add_argument_group("images of a target").add_argument
     target = (
-        "what the images of the folder show, the second PATH: such as "
+        "what the images of --child-topic show, or those of a folder, the second PATH, one for "
+        "each pose of a hand: such as "
         "charuco:5x7:0.04:0.03:4X4_50 (squares, side of a square and of a marker in m, markers) or "
         "aprilgrid:6x6:0.088:0.0264 (tags, side of a tag, gap)"
     )
     add("--target", metavar="TARGET", help=target)
-    camera = "its intrinsics: YAML of camera_info, of Kalibr or of OpenCV"
+    camera = "intrinsics: YAML of camera_info, Kalibr or OpenCV; a bag may have its own camera_info"
     add("--camera", metavar="FILE", type=Path, help=camera)
     _add_many(parser)
     add = parser.add_argument_group("what is installed").add_argument
@@ -141,7 +142,7 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise ConfigError("--batch cannot be combined with PATH or --list")
     if not arguments.batch and (arguments.dask or arguments.vehicle):
         raise ConfigError("--dask and --vehicle are for --batch")
-    if bool(arguments.target) != bool(arguments.camera):
+    if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
     named = [f"{stream}_{kind}" for stream in STREAMS for kind in ("topic", "tf")]
     others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
@@ -160,8 +161,9 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     from hand_eye_calib.cli.present import deliver
 
     paths = arguments.paths
+    are_images = arguments.target and not arguments.child_topic
     are_samples = len(paths) == 1 and paths[0].suffix in _SAMPLES
-    if are_samples or arguments.target or arguments.order == "none":
+    if are_samples or are_images or arguments.order == "none":
         from hand_eye_calib.cli import stops
 
         return deliver(*stops.solved(arguments), arguments)
@@ -200,7 +202,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     and whether one can be one of the two sensors; returns the exit code.
     """
     from hand_eye_calib.io.bags import PoseBag
-    from hand_eye_calib.io.bags.messages import SENSOR_TYPES
+    from hand_eye_calib.io.bags.messages import MESSAGE_TYPES
 
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
         topics = [
@@ -208,7 +210,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
                 **each._asdict(),
                 "rate_hz": (each.count - 1) / (bag.duration_s or 1.0) if each.count > 1 else None,
                 "frames": bag.edges_on(each.name),
-                "is_usable": each.type in SENSOR_TYPES,
+                "is_usable": each.type in MESSAGE_TYPES,
             }
             for each in bag.topics.values()
         ]

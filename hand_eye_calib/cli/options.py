@@ -237,6 +237,8 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
         )
         if fields and not topic:
             raise ConfigError(f"--{stream}-fields is of messages: give --{stream}-topic, too")
+        if stream == "child" and topic and getattr(arguments, "target", None):
+            fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
         found[stream] = f"{topic}?{fields}" if fields else topic or tf
     return {stream: source for stream, source in found.items() if source}
 

@@ -38,18 +38,15 @@ def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
         if not child_path.is_dir():
             raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
         target = target_images.Target.parse(arguments.target)
-        camera = target_images.read_camera(arguments.camera)
+        finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
         (parent,), _ = read_files(arguments, [parent_path], options)
         images = target_images.images_in(child_path)
         _check_counts(arguments, len(parent), len(images))
-        read = target_images.read_images(images)
-        shown = with_progress(read, len(images), "finding the target")
-        seen = target_images.poses_of_target(shown, target, camera)
+        for image in with_progress(images, len(images), "finding the target"):
+            finder.look(target_images.read_image(image))
+        seen = finder.found()
         n_child = len(seen.images)
-        note(
-            f"the target is seen in {n_child} of {len(images)} images, its corners to "
-            f"{float((seen.rms_px**2).mean() ** 0.5):.2f} pixels (rms)"
-        )
+        note(str(seen))
         found = calibrate_arm(parent.poses[seen.images], seen.Ts_camera_target, config)
     counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
     return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}

@@ -7,7 +7,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.limits import LARGEST_TEXT
+from hand_eye_calib.io.limits import LARGEST
 
 
 def open_regular(path: str | Path) -> BufferedReader:
@@ -26,7 +26,7 @@ def open_regular(path: str | Path) -> BufferedReader:
     raise InputError(f"cannot read {path}: it is not a regular file; save its content to one first")
 
 
-def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
+def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
     """Read a whole file; an InputError if that is not possible, or it is larger than ``largest``
     bytes.
     """
@@ -36,7 +36,7 @@ def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
         return file.read()
 
 
-def read_text(path: str | Path, expected: str, largest: int = LARGEST_TEXT) -> str:
+def read_text(path: str | Path, expected: str, largest: int = LARGEST) -> str:
     """Read a whole text file in UTF-8, with or without a byte order mark; ``expected`` is what an
     error says that it should be. Raises as :func:`read_bytes`.
     """

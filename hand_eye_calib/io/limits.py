@@ -2,39 +2,36 @@
 
 A file is never believed about its own size. Text and YAML are refused before memory is allocated
 for them. Bags are read by libraries: while they do so, a command gives the process no more memory
-than :data:`LARGEST_GROWTH`; the poses that are kept come on top.
+than :data:`LARGEST`; the poses that are kept come on top.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_MIB = 1 << 20
+# ---- all files
+
+#: Bytes of a trajectory file, and of memory that reading a bag may take, in a command
+LARGEST = 512 << 20
 
 # ---- bags
 
-#: Bytes of memory that reading a bag may take, in a command
-LARGEST_GROWTH = 512 * _MIB
-#: Bytes that a compressed file may unpack to: this much ...
-SMALLEST_UNPACKED = 64 * _MIB
-#: ... plus this many times its own size.
+#: A compressed file may unpack to this many times its own size.
 LARGEST_RATIO = 256
 #: Bytes of the name of a topic, a type or a frame.
 LONGEST_NAME = 1_024
 #: A block of messages is passed on when it has reached this many bytes.
-BLOCK_BYTES = 4 * _MIB
+BLOCK_BYTES = 4 << 20
 
 # ---- YAML
 
 #: Bytes of a YAML file.
-LARGEST_YAML = 1 * _MIB
+LARGEST_YAML = 1 << 20
 #: Levels of nesting.
 DEEPEST_YAML = 32
 
 # ---- trajectory files
 
-#: Bytes of a trajectory file.
-LARGEST_TEXT = 512 * _MIB
 #: Characters of one line.
 LONGEST_LINE = 65_536
 
@@ -53,8 +50,8 @@ def limit_memory() -> None:
 
 @contextmanager
 def reading_memory() -> Iterator[None]:
-    """Lets the process grow by :data:`LARGEST_GROWTH` and no more, after :func:`limit_memory`; what
-    asks for more gets a MemoryError.
+    """Lets the process grow by :data:`LARGEST` and no more, after :func:`limit_memory`; what asks
+    for more gets a MemoryError.
     """
     if not _is_limited:
         yield
@@ -63,7 +60,7 @@ def reading_memory() -> Iterator[None]:
 
     limits = resource.getrlimit(resource.RLIMIT_AS)
     # Virtual memory, which is what the limit counts.
-    most = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST_GROWTH
+    most = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
     allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
     resource.setrlimit(resource.RLIMIT_AS, (min([most, *allowed]), limits[1]))
     try:

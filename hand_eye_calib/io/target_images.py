@@ -1,19 +1,29 @@
 """Poses of a camera from images of a target: a ChArUco board, or an AprilGrid as of Kalibr."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
+from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.text import angle, length
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+# How OpenCV turns images of ROS into grey ones; its names of Bayer patterns begin with another row.
+_TO_GREY = {
+    **dict.fromkeys(("mono8", "8UC1"), ""),
+    **dict.fromkeys(("bgr8", "8UC3"), "BGR2GRAY"),
+    **{"rgb8": "RGB2GRAY", "bgra8": "BGRA2GRAY", "rgba8": "RGBA2GRAY"},
+    **{"bayer_rggb8": "BayerBG2GRAY", "bayer_bggr8": "BayerRG2GRAY"},
+    **{"bayer_gbrg8": "BayerGR2GRAY", "bayer_grbg8": "BayerGB2GRAY"},
+    **{"yuv422": "YUV2GRAY_UYVY", "yuv422_yuy2": "YUV2GRAY_YUY2"},
+}
 
 # An image needs so many corners of the target, and may miss them by so much (pixels, rms).
 _FEWEST_CORNERS, _LARGEST_RMS_PX = 8, 5.0
@@ -26,9 +36,9 @@ _EXPECTED_CAMERA = (
     "the intrinsics of a camera: camera_info of ROS, camchain of Kalibr, or camera_matrix and "
     "distortion_coefficients of OpenCV"
 )
-
-# Finds corners (N, 3) of the target, m, and their pixels (N, 2) in a grey image.
-_Detector = Callable[[Any], tuple[FloatArray, FloatArray]]
+# Whether a model of distortion is that of a fisheye.
+_IS_FISHEYE = dict.fromkeys(("", "none", "plumb_bob", "radtan", "rational_polynomial"), False)
+_IS_FISHEYE |= {"equidistant": True, "fisheye": True}
 
 
 @dataclass(frozen=True)
@@ -71,6 +81,20 @@ class Camera:
     distortion: FloatArray
     is_fisheye: bool
 
+    @classmethod
+    def of(cls, where: object, matrix: Any, distortion: Any, model: str = "") -> Self:
+        """From 9 numbers, coefficients and the name of their model; an InputError if they are not
+        those of a camera.
+        """
+        try:
+            numbers = np.array(matrix, dtype=float).reshape(3, 3)
+            if not np.isfinite(numbers).all() or numbers[0, 0] <= 0.0:
+                raise ValueError("no focal length")
+            return cls(numbers, np.array(distortion, dtype=float).ravel(), _IS_FISHEYE[model])
+        except (KeyError, TypeError, ValueError):
+            expected = f"{_EXPECTED_CAMERA}; models are {', '.join(filter(None, _IS_FISHEYE))}"
+            raise InputError(f"{where}: expected {expected}") from None
+
 
 def read_camera(path: str | Path) -> Camera:
     """Read intrinsics from YAML of ROS, Kalibr or OpenCV; an InputError if there are none."""
@@ -85,24 +109,17 @@ def read_camera(path: str | Path) -> Camera:
                 value["data"] if isinstance(value, Mapping) else value
                 for value in (document["camera_matrix"], document["distortion_coefficients"])
             )
-        numbers = np.array(matrix, dtype=float).reshape(3, 3)
-        coefficients = np.array(distortion, dtype=float).ravel()
-        if not np.isfinite(numbers).all() or numbers[0, 0] <= 0.0:
-            raise ValueError("no focal length")
     except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(f"{path}: expected {_EXPECTED_CAMERA}") from None
-    is_fisheye = document.get("distortion_model") in ("equidistant", "fisheye")
-    return Camera(numbers, coefficients, is_fisheye)
+    return Camera.of(path, matrix, distortion, document.get("distortion_model", ""))
 
 
-class TargetPoses(NamedTuple):
-    """Poses (N, 4, 4) of the target in the camera, of the images in which it is seen; the indices
-    (N,) of these, and by how many pixels (rms) their corners are missed.
-    """
-
-    Ts_camera_target: FloatArray
-    images: list[int]
-    rms_px: FloatArray
+def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
+    """Intrinsics of a CameraInfo message of ROS; of rectified images the projection counts."""
+    of = {name.lower(): value for name, value in vars(info).items()}  # in ROS 1 K, D and P
+    if is_rectified:
+        return Camera.of(where, np.reshape(of["p"], (3, 4))[:, :3], [])
+    return Camera.of(where, of["k"], of["d"], of["distortion_model"])
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -114,113 +131,145 @@ def images_in(folder: Path) -> list[Path]:
     )
 
 
-def read_images(paths: Iterable[Path]) -> Iterable[Any]:
-    """Images in grey, one at a time."""
-    cv2 = _opencv()
-    for path in paths:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+def read_image(path: Path) -> Any:
+    """An image in grey."""
+    image = _opencv().imread(str(path), _opencv().IMREAD_GRAYSCALE)
+    if image is None:
+        raise InputError(f"{path} is not an image that can be read")
+    return image
+
+
+def grey_of(message: Any) -> Any:
+    """The image of a sensor_msgs/Image or CompressedImage in grey; an InputError if it has none."""
+    cv2, data = _opencv(), np.asarray(message.data, dtype=np.uint8)
+    if not hasattr(message, "encoding"):
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise InputError(f"{path} is not an image that can be read")
-        yield image
+            raise InputError("a compressed image cannot be read")
+        return image
+    if message.encoding not in _TO_GREY:
+        known = ", ".join(_TO_GREY)
+        raise InputError(f"images are encoded as {message.encoding[:40]!r}; expected {known}")
+    n_channels, conversion = message.step // message.width, _TO_GREY[message.encoding]
+    rows = data.reshape(message.height, message.step)[:, : message.width * n_channels]
+    image = rows.reshape(message.height, message.width, n_channels)
+    return (
+        cv2.cvtColor(image, getattr(cv2, f"COLOR_{conversion}")) if conversion else image[:, :, 0]
+    )
 
 
-def poses_of_target(images: Iterable[Any], target: Target, camera: Camera) -> TargetPoses:
-    """Find the target in grey images, and its pose from its corners; an InputError if no image
-    shows it.
+@dataclass(frozen=True)
+class TargetPoses:
+    """Poses (N, 4, 4) of the target in the camera, of the images in which it is seen; the indices
+    (N,) of these, by how many pixels (rms) their corners are missed, and standard deviations
+    (m, rad) of the poses if the corners err by as much; and the number of all images.
     """
-    cv2 = _opencv()
-    markers = getattr(cv2.aruco, f"DICT_{target.dictionary}", None)
-    if markers is None:
-        raise ConfigError(
-            f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
+
+    Ts_camera_target: FloatArray
+    images: list[int]
+    rms_px: FloatArray
+    sigmas: FloatArray
+    n_images: int
+
+    def __str__(self) -> str:
+        rms_px, (shift_m, turn_rad) = np.median(self.rms_px), np.median(self.sigmas, axis=0)
+        return (
+            f"the target is seen in {len(self.images)} of {self.n_images} images, its corners to "
+            f"{rms_px:.2f} pixels (rms): {length(shift_m)} and {angle(turn_rad)} of a pose"
         )
-    dictionary = cv2.aruco.getPredefinedDictionary(markers)
-    detect = (_board if target.kind == "charuco" else _tags)(cv2, target, dictionary)
-    found: list[tuple[FloatArray, int, float]] = []
-    number = -1
-    for number, image in enumerate(images):
-        corners, pixels = detect(image)
-        if len(corners) >= _FEWEST_CORNERS:
-            T_camera_target, rms_px = _pose(cv2, corners, pixels, camera)
-            if rms_px <= _LARGEST_RMS_PX:
-                found.append((T_camera_target, number, rms_px))
-    if not found:
-        raise InputError(
-            f"none of {number + 1} images shows at least {_FEWEST_CORNERS} corners of the target "
-            f"{target.kind} {target.columns}x{target.rows} of {target.dictionary}"
-        )
-    poses, numbers, rms = zip(*found, strict=True)
-    return TargetPoses(np.stack(poses), list(numbers), np.array(rms))
 
 
-def _pose(
-    cv2: Any, corners: FloatArray, pixels: FloatArray, camera: Camera
-) -> tuple[FloatArray, float]:
-    """Pose of the target in the camera, and the rms error of its corners in pixels. Of the two
-    poses that a flat target nearly fits, the better one.
+class TargetFinder:
+    """Finds a target in grey images of a camera, and its poses from its corners; a ConfigError for
+    markers that OpenCV does not have.
     """
-    undistort = cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
-    rays = undistort(pixels.reshape(-1, 1, 2), camera.matrix, camera.distortion).reshape(-1, 2)
-    ideal = np.eye(3), None
-    _, turns, shifts, _ = cv2.solvePnPGeneric(corners, rays, *ideal, flags=cv2.SOLVEPNP_IPPE)
-    found = []
-    for start in zip(turns, shifts, strict=True):
-        turn, shift = cv2.solvePnPRefineLM(corners, rays, *ideal, *start)
+
+    def __init__(self, target: Target, camera: Camera) -> None:
+        self._cv2, self._target, self._camera = _opencv(), target, camera
+        aruco, self._n_images = self._cv2.aruco, 0
+        self._found: list[tuple[FloatArray, int, float, FloatArray]] = []
+        markers = getattr(aruco, f"DICT_{target.dictionary}", None)
+        if markers is None:
+            raise ConfigError(
+                f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
+            )
+        dictionary, size = aruco.getPredefinedDictionary(markers), (target.columns, target.rows)
+        # The corners (k, 3) of each number that is detected.
+        if target.kind == "charuco":
+            board = aruco.CharucoBoard(size, target.size, target.marker, dictionary)
+            self._detect = aruco.CharucoDetector(board).detectBoard
+            self._corners = np.asarray(board.getChessboardCorners(), dtype=float)[:, None]
+            return
+        parameters = aruco.DetectorParameters()
+        parameters.markerBorderBits = 2  # Kalibr's tags have a border of two bits
+        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+        self._detect = aruco.ArucoDetector(dictionary, parameters).detectMarkers
+        # From the lower left tag on, rows upward. OpenCV has the tags of this family upside down:
+        # their corners come from the lower right one on, clockwise.
+        square = target.size * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
+        y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
+        places = (target.size + target.marker) * np.stack([x, y, 0 * x], axis=-1)
+        self._corners = places[:, None] + square
+
+    def look(self, image: Any) -> bool:
+        """Whether the next image shows the target, well enough."""
+        number, self._n_images = self._n_images, self._n_images + 1
+        pixels, ids, *_ = self._detect(image)
+        known = np.ravel([] if ids is None else ids).astype(int)
+        is_known = known < len(self._corners)
+        corners = self._corners[known[is_known]].reshape(-1, 3)
+        if len(corners) < _FEWEST_CORNERS:
+            return False
+        pixels = np.asarray(pixels, dtype=float).reshape(len(known), -1, 2)[is_known]
+        T_camera_target, rms_px, sigmas = self._pose(corners, pixels.reshape(-1, 1, 2))
+        if rms_px <= _LARGEST_RMS_PX:
+            self._found.append((T_camera_target, number, rms_px, sigmas))
+        return rms_px <= _LARGEST_RMS_PX
+
+    def found(self) -> TargetPoses:
+        """All poses; an InputError if no image shows the target."""
+        if not self._found:
+            target = self._target
+            raise InputError(
+                f"none of {self._n_images} images shows at least {_FEWEST_CORNERS} corners of the "
+                f"target {target.kind} {target.columns}x{target.rows} of {target.dictionary}"
+            )
+        poses, numbers, rms, sigmas = zip(*self._found, strict=True)
+        columns = np.stack(poses), list(numbers), np.array(rms), np.array(sigmas)
+        return TargetPoses(*columns, self._n_images)
+
+    def _pose(
+        self, corners: FloatArray, pixels: FloatArray
+    ) -> tuple[FloatArray, float, FloatArray]:
+        """Pose of the target in the camera, the rms error of its corners in pixels, and standard
+        deviations. Of the two poses that a flat target nearly fits, the better one.
+        """
+        cv2, camera = self._cv2, self._camera
+        undistort = cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
+        rays = undistort(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
+        ideal, focal = (np.eye(3), None), camera.matrix[[0, 1], [0, 1]]
+        _, turns, shifts, _ = cv2.solvePnPGeneric(corners, rays, *ideal, flags=cv2.SOLVEPNP_IPPE)
+        found = []
+        for start in zip(turns, shifts, strict=True):
+            turn, shift = cv2.solvePnPRefineLM(corners, rays, *ideal, *start)
+            seen, jacobian = cv2.projectPoints(corners, turn, shift, *ideal)
+            off = (seen.reshape(-1, 2) - rays) * focal
+            rms_px = float(np.sqrt((off**2).sum(axis=1).mean()))
+            found.append((rms_px, turn, shift, jacobian[:, :6]))
+        rms_px, turn, shift, jacobian = min(found, key=lambda each: each[0])
+        of_pixels = jacobian * np.tile(focal, len(corners))[:, None]
+        # Two coordinates of a corner share its error; first come rotations, then translations.
+        variances = rms_px**2 / 2 * np.diag(np.linalg.pinv(of_pixels.T @ of_pixels))
+        sigmas = np.sqrt(variances.reshape(2, 3).mean(axis=1))[::-1]
         T = se3.from_rotation_translation(cv2.Rodrigues(turn)[0], shift.ravel())
-        seen = corners @ T[:3, :3].T + T[:3, 3]
-        off = (seen[:, :2] / seen[:, 2:] - rays) * camera.matrix[[0, 1], [0, 1]]
-        found.append((T, float(np.sqrt((off**2).sum(axis=1).mean()))))
-    return min(found, key=lambda each: each[1])
-
-
-def _board(cv2: Any, target: Target, dictionary: Any) -> _Detector:
-    """Finds the corners of a ChArUco board."""
-    size = (target.columns, target.rows)
-    board = cv2.aruco.CharucoBoard(size, target.size, target.marker, dictionary)
-    charuco = cv2.aruco.CharucoDetector(board)
-    places = np.asarray(board.getChessboardCorners(), dtype=float)
-
-    def detect(image: Any) -> tuple[FloatArray, FloatArray]:
-        pixels, ids, _, _ = charuco.detectBoard(image)
-        if ids is None:
-            return np.empty((0, 3)), np.empty((0, 2))
-        return places[ids.ravel()], np.asarray(pixels, dtype=float).reshape(-1, 2)
-
-    return detect
-
-
-def _tags(cv2: Any, target: Target, dictionary: Any) -> _Detector:
-    """Finds the corners of the tags of an AprilGrid."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.markerBorderBits = 2  # Kalibr's tags have a border of two bits
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    markers = cv2.aruco.ArucoDetector(dictionary, parameters)
-    # From the lower left tag on, rows upward. OpenCV has the tags of this family upside down: their
-    # corners come from the lower right one on, clockwise.
-    step = target.size + target.marker
-    square = target.size * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
-
-    def detect(image: Any) -> tuple[FloatArray, FloatArray]:
-        quads, ids, _ = markers.detectMarkers(image)
-        places, pixels = [np.empty((0, 3))], [np.empty((0, 2))]
-        for k, quad in zip([] if ids is None else ids.ravel(), quads, strict=False):
-            row, column = divmod(int(k), target.columns)
-            if row < target.rows:
-                places.append(square + step * np.array([column, row, 0]))
-                pixels.append(quad[0])
-        return np.concatenate(places), np.concatenate(pixels)
-
-    return detect
+        return T, rms_px, sigmas
 
 
 def _opencv() -> Any:
-    try:
-        import cv2
-
-        cv2.aruco.CharucoDetector  # noqa: B018
-    except (ImportError, AttributeError):
+    cv2 = required("cv2", "finding a target in images", "hand_eye_calib[camera]")
+    if not hasattr(cv2.aruco, "CharucoDetector"):
         raise MissingDependencyError(
             "poses from images of a target need OpenCV 4.7 or newer: pip install "
             "'hand_eye_calib[camera]'"
-        ) from None
+        )
     return cv2

@@ -58,7 +58,7 @@ ROS_LIBRARIES += ["rclpy", "rcl_interfaces", "builtin_interfaces", "rosidl_runti
 ROS_LIBRARIES += ["std_srvs", "tf2_ros"]
 CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "rosbags": "io/bags/",
-    "mcap": "io/bags/mcap_files.py",
+    "mcap": "io/bags/",
     "backports": "io/bags/storage.py",
     "fsspec": "io/remote.py",
     "pyulog": "io/trajectory_files/foreign.py",

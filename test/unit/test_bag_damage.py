@@ -33,14 +33,14 @@ from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 from rosbags import rosbag1, rosbag2
 
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
 from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
 
 MIB = 1 << 20
-# What a command may take: LARGEST_GROWTH, the interpreter and its libraries.
+# What a command may take: LARGEST, the interpreter and its libraries.
 MOST_MIB = 1000
 PLACES = 100
 POSES = wandering_poses(60)
@@ -164,10 +164,11 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
     whole, file = all_poses(path), storage_file(path)
     (path / "metadata.yaml").unlink()
     size = file.stat().st_size
-    for share in (0.9, 0.5, 0.3):
+    for share in (0.9, 0.5, 0.3, 0.04):  # the last in the first chunk
         os.truncate(file, int(size * share))
         recovered, (warning,) = read(path)
-        assert share - 0.35 < len(recovered) / len(whole) < share + 0.1
+        assert share - 0.1 < len(recovered) / len(whole) < share + 0.1
+        assert recovered
         assert recovered == whole[: len(recovered)]
         assert re.search(r"cut off or damaged .* lost", warning)
         assert re.search(rf"recovered are {len(recovered)} messages covering [0-9.]+ s$", warning)
@@ -211,14 +212,11 @@ def without_chunks(data):
 
 
 @pytest.mark.parametrize("change", [without_index, without_chunks])
-def test_mcap_files_without_index_and_without_chunks_are_whole(tmp_path, monkeypatch, change):
+def test_mcap_files_without_index_and_without_chunks_are_whole(tmp_path, change):
     write_bag(tmp_path / "bag", STREAMS)
     changed = tmp_path / "changed.mcap"
     changed.write_bytes(change(storage_file(tmp_path / "bag").read_bytes()))
     assert read(changed) == (all_poses(tmp_path / "bag"), [])
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    with pytest.raises(MissingDependencyError, match="needs mcap, .*: pip install mcap$"):
-        PoseBag(changed)
 
 
 # ---- what is no bag

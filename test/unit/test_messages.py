@@ -1,10 +1,8 @@
 """What is unpacked from bytes is what the library that made them says is in them."""
 
-import contextlib
-
 import numpy as np
 import pytest
-from bag_making import JAZZY, NOETIC, ODOMETRY, PATH, POSE_STAMPED, TF, header
+from bag_making import JAZZY, NOETIC, ODOMETRY, POSE_STAMPED, TF, header
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,13 +11,15 @@ from hand_eye_calib.io.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
     POSE_TYPES,
-    unpack_path,
+    Run,
+    transforms_in,
     unpack_poses,
-    unpack_transforms,
 )
+from hand_eye_calib.io.bags.storage import MessageKind
 
 ENCODINGS = ("cdr", "ros1")
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
+TF_DEFINITION = b"geometry_msgs/TransformStamped[] transforms"
 
 names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
 stamps_ns = st.integers(0, 2**31 * 10**9 - 1)
@@ -93,26 +93,6 @@ def test_a_damaged_one_of_many_poses_is_refused(encoding):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@given(
-    world=names,
-    frames=st.sampled_from([["a"], ["a", "bcd"]]),
-    drawn=st.lists(st.tuples(stamps_ns, numbers), max_size=6),
-)
-def test_a_path(encoding, world, frames, drawn):
-    def make(types):
-        steps = [
-            message_of(types, POSE_STAMPED, stamp_ns, frames[index % len(frames)], "", values)
-            for index, (stamp_ns, values) in enumerate(drawn)
-        ]
-        return types.types[PATH](header(types, 12, world), steps)
-
-    found = unpack_path(*serialized(encoding, PATH, make))
-    assert {*found.world_frames} <= {printable(world)}
-    assert found.stamps_ns.tolist() == [stamp_ns for stamp_ns, _ in drawn]
-    np.testing.assert_array_equal(found.poses, np.reshape([each for _, each in drawn], (-1, 7)))
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
 @given(drawn=st.lists(poses, max_size=4))
 def test_transforms_lose_the_leading_slash_of_old_frames(encoding, drawn):
     def make(types):
@@ -122,16 +102,10 @@ def test_transforms_lose_the_leading_slash_of_old_frames(encoding, drawn):
         ]
         return types.types[TF](edges)
 
-    found = unpack_transforms(*serialized(encoding, TF, make))
+    kind = MessageKind("/tf", TF, encoding, ("MSG", TF_DEFINITION))
+    data, _ = serialized(encoding, TF, make)
+    found = transforms_in(*Run(kind, [data], np.zeros(1)).decoded())
     for fields, (stamp_ns, world, sensor, values) in zip(found, drawn, strict=True):
         frames = printable(world).lstrip("/"), printable(sensor).lstrip("/")
         assert fields[:3] == (stamp_ns, *frames)
         np.testing.assert_array_equal([*fields.position, *fields.quat_xyzw], values)
-
-
-@pytest.mark.parametrize("unpack", [unpack_path, unpack_transforms])
-@given(data=st.binary(max_size=200), is_ros1=st.booleans())
-def test_bytes_that_are_no_message_are_malformed_and_nothing_else(unpack, data, is_ros1):
-    for start in (b"", b"\x00\x01\x00\x00"):
-        with contextlib.suppress(*MALFORMED):
-            list(unpack(start + data, is_ros1))

@@ -9,7 +9,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.target_images import Camera, Target, images_in, poses_of_target, read_camera
+from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, images_in, read_camera
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")
@@ -59,6 +59,13 @@ def aprilgrid_picture(columns, rows, size, gap):
         bottom = picture.shape[0] - number // columns * step
         picture[bottom - side : bottom, left : left + side] = tag
     return picture
+
+
+def poses_of_target(images, target, camera):
+    finder = TargetFinder(target, camera)
+    for image in images:
+        finder.look(image)
+    return finder.found()
 
 
 def views(count, center, rng):

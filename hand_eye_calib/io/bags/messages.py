@@ -1,46 +1,47 @@
-"""Stamps, frames and values of ROS messages, unpacked from their bytes.
+"""Types of messages, and what is measured in them.
 
-All types that are read begin with the same bytes: a ``std_msgs/Header``, for some types the
-sensor's frame, then what is measured. Only those are unpacked, which takes a small part of the time
-of a whole message and needs no type definitions. A new type is a row in :data:`MESSAGE_TYPES`.
+Those of the first part of the table are unpacked from their bytes: all begin with a
+``std_msgs/Header``, for some types the sensor's frame, then what is measured. Only that is
+unpacked, which takes a small part of the time of a whole message and needs no type definitions.
+Messages of all other types are decoded by libraries. A new type is a row in the table.
 """
 
+import json
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from types import SimpleNamespace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, printable, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator
-from hand_eye_calib.io.bags.fields import FIELDS
-from hand_eye_calib.io.bags.mcap_files import MessageKind
 from hand_eye_calib.io.bags.poses import PoseColumns
+from hand_eye_calib.io.bags.storage import MessageKind
 from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin
 from hand_eye_calib.io.limits import LONGEST_NAME
+from hand_eye_calib.io.trajectory_files.table import TWIST
 from hand_eye_calib.io.transforms import PoseFields
 
 # What unpacking bytes that are not a message of its type may raise.
 MALFORMED = (struct.error, ValueError)
-Errors = type[Exception] | tuple[type[Exception], ...]
 
 T = TypeVar("T")
 
 _NS_PER_S = STAMP_UNITS["s"]
 _POSE_SIZE = struct.calcsize("=7d")
-# Of what is no pose, the part that is not measured: at the origin, level.
-_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 # ---- bytes
 
 # CDR begins with 4 bytes that say how it is encoded, and alignment counts from there. A ROS 1
-# header begins with 4 bytes of sequence number, and nothing is aligned.
-_START, _CDR = 4, b"\x00\x01"
+# header begins with as many bytes of sequence number, and nothing is aligned.
+_START, _CDR = struct.calcsize("=I"), b"\x00\x01"
 
 
 class Cursor:
@@ -49,43 +50,33 @@ class Cursor:
     def __init__(self, data: bytes, is_ros1: bool) -> None:
         if not is_ros1 and bytes(data[:2]) != _CDR:
             raise ValueError(f"expected plain CDR, found encoding 0x{bytes(data[:2]).hex()}")
-        self.data, self.is_ros1, self.position = data, is_ros1, 0 if is_ros1 else _START
+        self._data, self._is_ros1, self.position = data, is_ros1, _START
 
-    def read(self, format_: str) -> tuple[float, ...]:
+    def read(self, format_: str) -> tuple[Any, ...]:
         """Read numbers of one kind, by their format in struct."""
-        if not self.is_ros1:
+        if not self._is_ros1:
             self.position += (_START - self.position) % struct.calcsize(format_[-1])
-        values = struct.unpack_from(f"<{format_}", self.data, self.position)
+        values = struct.unpack_from(f"<{format_}", self._data, self.position)
         self.position += struct.calcsize(f"={format_}")
         return values
 
-    def number(self, format_: str = "I") -> int:
-        """Read a whole number, of 4 bytes without sign by default."""
-        return int(self.read(format_)[0])
-
     def stamp_ns(self) -> int:
         """Read a stamp."""
-        seconds, nanoseconds = self.number("I" if self.is_ros1 else "i"), self.number()
+        (seconds,), (nanoseconds,) = self.read("I" if self._is_ros1 else "i"), self.read("I")
         if nanoseconds >= _NS_PER_S:
             raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
-        return seconds * _NS_PER_S + nanoseconds
+        return int(seconds * _NS_PER_S + nanoseconds)
 
     def name(self) -> str:
         """Read a string; in CDR it ends in a zero byte. Control characters are escaped."""
-        length = self.number()
+        (length,) = self.read("I")
         start, self.position = self.position, self.position + length
-        if self.position > len(self.data):
+        if self.position > len(self._data):
             raise ValueError("a text does not fit into the message")
         if length > LONGEST_NAME:
             raise ValueError(f"the name of a frame has {length} bytes, more than {LONGEST_NAME}")
-        end = self.position - (not self.is_ros1)
-        return printable(str(self.data[start : max(end, start)], "utf-8"))
-
-    def header(self) -> tuple[int, str]:
-        """Read stamp and frame."""
-        if self.is_ros1:
-            self.number()  # sequence number
-        return self.stamp_ns(), self.name()
+        end = self.position - (not self._is_ros1)
+        return printable(str(self._data[start : max(end, start)], "utf-8"))
 
 
 def _pose(cursor: Cursor) -> Sequence[float]:
@@ -94,18 +85,18 @@ def _pose(cursor: Cursor) -> Sequence[float]:
 
 
 def _imu(cursor: Cursor) -> Sequence[float]:
-    """Orientation, scalar last, and angular rates (rad/s) of an Imu: NaN for what its covariance
+    """Angular rates (rad/s) and orientation, scalar last, of an Imu: NaN for what its covariance
     says it does not have.
     """
     values = cursor.read("25d")
     orientation = (math.nan,) * 4 if values[4] == -1.0 else values[:4]
     rates = (math.nan,) * 3 if values[16] == -1.0 else values[13:16]
-    return orientation + rates
+    return rates + orientation
 
 
 def _fix(cursor: Cursor) -> Sequence[float]:
     """Latitude, longitude (deg) and height (m) of a NavSatFix: NaN without a fix."""
-    status, _ = cursor.number("b"), cursor.number("H")
+    (status,), _ = cursor.read("b"), cursor.read("H")
     values = cursor.read("3d")
     return values if status >= 0 else (math.nan,) * 3
 
@@ -114,55 +105,102 @@ def _fix(cursor: Cursor) -> Sequence[float]:
 
 
 class MessageType(NamedTuple):
-    """A type of messages with a header that are read: its name; what they can be read as, the usual
-    first, and where that is in what is unpacked; what reads the values behind the frames; and
-    whether the sensor's frame stands behind the header.
+    """A type of messages that are read: its name; what they can be read as, the usual first; what
+    reads the values behind the frames, if it is unpacked from its bytes, and whether the sensor's
+    frame stands behind the header; or the fields of it that are read, see :mod:`.sources`.
     """
 
     name: str
-    measures: Mapping[str, slice]
-    unpack: Callable[[Cursor], Sequence[float]]
+    measures: Sequence[str]
+    unpack: Callable[[Cursor], Sequence[float]] | None = None
     has_child_frame: bool = False
+    fields: str = ""
 
 
-_OF_POSES = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7)}
-_OF_IMU = {"rates": slice(4, 7), "rotations": slice(4)}
-_OF_POINTS = {"positions": slice(3)}
+# Where that stands in what is unpacked; latitude, longitude and height are positions.
+_PARTS = {
+    "poses": slice(7),
+    "positions": slice(3),
+    "rotations": slice(3, 7),
+    "rates": slice(3),
+}
+_OF_POSES, _OF_POINTS = ("poses", "positions", "rotations"), ("positions",)
+_TURN = "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
+_PLACE = "lat_deg={0}latitude,lon_deg={0}longitude,height={0}altitude"
 
-# The likeliest first.
+
+def _pose_at(at: str, stamp: str = "header.stamp", parts: str = "position orientation") -> str:
+    position, orientation = (f"{at}{part}" for part in parts.split())
+    place = f"x={position}.x,y={position}.y,z={position}.z"
+    return f"t={stamp},{place},{_TURN.format(orientation)}"
+
+
+def _twist_at(at: str) -> str:
+    parts = (f"{kind}.{axis}" for kind in ("linear", "angular") for axis in "xyz")
+    return ",".join(["t=header.stamp", *map(f"{{}}={at}.{{}}".format, TWIST, parts)])
+
+
+PATH_TYPE = "nav_msgs/msg/Path"
+POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
+#: Images, which are read with a target.
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+#: Lists of transforms, and one alone.
+TF_TYPES = (
+    *("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
+    *("foxglove.FrameTransforms", "foxglove.FrameTransform"),
+)
+
+# The likeliest first; of an array in a message, the first element is read.
 _ROWS = (
     MessageType("nav_msgs/msg/Odometry", _OF_POSES, _pose, has_child_frame=True),
     MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, _pose),
     MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, _pose),
     MessageType("geometry_msgs/msg/TransformStamped", _OF_POSES, _pose, has_child_frame=True),
-    MessageType("sensor_msgs/msg/Imu", _OF_IMU, _imu),
+    MessageType(PATH_TYPE, _OF_POSES),
+    MessageType("sensor_msgs/msg/Imu", ("rates", "rotations"), _imu),
     MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, _fix),
     MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, lambda cursor: cursor.read("3d")),
+    MessageType(
+        "geographic_msgs/msg/GeoPoseStamped",
+        _OF_POSES,
+        fields="t=header.stamp,"
+        + ",".join([_PLACE.format("pose.position."), _TURN.format("pose.orientation")]),
+    ),
+    *(
+        MessageType(name, _OF_POSES, fields=fields)
+        for name, fields in (
+            ("geometry_msgs/msg/TwistStamped", _twist_at("twist")),
+            ("geometry_msgs/msg/TwistWithCovarianceStamped", _twist_at("twist.twist")),
+            (
+                "px4_msgs/msg/VehicleOdometry",
+                "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,"
+                "qw=q.0,qx=q.1,qy=q.2,qz=q.3",
+            ),
+            ("geometry_msgs/msg/PoseArray", _pose_at("poses.0.")),
+            ("mocap4r2_msgs/msg/RigidBodies", _pose_at("rigidbodies.0.pose.")),
+            (
+                "motion_capture_tracking_interfaces/msg/NamedPoseArray",
+                _pose_at("poses.0.pose."),
+            ),
+            ("foxglove.PoseInFrame", _pose_at("pose.", "timestamp")),
+            ("foxglove.PosesInFrame", _pose_at("poses.0.", "timestamp")),
+            ("foxglove.FrameTransform", _pose_at("", "timestamp", "translation rotation")),
+        )
+    ),
+    MessageType("foxglove.LocationFix", _OF_POINTS, fields=f"t=timestamp,{_PLACE.format('')}"),
+    MessageType(POINTS_TYPE, _OF_POSES),
 )
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Those that carry whole poses.
 POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _pose)
-# Arrays of PoseStamped and of TransformStamped.
-PATH_TYPE = "nav_msgs/msg/Path"
-POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
-TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-#: Types of topics that can be one of the two sensors.
-SENSOR_TYPES = (
-    *POSE_TYPES,
-    PATH_TYPE,
-    *(name for name in MESSAGE_TYPES if name not in POSE_TYPES),
-    *FIELDS,
-    POINTS_TYPE,
-)
 
 
 def measured_as(message_type: str, wanted: str, source: object) -> str:
     """What messages of a type are read as: what is wanted, or the usual for "auto"; a ConfigError
     if they cannot be read as that.
     """
-    possible = ["positions"] if message_type == "foxglove.LocationFix" else [*_OF_POSES]
-    if message_type in MESSAGE_TYPES:
-        possible = [*MESSAGE_TYPES[message_type].measures]
+    row = MESSAGE_TYPES.get(message_type)
+    possible = row.measures if row else _OF_POSES
     if wanted == "auto":
         return possible[0]
     if wanted not in possible:
@@ -173,12 +211,74 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     return wanted
 
 
-# ---- unpacking
+# ---- messages that a library decodes
 
 
-def unpack_stamp_ns(data: bytes) -> int:
-    """Unpack the stamp of a message in CDR that begins with a header; raises MALFORMED."""
-    return Cursor(data, is_ros1=False).stamp_ns()
+@lru_cache
+def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
+    """What makes an object of the bytes of a message; an InputError if its definition or encoding
+    is not known.
+    """
+    name, (language, content) = kind.type, kind.definition
+    if kind.encoding == "json":
+        return partial(json.loads, object_hook=lambda fields: SimpleNamespace(**fields))
+    try:
+        if kind.encoding == "protobuf":
+            of_protobuf = required("mcap_protobuf.decoder", name, "hand_eye_calib[foxglove]")
+            schema = SimpleNamespace(id=0, name=name, encoding=language, data=content)
+            decode: Callable[[bytes], Any] = of_protobuf.DecoderFactory().decoder_for(
+                kind.encoding, schema
+            )
+            return decode
+        if kind.encoding not in ("cdr", "ros1"):
+            raise InputError(
+                f"messages of type {name} are encoded as {kind.encoding[:40]!r}; expected cdr, "
+                "ros1, json or protobuf"
+            )
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        types = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
+        if content and name not in types.types:
+            text, is_idl = content.decode(), "idl" in language.lower()
+            known = get_types_from_idl(text) if is_idl else get_types_from_msg(text, name)
+            types.register({key: each for key, each in known.items() if key not in types.types})
+        types.types[name]
+    except HandEyeCalibError:
+        raise
+    except Exception as error:  # of many kinds, at damaged definitions
+        raise InputError(
+            f"the bag has no definition of {name} that can be read; record it as mcap, which "
+            "stores definitions"
+        ) from error
+    read = types.deserialize_ros1 if kind.is_ros1 else types.deserialize_cdr
+    return lambda data: read(data, name)
+
+
+def ns_of(stamp: Any) -> int | None:
+    """A stamp of a message, as ROS, Foxglove's JSON or protobuf has it, in ns; None for others."""
+    for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos")):
+        if hasattr(stamp, nanoseconds):
+            return int(getattr(stamp, seconds) * _NS_PER_S + getattr(stamp, nanoseconds))
+    return None
+
+
+def pose_row(position: Any, orientation: Any) -> tuple[float, ...]:
+    """x y z qx qy qz qw of a position, or translation, and an orientation of a message."""
+    at, turn = position, orientation
+    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
+
+
+def transforms_in(message: Any) -> Iterator[PoseFields]:
+    """The transforms of a message of one of TF_TYPES, frames without a leading slash."""
+    for each in getattr(message, "transforms", [message]):
+        if hasattr(each, "header"):
+            stamp, parent, pose = each.header.stamp, each.header.frame_id, each.transform
+        else:  # of Foxglove
+            stamp, parent, pose = each.timestamp, each.parent_frame_id, each
+        frames = (printable(name[:LONGEST_NAME]) for name in (parent, each.child_frame_id))
+        row = pose_row(pose.translation, pose.rotation)
+        parent, frame = (name.lstrip("/") for name in frames)
+        yield PoseFields(ns_of(stamp) or 0, parent, frame, row[:3], row[3:])
 
 
 class Run(NamedTuple):
@@ -188,23 +288,40 @@ class Run(NamedTuple):
     messages: list[bytes]
     bag_ns: IntArray
 
-    def read(self, unpack: Callable[..., T], errors: Errors = MALFORMED) -> T:
-        """What is unpacked of the messages and whether they are of ROS 1; an InputError if that
-        raises one of the errors.
+    def read(self, unpack: Callable[..., T]) -> T:
+        """What is unpacked of the messages and whether they are of ROS 1; an InputError if they
+        are MALFORMED.
         """
         try:
             return unpack(self.messages, self.kind.is_ros1)
-        except InputError:
+        except HandEyeCalibError:
             raise
-        except errors as error:
-            raise InputError(
-                f"{self.kind.topic}: a message is not a readable {self.kind.type} ({error}); the "
-                "bag is damaged, record it again"
-            ) from error
+        except MALFORMED as error:
+            raise self._unreadable(error) from error
 
-    def each(self, unpack: Callable[..., T], errors: Errors = MALFORMED) -> list[T]:
-        """The same of each message."""
-        return self.read(lambda data, is_ros1: [unpack(each, is_ros1) for each in data], errors)
+    def decoded(self) -> Iterator[Any]:
+        """The messages as objects with their fields; an InputError at one that cannot be read."""
+        decode = _decoder(self.kind)
+        for data in self.messages:
+            try:
+                message = decode(data)
+            except Exception as error:  # the libraries' are of many kinds
+                raise self._unreadable(error) from error
+            yield message
+
+    def _unreadable(self, error: Exception) -> InputError:
+        return InputError(
+            f"{self.kind.topic}: a message is not a readable {self.kind.type} ({error}); the bag "
+            "is damaged, record it again"
+        )
+
+
+# ---- messages that are unpacked from their bytes
+
+
+def unpack_stamp_ns(data: bytes) -> int:
+    """Unpack the stamp of a message in CDR that begins with a header; raises MALFORMED."""
+    return Cursor(data, is_ros1=False).stamp_ns()
 
 
 _Unpacked = tuple[int, str, str | None, Sequence[float], int]
@@ -213,9 +330,10 @@ _Unpacked = tuple[int, str, str | None, Sequence[float], int]
 def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     """Stamp in ns, the header's frame, the sensor's behind it, values, and where these end."""
     cursor = Cursor(data, is_ros1)
-    stamp_ns, frame = cursor.header()
+    stamp_ns, frame = cursor.stamp_ns(), cursor.name()
     sensor_frame = cursor.name() if row.has_child_frame else None
-    return stamp_ns, frame, sensor_frame, row.unpack(cursor), cursor.position
+    values = row.unpack(cursor) if row.unpack else ()
+    return stamp_ns, frame, sensor_frame, values, cursor.position
 
 
 def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseColumns:
@@ -248,27 +366,6 @@ def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatAr
     return seconds * _NS_PER_S + nanoseconds, poses
 
 
-def unpack_path(data: bytes, is_ros1: bool) -> PoseColumns:
-    """Unpack the poses of a nav_msgs/Path; raises MALFORMED."""
-    cursor = Cursor(data, is_ros1)
-    _, world_frame = cursor.header()
-    rows = [(cursor.header()[0], _pose(cursor)) for _ in range(cursor.number())]
-    stamps_ns = np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64)
-    poses = np.reshape([pose for _, pose in rows], (-1, 7))
-    return PoseColumns.of_frames(stamps_ns, poses, world_frame)
-
-
-def unpack_transforms(data: bytes, is_ros1: bool) -> list[PoseFields]:
-    """Unpack the transforms of a tf message, frames without a leading slash; raises MALFORMED."""
-    cursor, found = Cursor(data, is_ros1), []
-    for _ in range(cursor.number()):
-        stamp_ns, world_frame = cursor.header()
-        frames = world_frame.lstrip("/"), cursor.name().lstrip("/")
-        values = _pose(cursor)
-        found.append(PoseFields(stamp_ns, *frames, values[:3], values[3:]))
-    return found
-
-
 # ---- what the messages of a topic measure
 
 
@@ -295,12 +392,12 @@ class MessageReader:
         columns = unpack_poses(messages, self._row.name, is_ros1)
         if self._are_poses:
             return columns, np.ones(len(messages), dtype=bool)
-        values = columns.poses[:, self._row.measures[self._measures]]
+        values = columns.poses[:, _PARTS[self._measures]]
         is_usable = np.asarray(np.isfinite(values).all(axis=1), dtype=bool)
         self.n_left_out += int((~is_usable).sum())
-        poses = np.tile(_NOTHING, (len(values), 1))
+        poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))
         if is_usable.any():
-            part = slice(3) if self._measures == "positions" else slice(3, 7)
+            part = _PARTS["positions" if self._measures == "positions" else "rotations"]
             poses[is_usable, part] = self._measured(columns.stamps_ns, values, is_usable)
         poses[~is_usable] = np.nan
         columns = columns._replace(poses=poses)

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry.trajectory import Trajectory
 
-# A delay against the bag's time is of a wrong stamp if it is this many times farther from both
-# neighbours than these from each other (and than the usual step), and this far.
-_FACTOR, _SMALLEST_JUMP_S = 10.0, 0.5
+# A delay against the bag's time (s) is of a wrong stamp if it is so much farther from both
+# neighbours than these are from each other and than the usual step: computers delay for less.
+_JUMP_S = 0.5
 
 
 class PoseColumns(NamedTuple):
     """The unpacked part of N messages in columns: stamps (N,), frames, and poses (N, 7) of
-    x y z qx qy qz qw; of messages that are no poses, what :attr:`MessageType.unpack` reads.
+    x y z qx qy qz qw; of messages that are no poses, what is unpacked of them.
     """
 
     stamps_ns: IntArray
@@ -97,6 +97,4 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
     delays_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
     steps_s, across_s = np.abs(np.diff(delays_s)), np.abs(delays_s[2:] - delays_s[:-2])
     off_s = np.minimum(steps_s[:-1], steps_s[1:])
-    usual_s = across_s + np.median(steps_s[1:-1])
-    is_believable: BoolArray = (off_s <= _SMALLEST_JUMP_S) | (off_s <= _FACTOR * usual_s)
-    return is_believable
+    return np.asarray(off_s <= _JUMP_S + across_s + np.median(steps_s[1:-1]))

@@ -9,31 +9,30 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import chain, pairwise
 from operator import itemgetter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.fields import FIELDS, split_fields
-from hand_eye_calib.io.bags.mcap_files import Message
 from hand_eye_calib.io.bags.messages import (
+    IMAGE_TYPES,
     MESSAGE_TYPES,
     PATH_TYPE,
     POINTS_TYPE,
     POSE_TYPES,
-    SENSOR_TYPES,
     TF_TYPES,
     Run,
     measured_as,
-    unpack_transforms,
+    transforms_in,
 )
 from hand_eye_calib.io.bags.poses import PoseTable
 from hand_eye_calib.io.bags.sources import (
     FieldReading,
+    ImageReading,
     JoinedReading,
     PathReading,
     Reading,
@@ -43,7 +42,9 @@ from hand_eye_calib.io.bags.sources import (
     TransformReading,
     is_static,
 )
-from hand_eye_calib.io.bags.storage import message_blocks, open_bags
+from hand_eye_calib.io.bags.storage import Message, message_blocks, open_bags
+from hand_eye_calib.io.limits import LONGEST_NAME
+from hand_eye_calib.io.target_images import Target, camera_of, read_camera
 from hand_eye_calib.io.transforms import TfSource, TfStream
 
 # A topic with fewer poses is not one of the two sensors: goals and initial poses are published
@@ -51,8 +52,6 @@ from hand_eye_calib.io.transforms import TfSource, TfStream
 _FEWEST_POSES = 3
 # Words of a topic's name that say which stream it is, the likeliest parent first.
 _WORDS = ("parent", "base", "lidar", "", "child")
-# Transforms that a message lists.
-_MOST_FRAMES = 20
 
 
 class TopicInfo(NamedTuple):
@@ -134,13 +133,19 @@ class PoseBag:
         transforms. An InputError if they cannot be read.
         """
         runs = self._runs([topic] if self.topics[topic].type in TF_TYPES else [])
-        first = next((run.each(unpack_transforms) for run in runs), [])
-        return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in chain(*first)})
+        first = chain.from_iterable(map(transforms_in, next((run.decoded() for run in runs), ())))
+        return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in first})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
         """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
         its type are for; a ConfigError if they do not have what is wanted.
         """
+        topic, _, fields = str(source).partition("?")
+        if "=" in fields:
+            usual = FieldReading("", topic, fields).measures
+            if usual != "poses" and wanted not in ("auto", usual):
+                raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
+            return usual if wanted == "auto" else wanted
         return measured_as(self._type_of(source), wanted, source)
 
     def check(self, source: Source) -> None:
@@ -151,7 +156,7 @@ class PoseBag:
             if not self._of_transforms():
                 raise InputError(f"no transforms in {self}. {self._listing()}")
             return
-        topic, fields = split_fields(source)
+        topic, _, fields = source.partition("?")
         parts = self._parts_of(topic)
         for part in parts:
             if part not in self.topics:
@@ -159,13 +164,15 @@ class PoseBag:
         if len(parts) > 1:
             for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
                 self.measured(part, wanted)
-        elif not fields and (type_ := self._type_of(topic)) not in SENSOR_TYPES:
+        elif not fields and (type_ := self._type_of(topic)) not in MESSAGE_TYPES:
             hint = "read others by their fields, TOPIC?t=header.stamp,x=..."
             if type_ in TF_TYPES:
                 hint = "name two of its frames with --parent-tf and --child-tf"
+            elif type_ in IMAGE_TYPES:
+                hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
             raise InputError(
                 f"topic {source} of {self} is of type {type_ or 'several types'}; accepted are "
-                f"{', '.join(SENSOR_TYPES)}; {hint}. {self._listing()}"
+                f"{', '.join(MESSAGE_TYPES)}; {hint}. {self._listing()}"
             )
 
     def select(
@@ -197,7 +204,7 @@ class PoseBag:
             raise InputError(
                 "name the topics of poses with --parent-topic and --child-topic, or frames with "
                 f"--parent-tf and --child-tf. {self._listing()}"
-                + (f". Transforms are {', '.join(found[:_MOST_FRAMES])}" if found else "")
+                + (f". Transforms are {', '.join(found)[:LONGEST_NAME]}" if found else "")
             )
         chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
         return parent or chosen.pop(0), child or chosen.pop(0)
@@ -249,19 +256,41 @@ class PoseBag:
             self.static_frames.route(*source)  # or it raises
             of_tree = TfStream(source, max_gap_s, self.static_frames)
             return TransformReading(stream, of_tree, self._of_transforms())
-        (topic, fields), type_ = split_fields(source), self._type_of(source)
-        if type_ in MESSAGE_TYPES:
+        topic, _, fields = source.partition("?")
+        if ":" in fields and "=" not in fields:
+            return self._images(stream, topic, fields)
+        type_ = self._type_of(topic)
+        row = MESSAGE_TYPES.get(type_)
+        if fields := fields or (row.fields if row else ""):
+            return FieldReading(stream, topic, fields)
+        if row and row.unpack:
             return TopicReading(stream, topic, type_, self.measured(source, measures))
         if type_ == PATH_TYPE:
             return PathReading(stream, topic)
         if type_ == POINTS_TYPE:
             return ScanReading(stream, topic, self.paths[0], self.files)
-        if topic in self.topics:
-            return FieldReading(stream, topic, fields or FIELDS[type_])
         parts = zip(self._parts_of(topic), ("positions", "rotations"), strict=True)
         return JoinedReading(
             *(TopicReading(stream, part, self._type_of(part), wanted) for part, wanted in parts)
         )
+
+    def _images(self, stream: str, topic: str, text: str) -> Reading:
+        """Reads images of a target, with the intrinsics of a file or of the camera_info beside."""
+        target, _, file = text.partition("@")
+        if (type_ := self._type_of(topic)) not in IMAGE_TYPES:
+            raise InputError(f"{topic} is of type {type_}, which has no images of {target}")
+        if file:
+            return ImageReading(stream, topic, Target.parse(target), read_camera(file))
+        beside = (str(folder / "camera_info") for folder in PurePosixPath(topic).parents)
+        info = next((each for each in beside if each in self.topics), "")
+        run = next(self._runs([info]), None)
+        if run is None:
+            raise InputError(
+                f"no camera_info beside {topic} in {self}; name a file of the intrinsics: with "
+                f"--camera, or {topic}?{target}@FILE"
+            )
+        camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
+        return ImageReading(stream, topic, Target.parse(target), camera)
 
     def trajectory(self, source: Source, measures: str = "auto") -> tuple[Trajectory, list[str]]:
         """The trajectory of one source in the order of stamps, of those with equal stamps the
@@ -289,7 +318,7 @@ class PoseBag:
         tree, notes = FrameTree("the bag's transforms"), {}
         for run in self._runs(self._of_transforms()):
             is_fixed = is_static(run.kind.topic)
-            for _, parent, frame, *values in chain(*run.each(unpack_transforms)):
+            for _, parent, frame, *values in chain.from_iterable(map(transforms_in, run.decoded())):
                 try:
                     pose = checked_pose(*values) if is_fixed else None
                 except InputError as error:

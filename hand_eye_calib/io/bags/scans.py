@@ -7,41 +7,70 @@ of them: they look the same on flat ground whatever the pitch, and pitch and rol
 """
 
 import os
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.config import STAMP_UNITS
+from hand_eye_calib.errors import InputError, printable, required
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import Cursor
+from hand_eye_calib.io.bags.messages import ns_of
 
 # numpy's name of each datatype of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 # Names that drivers give the time of a point.
 _TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
-# A scan lasts so long (s): tells the unit of the times of its points.
-_SHORTEST_S, _LONGEST_S = 0.005, 1.0
 
-# Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
-_NEAREST_M, _FARTHEST_M = 1.0, 80.0
-# Size of a voxel as a share of the median range, within limits (m).
-_VOXEL_SHARE, _LEAST_VOXEL_M, _MOST_VOXEL_M = 0.03, 0.1, 0.4
-# Over so many voxels points are matched: each scan is registered twice, its distortion corrected
-# anew.
-_MATCH_VOXELS = (6.0, 2.0)
-_NEIGHBOURS = 12
-# Of what does not depend on their number.
-_N_THREADS = os.cpu_count() or 1
-# A scan becomes part of the map after so much motion; the map has so many.
-_KEY_M, _KEY_RAD, _N_KEYS = 0.7, 0.06, 30
-# Parts of a scan whose points have the same correction.
-_PARTS = 40
-# A registration with a smaller share of matched points counts as failed.
-_LEAST_MATCHED = 0.3
+
+@dataclass(frozen=True)
+class Tuning:
+    """Numbers of the registration, tried on simulated scans of 16 and 64 rings, in rooms and yards.
+
+    Attributes
+    ----------
+    longest_s : float
+        No scan lasts longer: tells the unit of the times of its points.
+    nearest_m, farthest_m : float
+        Ranges that are used: the robot itself is nearer, and beyond a scan is too sparse.
+    voxel_share, least_voxel_m, most_voxel_m : float
+        Size of a voxel as a share of the median range, within limits.
+    match_voxels : tuple of float
+        Over so many voxels points are matched: each scan is registered twice, its distortion
+        corrected anew.
+    n_neighbours : int
+        Points that a local plane is fitted to.
+    key_m, key_rad : float
+        A scan becomes part of the map after so much motion.
+    n_keys : int
+        Scans in the map: a neighbourhood, which drift does not tear.
+    n_parts : int
+        Parts of a scan whose points have the same correction for motion.
+    least_matched : float
+        A registration with a smaller share of matched points counts as failed.
+    """
+
+    longest_s: float = 1.0
+    nearest_m: float = 1.0
+    farthest_m: float = 80.0
+    voxel_share: float = 0.03
+    least_voxel_m: float = 0.1
+    most_voxel_m: float = 0.4
+    match_voxels: tuple[float, ...] = (6.0, 2.0)
+    n_neighbours: int = 12
+    key_m: float = 0.7
+    key_rad: float = 0.06
+    n_keys: int = 30
+    n_parts: int = 40
+    least_matched: float = 0.3
+
+
+_TUNING = Tuning()
 
 
 class Scan(NamedTuple):
@@ -55,46 +84,40 @@ class Scan(NamedTuple):
     frame: str
 
 
-def unpack_scan(data: bytes, is_ros1: bool) -> Scan:
-    """Points and times of a PointCloud2 message; a ValueError if it is damaged, or has no x, y and
-    z. Without times of its points, a scan counts as taken at once.
+def scan_of(message: Any) -> Scan:
+    """Points and times of a PointCloud2 message; an InputError if it has no x, y and z, or is
+    damaged. Without times of its points, a scan counts as taken at once.
     """
-    cursor = Cursor(data, is_ros1)
-    header_ns, frame = cursor.header()
-    height, width = cursor.number(), cursor.number()
-    formats, offsets = {}, {}
-    for _ in range(cursor.number()):
-        name, offsets[name], kind = cursor.name(), cursor.number(), cursor.number("B")
-        cursor.number()
-        if not 0 < kind < len(_DATATYPES):
-            raise ValueError(f"field {name} of the points has datatype {kind}")
-        formats[name] = _DATATYPES[kind]
-    order = ">" if cursor.number("B") else "<"
-    step, _, size = cursor.number(), cursor.number(), cursor.number()
-    if not {"x", "y", "z"} <= formats.keys():
-        raise ValueError(f"points have no x, y, z, but {', '.join(formats)}")
-    if size < height * width * step or cursor.position + size > len(data):
-        raise ValueError(f"{height * width} points do not fit into {size} bytes")
-    table = np.frombuffer(data, np.uint8, height * width * step, cursor.position).reshape(-1, step)
+    offsets = {each.name: (each.offset, each.datatype) for each in message.fields}
+    if not {*"xyz"} <= offsets.keys():
+        raise InputError(f"points have no x, y, z, but {', '.join(offsets)}")
+    n_bytes = message.height * message.width * message.point_step
+    order, data = ">" if message.is_bigendian else "<", np.asarray(message.data, dtype=np.uint8)
 
     def column(name: str) -> FloatArray:
-        kind = np.dtype(order + formats[name])
-        part = table[:, offsets[name] : offsets[name] + kind.itemsize]
-        return np.ascontiguousarray(part).view(kind)[:, 0].astype(float)
+        offset, kind = offsets[name]
+        part = data[:n_bytes].reshape(-1, message.point_step)[:, offset:]
+        form = np.dtype(order + _DATATYPES[kind])
+        return np.ascontiguousarray(part[:, : form.itemsize]).view(form)[:, 0].astype(float)
 
-    points = np.stack([column(axis) for axis in "xyz"], axis=-1)
-    of_time = next((name for name in _TIMES if name in formats), None)
-    times = column(of_time) if of_time else np.zeros(len(points))
+    try:
+        points = np.stack([column(axis) for axis in "xyz"], axis=-1)
+        of_time = next((name for name in _TIMES if name in offsets), None)
+        times = column(of_time) if of_time else np.zeros(len(points))
+    except (ValueError, IndexError, TypeError) as error:
+        raise InputError(f"a scan of points is damaged ({error}); record it again") from error
     ranges = np.linalg.norm(points, axis=1)
-    is_used = (ranges > _NEAREST_M) & (ranges < _FARTHEST_M)  # nor those that are not finite
+    is_used = (ranges > _TUNING.nearest_m) & (ranges < _TUNING.farthest_m)  # nor if not finite
     points, times = points[is_used], times[is_used]
-    span = np.ptp(times) if len(times) else 0.0
-    units_s = [unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if _SHORTEST_S <= span * unit <= _LONGEST_S]
-    if not units_s:
+    span, header_ns = np.ptp(times) if len(times) else 0.0, ns_of(message.header.stamp) or 0
+    units_s = [unit_ns * 1e-9 for unit_ns in STAMP_UNITS.values()]
+    unit_s = max((unit for unit in units_s if span * unit <= _TUNING.longest_s), default=0.0)
+    frame = printable(message.header.frame_id)
+    if not span * unit_s:
         return Scan(points, np.ones(len(times)), header_ns, frame)
     # Times may be relative to the stamp of the header, or absolute.
-    last_s = float(times.max() * units_s[0])
-    stamp_ns = round(last_s * 1e9) + header_ns * (last_s <= _LONGEST_S)
+    last_s = float(times.max() * unit_s)
+    stamp_ns = round(last_s * 1e9) + header_ns * (last_s <= _TUNING.longest_s)
     return Scan(points, (times - times.min()) / span, stamp_ns, frame)
 
 
@@ -127,22 +150,18 @@ class ScanOdometry:
             if np.array_equal(kept["files"], self._state):
                 self.kept = Odometry(*(kept[name] for name in Odometry._fields))
                 return
-        try:
-            import small_gicp
-        except ImportError:
-            raise MissingDependencyError(
-                "odometry from the points of a lidar needs small_gicp, which is not installed: pip "
-                "install 'hand_eye_calib[lidar]'; or record the odometry of a lidar SLAM"
-            ) from None
-        self._gicp = small_gicp
+        self._gicp = required(
+            "small_gicp", "odometry from the points of a lidar", "hand_eye_calib[lidar]"
+        )
+        self._n_threads = os.cpu_count() or 1  # what is found does not depend on it
         self._pose, self._step, self._frame = np.eye(4), np.eye(4), ""
         self._voxel_m, self._n_failed = 0.0, 0
-        self._keys: list[tuple[FloatArray, FloatArray]] = []
+        self._keys = deque[tuple[FloatArray, FloatArray]](maxlen=_TUNING.n_keys)
         self._found: list[tuple[FloatArray, int, int]] = []
 
     def add(self, scan: Scan, bag_ns: int) -> None:
         """Register the next scan."""
-        if len(scan.points) > _NEIGHBOURS:
+        if len(scan.points) > _TUNING.n_neighbours:
             self._register(scan)
             self._found.append((self._pose, scan.stamp_ns, bag_ns))
             self._frame = scan.frame
@@ -165,14 +184,14 @@ class ScanOdometry:
 
     def _register(self, scan: Scan) -> None:
         if not self._keys:
-            share = _VOXEL_SHARE * float(np.median(np.linalg.norm(scan.points, axis=1)))
-            self._voxel_m = min(max(share, _LEAST_VOXEL_M), _MOST_VOXEL_M)
+            share = _TUNING.voxel_share * float(np.median(np.linalg.norm(scan.points, axis=1)))
+            self._voxel_m = min(max(share, _TUNING.least_voxel_m), _TUNING.most_voxel_m)
             self._add_to_map(scan.points)
             return
         before, step, pose = self._pose, self._step, self._pose
-        for n_voxels in _MATCH_VOXELS:
+        for n_voxels in _TUNING.match_voxels:
             points = self._gicp.voxelgrid_sampling(_without_motion(scan, step), self._voxel_m)
-            self._gicp.estimate_covariances(points, None, _NEIGHBOURS, _N_THREADS)
+            self._gicp.estimate_covariances(points, None, _TUNING.n_neighbours, self._n_threads)
             found = self._gicp.align(
                 *(self._map[0], points, self._map[1]),
                 init_T_target_source=before @ step,
@@ -180,7 +199,7 @@ class ScanOdometry:
                 max_correspondence_distance=n_voxels * self._voxel_m,
                 max_iterations=30,
             )
-            if found.num_inliers < _LEAST_MATCHED * points.size():
+            if found.num_inliers < _TUNING.least_matched * points.size():
                 pose, step = before, np.eye(4)  # rather than on and away from the map
                 self._n_failed += 1
                 break
@@ -190,22 +209,23 @@ class ScanOdometry:
             step = se3.inverse(before) @ pose
         self._pose, self._step = pose, step
         moved = se3.inverse(self._keys[-1][0]) @ pose
-        is_new = len(self._keys) < 5 or np.linalg.norm(moved[:3, 3]) > _KEY_M
-        if is_new or se3.rotation_angle(moved[:3, :3]) > _KEY_RAD:
+        is_new = len(self._keys) < 5 or np.linalg.norm(moved[:3, 3]) > _TUNING.key_m
+        if is_new or se3.rotation_angle(moved[:3, :3]) > _TUNING.key_rad:
             self._add_to_map(_without_motion(scan, step))
 
     def _add_to_map(self, points: FloatArray) -> None:
         placed = points @ self._pose[:3, :3].T + self._pose[:3, 3]
         sampled = self._gicp.voxelgrid_sampling(placed, self._voxel_m / 2.0)
-        self._keys = [*self._keys, (self._pose, np.array(sampled.points()[:, :3]))][-_N_KEYS:]
+        self._keys.append((self._pose, np.array(sampled.points()[:, :3])))
         whole = np.concatenate([each for _, each in self._keys])
-        self._map = self._gicp.preprocess_points(whole, self._voxel_m, _NEIGHBOURS, _N_THREADS)
+        about = self._voxel_m, _TUNING.n_neighbours, self._n_threads
+        self._map = self._gicp.preprocess_points(whole, *about)
 
 
 def _without_motion(scan: Scan, step: FloatArray) -> FloatArray:
     """Points (N, 3) as if the whole scan was taken at its end, after a constant motion ``step``."""
-    before_end = (np.arange(_PARTS) + 0.5) / _PARTS - 1.0
+    before_end = (np.arange(_TUNING.n_parts) + 0.5) / _TUNING.n_parts - 1.0
     Ts = se3.exp(np.outer(before_end, se3.log(step)))
-    part = np.minimum((scan.phases * _PARTS).astype(int), _PARTS - 1)
+    part = np.minimum((scan.phases * _TUNING.n_parts).astype(int), _TUNING.n_parts - 1)
     turned = np.einsum("nij,nj->ni", Ts[part, :3, :3], scan.points)
     return np.asarray(np.where(scan.phases[:, None] < 1.0, turned + Ts[part, :3, 3], scan.points))

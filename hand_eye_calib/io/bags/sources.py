@@ -1,21 +1,29 @@
 """What a stream can be read from: a topic of poses, two topics that are joined, a path, the points
-of a lidar, fields of any message, or transforms.
+of a lidar, images of a target, fields of any message, or transforms.
+
+Fields are named as in ``/topic?t=header.stamp,x=pose.position.x,...``: before the equals sign as
+columns of csv files, with their units; vx, vy, vz, wx, wy, wz are integrated. A target is named as
+in ``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``, and with ``@FILE`` behind it the file of the
+camera's intrinsics.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.fields import FieldReader
-from hand_eye_calib.io.bags.messages import MessageReader, Run, unpack_path, unpack_transforms
+from hand_eye_calib.io.bags.messages import MessageReader, Run, ns_of, pose_row, transforms_in
 from hand_eye_calib.io.bags.poses import NOTHING, PoseColumns, PoseTable, are_believable
-from hand_eye_calib.io.bags.scans import ScanOdometry, unpack_scan
+from hand_eye_calib.io.bags.scans import ScanOdometry, scan_of
+from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
+from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
+from hand_eye_calib.io.trajectory_files.table import TWIST, Table
 from hand_eye_calib.io.transforms import TfSource, TfStream
 
 Source = str | TfSource
@@ -105,21 +113,24 @@ class PathReading(Reading):
     poses of its newest message. Its stamps count as bag times.
     """
 
-    def __init__(self, stream: str, topic: str) -> None:
-        super().__init__(stream, topic)
-        self._newest: PoseColumns | None = None
+    _newest: Run | None = None
 
     def take(self, run: Run) -> None:
-        (self._newest,) = run._replace(messages=run.messages[-1:]).each(unpack_path)
+        self._newest = run._replace(messages=run.messages[-1:])
 
     def table(self) -> PoseTable:
-        path = self._newest or NOTHING
-        if len(path.stamps_ns) > 1 and not path.stamps_ns.any():
+        if self._newest is None:
+            return self._of_frames([], np.empty((0, 7)), [])
+        (path,) = self._newest.decoded()
+        rows = [pose_row(each.pose.position, each.pose.orientation) for each in path.poses]
+        stamps_ns = [ns_of(each.header.stamp) for each in path.poses]
+        if len(rows) > 1 and not any(stamps_ns):
             raise InputError(
                 f"the poses of path {self.topics[0]} have no stamps: all are zero; use the "
                 "odometry that the path was made from"
             )
-        return PoseTable.of_columns(self.stream, path, path.stamps_ns)
+        poses, frame = np.reshape(rows, (-1, 7)), printable(path.header.frame_id)
+        return self._of_frames(stamps_ns, poses, stamps_ns, frame)
 
 
 class ScanReading(Reading):
@@ -130,8 +141,8 @@ class ScanReading(Reading):
         super().__init__(stream, *([] if self._lidar.kept else [topic]))
 
     def take(self, run: Run) -> None:
-        for scan, bag_ns in zip(run.each(unpack_scan), run.bag_ns.tolist(), strict=True):
-            self._lidar.add(scan, bag_ns)
+        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
+            self._lidar.add(scan_of(message), bag_ns)
 
     def table(self) -> PoseTable:
         found = self._lidar.odometry()
@@ -142,22 +153,90 @@ class ScanReading(Reading):
         return self._of_frames(*columns, "scans", str(found.frame))
 
 
+class ImageReading(Reading):
+    """Images of a target: the poses of the camera in the frame of the target."""
+
+    def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
+        super().__init__(stream, topic)
+        self._finder, self._frame = TargetFinder(target, camera), ""
+        self._stamps_ns, self._bag_ns = list[int](), list[int]()
+
+    def take(self, run: Run) -> None:
+        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
+            try:
+                is_seen = self._finder.look(grey_of(message))
+            except InputError as error:
+                raise InputError(f"{self.topics[0]}: {error}") from None
+            if is_seen:
+                self._stamps_ns.append(ns_of(message.header.stamp) or 0)
+                self._bag_ns.append(bag_ns)
+                self._frame = printable(message.header.frame_id)
+
+    def table(self) -> PoseTable:
+        found = self._finder.found()
+        self.notes.append(f"{self.topics[0]}: {found}")
+        Ts = se3.inverse(found.Ts_camera_target)
+        poses = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
+        return self._of_frames(self._stamps_ns, poses, self._bag_ns, "target", self._frame)
+
+
 class FieldReading(Reading):
-    """Fields of messages of any type."""
+    """Fields of messages of any type; a ConfigError if they are not written as they should be.
+    ``measures`` is what they are of a pose.
+    """
 
     def __init__(self, stream: str, topic: str, fields: str) -> None:
         super().__init__(stream, topic)
-        self._reader = FieldReader(topic, fields)
+        pairs = [each.partition("=")[::2] for each in fields.split(",")]
+        if not all(name and path for name, path in pairs):
+            raise ConfigError(
+                "fields are written NAME=PATH,..., such as t=header.stamp,x=pose.position.x; got "
+                f"{fields!r}"
+            )
+        self._names = [name for name, _ in pairs]
+        self._paths = [path.split(".") for _, path in pairs]
+        of_table = "twists" if {*TWIST} <= {*self._names} else "auto"
+        self._table = Table(topic, self._names, of_table)
         self._rows, self._bag_ns = list[list[str]](), list[int]()
+        self.measures = "poses" if of_table == "twists" else self._table.measures
+        if self.measures == "rates":
+            raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
 
     def take(self, run: Run) -> None:
-        # The library's errors are of many kinds.
-        self._rows += run.each(self._reader.cells_of(run.kind), Exception)
+        self._rows += [[self._cell(each, path) for path in self._paths] for each in run.decoded()]
         self._bag_ns += run.bag_ns.tolist()
 
+    def _cell(self, value: Any, path: list[str]) -> str:
+        """A value of a message, stamps in seconds with all their digits."""
+        try:
+            for part in path:
+                value = value[int(part)] if part.isdecimal() else getattr(value, part)
+        except (AttributeError, IndexError, TypeError):
+            raise InputError(
+                f"{self.topics[0]}: a message has no {'.'.join(path)}; name other fields"
+            ) from None
+        stamp_ns = ns_of(value)
+        return str(value) if stamp_ns is None else f"{Decimal(stamp_ns).scaleb(-9):f}"
+
     def table(self) -> PoseTable:
-        stamps_ns, poses, self.notes = self._reader.poses(self._rows)
-        return self._of_frames(stamps_ns, poses, self._bag_ns)
+        table = self._table.fill(enumerate(self._rows, 1), list)
+        if not table.stamps:
+            topic = self.topics[0]
+            raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
+        stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
+        if table.measures == "twists":
+            return self._of_frames(stamps_ns, _integrated(stamps_ns, table.values()), self._bag_ns)
+        return self._of_frames(stamps_ns, np.c_[poses_of(table)], self._bag_ns)
+
+
+def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
+    """Poses (N, 7) of velocities (N, 6), m/s and rad/s, in the sensor's own frame."""
+    steps = (twists[1:] + twists[:-1]) / 2 * (np.diff(stamps_ns) * 1e-9)[:, None]
+    poses = np.tile(np.eye(4), (len(twists), 1, 1))
+    for row, step in enumerate(se3.exp(steps), start=1):
+        poses[row] = poses[row - 1] @ step
+        poses[row, :3, :3] = se3.nearest_rotation(poses[row, :3, :3])
+    return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
 
 
 class TransformReading(Reading):
@@ -165,15 +244,14 @@ class TransformReading(Reading):
     rate in the chain.
     """
 
-    def __init__(self, stream: str, source: TfStream, topics: Sequence[str]) -> None:
+    def __init__(self, stream: str, source: TfStream, topics: Collection[str]) -> None:
         super().__init__(stream, *(topic for topic in topics if not is_static(topic)))
         self._source = source
         self._found: list[tuple[Any, ...]] = []
 
     def take(self, run: Run) -> None:
-        lists = run.each(unpack_transforms)
-        for transforms, bag_ns in zip(lists, run.bag_ns.tolist(), strict=True):
-            for transform in transforms:
+        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
+            for transform in transforms_in(message):
                 poses = self._source.edges_at(transform, False)
                 self._found += ((bag_ns, *pose) for pose in poses)
 

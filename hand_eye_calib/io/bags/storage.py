@@ -1,40 +1,62 @@
-"""The storage files of bags: found, unpacked, and read through the library rosbags.
-
-An mcap file that rosbags cannot open is read record by record: see mcap_files.py.
+"""The storage files of bags: found, unpacked, and read through the libraries rosbags (sqlite3,
+rosbag1) and mcap.
 """
 
+import struct
 import sys
 import tempfile
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from operator import attrgetter
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from functools import lru_cache
+from importlib import import_module
+from io import BufferedReader, BytesIO
+from operator import attrgetter, itemgetter
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 from urllib.parse import quote
 
 import numpy as np
 
-from hand_eye_calib.errors import InputError, MissingDependencyError
-from hand_eye_calib.io.bags.mcap_files import (
-    Message,
-    MessageKind,
-    indexed_messages,
-    message_kind,
-    reason_of,
-    recovered_messages,
-)
-from hand_eye_calib.io.limits import BLOCK_BYTES, LARGEST_RATIO, SMALLEST_UNPACKED, reading_memory
-
-# Messages that are unpacked at once.
-_BLOCK_SIZE = 2048
+from hand_eye_calib.errors import InputError, MissingDependencyError, printable, required
+from hand_eye_calib.io.limits import BLOCK_BYTES, LARGEST_RATIO, LONGEST_NAME, reading_memory
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
-class Storage:
+class MessageKind(NamedTuple):
+    """What the messages of a topic have in common; encoding is "cdr", "ros1", "json" or "protobuf"
+    of what can be read, definition the language and the content of what describes them.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    definition: tuple[str, bytes] = ("", b"")
+
+    @property
+    def is_ros1(self) -> bool:
+        """Whether they are packed as by ROS 1."""
+        return self.encoding == "ros1"
+
+
+# A message as it was recorded: its kind, its bag time in ns and its bytes.
+Message: TypeAlias = tuple[MessageKind, int, bytes]
+
+
+@lru_cache
+def _kind(topic: str, name: str, encoding: str, language: str, content: bytes) -> MessageKind:
+    """One for all connections that are alike, with names as they can be printed."""
+    if encoding == "ros1" and name.count("/") == 1:  # as ROS 1 itself names types
+        name = name.replace("/", "/msg/")
+    topic, name = (printable(each[:LONGEST_NAME]) for each in (topic, name))
+    return MessageKind(topic, name, encoding, (language, content))
+
+
+class Storage(ABC):
     """A storage file opened for reading: ``path`` is its name for a person, ``file`` where it is,
     unpacked. An InputError if nothing in it can be read.
 
@@ -47,56 +69,19 @@ class Storage:
         self.counts = Counter[MessageKind]()
         self.span_ns: tuple[int, ...] = ()
         self.losses: list[str] = []
-        self._reader: Any = None
         self._kinds: dict[int, MessageKind] = {}
         with self._guarded():
-            try:
-                self._open()
-            except (ImportError, MemoryError):
-                raise
-            except Exception as error:
-                if self._file.suffix != ".mcap":
-                    raise
-                self.close()
-                self._search(error)
+            self._open()
 
+    @abstractmethod
+    def _open(self) -> None: ...
+
+    @abstractmethod
     def close(self) -> None:
         """Close the file."""
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
 
-    def _open(self) -> None:
-        library = rosbags()[self._file.suffix != ".bag"]
-        reader = library.Reader(self._file)
-        if self._file.suffix == ".db3":  # whose path SQLite reads as an address
-            reader.storage.path = Path(quote(str(self._file)))
-        reader.open()
-        self._reader = reader
-        if self._file.suffix == ".mcap":
-            counts = (sum(each.channel_count.values()) for each in reader.storage.chunks)
-            if sum(counts) != reader.message_count:
-                raise ValueError("it has no index of its messages")
-        for each in reader.connections:
-            encoding = getattr(each.ext, "serialization_format", "ros1")
-            kind = message_kind(each.topic, each.msgtype, encoding, each.msgdef)
-            self._kinds[each.id] = kind
-            self.counts[kind] += each.msgcount
-        if reader.message_count:
-            self.span_ns = reader.start_time, reader.end_time - 1
-
-    def _search(self, reason: Exception) -> None:
-        """Go through a file that rosbags cannot open."""
-        times_ns = []
-        for kind, bag_ns, _ in recovered_messages(self._file, self.losses.append):
-            self.counts[kind] += 1
-            times_ns.append(bag_ns)
-        if self.losses and not times_ns:
-            raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
-        if times_ns:
-            self.span_ns = min(times_ns), max(times_ns)
-            about = f"{len(times_ns)} messages covering {np.ptp(self.span_ns) * 1e-9:.1f}"
-            self.losses = [f"{loss}; recovered are {about} s" for loss in self.losses]
+    @abstractmethod
+    def _messages(self, topics: Collection[str]) -> Iterable[Message]: ...
 
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over the messages of some topics in the order of bag time, many at once. Chunks
@@ -107,17 +92,6 @@ class Storage:
             with self._guarded():
                 block = next(blocks, [])
             yield block
-
-    def _messages(self, topics: Collection[str]) -> Iterable[Message]:
-        if self._reader is None:  # what is lost was said when it was opened
-            found = recovered_messages(self._file, lambda _: None)
-            return (message for message in found if message[0].topic in topics)
-        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
-        if self._file.suffix == ".mcap":
-            return indexed_messages(self._reader.storage, kinds)
-        wanted = [each for each in self._reader.connections if each.id in kinds]
-        messages = self._reader.messages(wanted) if wanted else ()
-        return ((kinds[each.id], bag_ns, data) for each, bag_ns, data in messages)
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -133,8 +107,8 @@ class Storage:
             raise
         except Exception as error:
             why = (
-                f"it is cut off, damaged or of an unsupported kind ({reason_of(error)}); repair it "
-                f"with {_REPAIRS[_suffix(self.path)]}, or record it again"
+                f"it is cut off, damaged or of an unsupported kind ({_reason_of(error)}); repair "
+                f"it with {_REPAIRS[_suffix(self.path)]}, or record it again"
             )
             # NoMemError is SQLite's, as rosbags uses it.
             if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
@@ -142,20 +116,196 @@ class Storage:
             raise InputError(f"cannot read bag {self.path}: {why}") from error
 
 
+class RosbagsFile(Storage):
+    """A .db3 or .bag file, through the library rosbags."""
+
+    def _open(self) -> None:
+        self._reader = rosbags()[self._file.suffix != ".bag"].Reader(self._file)
+        if self._file.suffix == ".db3":  # whose path SQLite reads as an address
+            self._reader.storage.path = Path(quote(str(self._file)))
+        self._reader.open()
+        for each in self._reader.connections:
+            encoding = getattr(each.ext, "serialization_format", "ros1")
+            definition = each.msgdef.format.name, each.msgdef.data.encode()
+            self._kinds[each.id] = _kind(each.topic, each.msgtype, encoding, *definition)
+            self.counts[self._kinds[each.id]] += each.msgcount
+        if self._reader.message_count:
+            self.span_ns = self._reader.start_time, self._reader.end_time - 1
+
+    def close(self) -> None:
+        self._reader.close()
+
+    def _messages(self, topics: Collection[str]) -> Iterable[Message]:
+        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
+        wanted = [each for each in self._reader.connections if each.id in kinds]
+        messages = self._reader.messages(wanted) if wanted else ()
+        return ((kinds[each.id], bag_ns, data) for each, bag_ns, data in messages)
+
+
+# Opcode and length of a record; channel, number, log time and time of publication of a message.
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<H4xQ8x")
+
+
+class McapFile(Storage):
+    """An mcap file, through the library mcap: by its index if it is whole, otherwise record by
+    record up to the first that is damaged; of a chunk that is cut off, what is there.
+    """
+
+    def _open(self) -> None:
+        reading = required("mcap.reader", "reading mcap files", "mcap")
+        self._stream = _WholeReads(self._file.open("rb", buffering=0))
+        self._chunks: list[Any] | None = None
+        try:
+            summary = reading.make_reader(self._stream).get_summary()
+            about, chunks = summary.statistics, summary.chunk_indexes
+            found = len(summary.channels), len(chunks), bool(chunks)
+            if found != (about.channel_count, about.chunk_count, about.message_count > 0):
+                raise ValueError("it has no index of its messages")
+        except MemoryError:
+            raise
+        except Exception as error:
+            self._search(error)
+            return
+        self._chunks = sorted(chunks, key=attrgetter("message_start_time"))
+        for key, channel in summary.channels.items():
+            self._kinds[key] = _kind_of(channel, summary.schemas)
+            self.counts[self._kinds[key]] += about.channel_message_counts.get(key, 0)
+        if about.message_count:
+            self.span_ns = about.message_start_time, about.message_end_time
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def _search(self, reason: Exception) -> None:
+        """Count what is in a file without an index."""
+        times_ns = []
+        for kind, bag_ns, _ in self._recovered(self.losses):
+            self.counts[kind] += 1
+            times_ns.append(bag_ns)
+        if self.losses and not times_ns:
+            raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
+        if times_ns:
+            self.span_ns = min(times_ns), max(times_ns)
+            about = f"{len(times_ns)} messages covering {np.ptp(self.span_ns) * 1e-9:.1f}"
+            self.losses = [f"{loss}; recovered are {about} s" for loss in self.losses]
+
+    def _messages(self, topics: Collection[str]) -> Iterable[Message]:
+        if self._chunks is None:  # what is lost was told when it was opened
+            yield from (each for each in self._recovered([]) if each[0].topic in topics)
+            return
+        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
+        for index in self._chunks:
+            channels = index.message_index_offsets
+            if kinds and (not channels or kinds.keys() & channels.keys()):
+                found = _messages_of_chunk(self._content(index), kinds)
+                yield from sorted(found, key=itemgetter(1))
+
+    def _content(self, index: Any) -> bytes:
+        """The records of a chunk."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk
+        from mcap.stream_reader import get_chunk_data_stream
+
+        self._stream.seek(index.chunk_start_offset + _RECORD.size)
+        chunk = Chunk.read(ReadDataStream(self._stream))
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        return bytes(stream.read(size))
+
+    def _recovered(self, losses: list[str]) -> Iterator[Message]:
+        """The messages of the file in their order, as far as it goes; adds what is lost."""
+        from mcap import records as mcap
+
+        schemas: dict[int, Any] = {}
+        kinds: dict[int, MessageKind] = {}
+        for record in self._records(losses):
+            if isinstance(record, mcap.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, mcap.Channel):
+                kinds[record.id] = _kind_of(record, schemas)
+            elif isinstance(record, mcap.Message) and record.channel_id in kinds:
+                yield kinds[record.channel_id], record.log_time, record.data
+
+    def _records(self, losses: list[str]) -> Iterator[Any]:
+        from mcap import data_stream, opcode, records, stream_reader
+
+        position = self._stream.seek(0)
+        try:
+            for record in stream_reader.StreamReader(self._stream, validate_crcs=True).records:
+                yield record
+                position = self._stream.tell()
+        except MemoryError:
+            raise
+        except Exception as error:
+            losses.append(f"it is cut off or damaged ({_reason_of(error)}), the rest is lost")
+            if not isinstance(error, EOFError):
+                return
+            # Of a chunk that is cut off, the records before that.
+            with suppress(Exception), self._file.open("rb") as file:
+                file.seek(position)
+                if file.read(_RECORD.size)[0] == opcode.Opcode.CHUNK:
+                    chunk = records.Chunk.read(data_stream.ReadDataStream(file))
+                    zstd = stream_reader.zstandard.ZstdDecompressor().decompressobj()
+                    lz4 = stream_reader.lz4.LZ4FrameDecompressor()
+                    unpackers = {"zstd": zstd.decompress, "lz4": lz4.decompress}
+                    unpack = unpackers.get(chunk.compression, bytes)
+                    rest = _WholeReads(BytesIO(unpack(chunk.data)))
+                    yield from stream_reader.StreamReader(rest, skip_magic=True).records
+
+
+def _kind_of(channel: Any, schemas: Mapping[int, Any]) -> MessageKind:
+    """The kind of the messages of an mcap channel."""
+    schema = schemas.get(channel.schema_id)
+    definition = (schema.encoding, schema.data) if schema else ("", b"")
+    name = schema.name if schema else ""
+    return _kind(channel.topic, name, channel.message_encoding, *definition)
+
+
+def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
+    """The messages of some channels in the records of an mcap chunk. The library's own iteration
+    takes several times as long.
+    """
+    from mcap.opcode import Opcode
+
+    position, of_message = 0, int(Opcode.MESSAGE)
+    while position < len(content):
+        opcode, size = _RECORD.unpack_from(content, position)
+        start, position = position + _RECORD.size, position + _RECORD.size + size
+        if position > len(content):
+            raise EOFError("a chunk ends in the middle of a record")
+        if opcode == of_message:
+            key, bag_ns = _MESSAGE.unpack_from(content, start)
+            if key in kinds:
+                yield kinds[key], bag_ns, content[start + _MESSAGE.size : position]
+
+
+class _WholeReads(BufferedReader):
+    """A file that never returns less than was asked for: the library mcap takes that for a whole
+    record.
+    """
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        if len(data) < (size or 0):
+            raise EOFError("it ends in the middle of a record")
+        return data
+
+
+def _reason_of(error: BaseException) -> str:
+    """Kind and text of an error in one line."""
+    return " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(".:")
+
+
 def rosbags() -> tuple[Any, Any]:
     """The modules of the library for bags of ROS 1 and ROS 2."""
-    try:
-        from rosbags import rosbag1, rosbag2
-    except ImportError as error:
-        raise MissingDependencyError(
-            "bags need rosbags, which is not installed: pip install rosbags"
-        ) from error
-    return rosbag1, rosbag2
+    of_ros1, of_ros2 = (
+        required(f"rosbags.rosbag{version}", "a bag", "rosbags") for version in "12"
+    )
+    return of_ros1, of_ros2
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Messages in blocks that are neither long nor large; those compressed one by one unpacked. A
-    ValueError at the first that is not bytes with a time.
+    """Messages in blocks; those compressed one by one are unpacked. A ValueError at the first that
+    is not bytes with a time.
     """
     rows, size = list[Message](), 0
     for kind, bag_ns, data in messages:
@@ -165,7 +315,7 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
             data = bytes(_zstd().decompress(data))
         rows.append((kind, bag_ns, data))
         size += len(data)
-        if len(rows) == _BLOCK_SIZE or size > BLOCK_BYTES:
+        if size > BLOCK_BYTES:
             yield rows
             rows, size = [], 0
     if rows:
@@ -174,11 +324,7 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
 
 def _zstd() -> Any:
     """The zstd module: Python's own from 3.14 on, its backport before."""
-    if sys.version_info >= (3, 14):
-        from compression import zstd as module
-    else:
-        import backports.zstd as module
-    return module
+    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
 # ---- files
@@ -195,7 +341,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
             folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
             readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
             lost = _unpack(file, readable)
-        storage = Storage(file, readable)
+        storage = (McapFile if _suffix(file) == ".mcap" else RosbagsFile)(file, readable)
         opened.callback(storage.close)
         storage.losses[:0] = [lost] * bool(lost)
         found.append(storage)
@@ -204,7 +350,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
 
 def _unpack(file: Path, target: Path) -> str:
     """Unpack a file that is compressed as a whole, as far as it goes; what is lost."""
-    zstd, most = _zstd(), SMALLEST_UNPACKED + LARGEST_RATIO * file.stat().st_size
+    zstd, most = _zstd(), LARGEST_RATIO * file.stat().st_size
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
         try:
             for piece in iter(lambda: packed.read(BLOCK_BYTES), b""):
@@ -214,7 +360,7 @@ def _unpack(file: Path, target: Path) -> str:
                         f"{LARGEST_RATIO} times its size, which is not believable"
                     )
         except (EOFError, zstd.ZstdError) as error:
-            return f"its compression is damaged ({reason_of(error)})"
+            return f"its compression is damaged ({_reason_of(error)})"
     return ""
 
 
