@@ -83,7 +83,7 @@ def _session_rig(directory: Path, result: "SessionResult") -> None:
     A time offset and a scale in numbers are the child's, which has them; the others have none.
     """
     from hand_eye_calib.io.results import save_rig
-    from hand_eye_calib.rig.calibrate import solve_rig
+    from hand_eye_calib.rig.calibrate import calibrate_rig
 
     config, (parent, child) = result.snapshot.config, result.snapshot.streams
     of_all = ["method", "max_gap", "target.translation", "target.rotation"]
@@ -100,7 +100,7 @@ def _session_rig(directory: Path, result: "SessionResult") -> None:
         frame = other.child_frame
         sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]
     options = config.to_options()
-    rig = solve_rig(sensors, {name: options[name] for name in of_all})
+    rig = calibrate_rig(sensors, {name: options[name] for name in of_all})
     inputs = {**result.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory, inputs)
     write_rig_report(directory, rig, rig.sensors)

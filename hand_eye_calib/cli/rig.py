@@ -23,7 +23,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     ``as_given`` puts the name of a remote bag back into plain values.
     """
     from hand_eye_calib.io.results import fingerprint, save_rig
-    from hand_eye_calib.rig.calibrate import solve_rig
+    from hand_eye_calib.rig import calibrate as of_rig
 
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
@@ -53,7 +53,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     sensors = dict(zip(frames, trajectories, strict=True))
     inputs = as_given(inputs) | {"options": options_from(arguments)}
     with waiting_for(f"solving for {len(sensors)} sensors"):
-        rig = solve_rig(sensors, inputs["options"])
+        rig = of_rig.calibrate_rig(sensors, inputs["options"])
     if arguments.out:
         note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
     if arguments.json:

@@ -94,7 +94,7 @@ def review(
     if {*options} & {*_REPAIRS}:
         # The scale was compared with that of a solve of streams as they should not be.
         options = {name: value for name, value in options.items() if value != "estimate"}
-        second = _solved_with(snapshot, options)
+        second = _solved_with(snapshot, options) if options else None
         is_clear = second and not any(each.makes_unusable for each in second.check.findings)
         return _repaired(first, second, options) if second and is_clear else first
     least = int(bool(options))
@@ -108,7 +108,7 @@ def review(
     most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else MOST_MOVED_S
     if "time_offset" not in given and abs(moved_s) >= most_s:
         options = {"time_offset": "estimate", **options}
-    second = _improved(first, options, by=least)
+    second = _improved(first, options, by=least) if options else None
     return _telling(second, options, found) if second else first
 
 
@@ -173,9 +173,7 @@ def _checked(calibration: Calibration, snapshot: Snapshot) -> Run:
 
 
 def _solved_with(snapshot: Snapshot, options: Options) -> Run | None:
-    """What other options give; None without any, or if nothing can be solved with them."""
-    if not options:
-        return None
+    """What other options give; None if nothing can be solved with them."""
     try:
         other = with_options(snapshot, options)
         return _checked(other.estimate(), other)

@@ -123,7 +123,8 @@ class Snapshot:
             )
             kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
         made = pair_poses(self.config, self.parent, self.child, self.paired_at, kept)
-        return downsample(PosePairs.concatenate(kept, made), self.config.max_pairs)
+        pairs, most = PosePairs.concatenate(kept, made), self.config.max_pairs
+        return downsample(pairs, most) if len(pairs) > most else pairs
 
     def estimate(self, cross_check: bool | None = None) -> Calibration:
         """Estimate the extrinsic.

@@ -21,13 +21,10 @@ _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
 
 def calibrate_rig(
     trajectories: Mapping[str, Trajectory],
+    options: Mapping[str, Any] | None = None,
     *,
-    method: str | None = None,
-    max_gap: float | None = None,
     time_offset: str | None = None,
     scale: str | None = None,
-    target_translation: float | None = None,
-    target_rotation: float | None = None,
     progress: Progress | None = None,
 ) -> RigCalibration:
     """Estimate the poses of all sensors of a rig in the frame of the first one.
@@ -41,9 +38,9 @@ def calibrate_rig(
     ----------
     trajectories : mapping of str to Trajectory
         Poses of each sensor in its own world, by the name of its frame; at least three.
-    method : str, optional
-        Of the first answers; see :class:`~hand_eye_calib.config.CalibratorConfig`, as for the other
-        options.
+    options : mapping of str to value, optional
+        By their public names, such as method, max_gap or target.translation; see
+        :class:`~hand_eye_calib.config.CalibratorConfig`.
     time_offset : "estimate", optional
         Of every sensor against the first one.
     scale : {"none", "auto", "estimate"}, optional
@@ -66,25 +63,16 @@ def calibrate_rig(
     >>> len(rig.calibrations)
     2
     """
-    options = {name: value for name, value in locals().items() if value is not None}
-    del options["trajectories"]
-    return solve_rig(trajectories, options, options.pop("progress", None))
-
-
-def solve_rig(
-    trajectories: Mapping[str, Trajectory],
-    options: Mapping[str, Any],
-    progress: Progress | None = None,
-) -> RigCalibration:
-    """The same as :func:`calibrate_rig`, with options by their public names."""
+    named = {"time_offset": time_offset, "scale": scale}
+    options = dict(options or {}) | {name: each for name, each in named.items() if each is not None}
     _refuse(trajectories, options)
     tell = progress or (lambda share, step: None)
     sensors = tuple(trajectories)
-    named = [replace(each, sensor_frame=name) for name, each in trajectories.items()]
+    first, *rest = [replace(each, sensor_frame=name) for name, each in trajectories.items()]
     star, moved = [], []
-    for index, other in enumerate(named[1:]):
+    for index, other in enumerate(rest):
         tell(0.6 * index / (len(sensors) - 1), f"{other.sensor_frame} in {sensors[0]}")
-        snapshot = whole_snapshot(named[0], other, options)
+        snapshot = whole_snapshot(first, other, options)
         answer = run(snapshot).calibration
         star.append(answer)
         moved.append(other.scaled(answer.scale).shifted(answer.time_offset_s))

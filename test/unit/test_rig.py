@@ -14,7 +14,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import write_bag
 from hand_eye_calib.io.results import save_rig
 from hand_eye_calib.report.rig_page import render_rig
-from hand_eye_calib.rig.calibrate import solve_rig
 from reproduction.rig import simulated, unequal
 
 
@@ -75,7 +74,7 @@ def test_what_is_of_two_sensors_is_refused(rig):
         hec.calibrate_rig({name: trajectories[name] for name in ("lidar", "front")})
     for options in ({"prior.z": "1.0 +/- 0.1"}, {"time_offset": 0.1}, {"parent_frame": "a"}):
         with pytest.raises(ConfigError, match=next(iter(options))):
-            solve_rig(trajectories, options)
+            hec.calibrate_rig(trajectories, options)
     trajectories["rear"] = dataclasses.replace(trajectories["rear"], measures="positions")
     with pytest.raises(InputError, match="rear measures positions only"):
         hec.calibrate_rig(trajectories)
