@@ -145,7 +145,7 @@ def angular_rates(
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
     starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(np.int64)
     ends_ns = starts_ns + round(window_s * 1e9)
-    before, after = trajectory.at(starts_ns), trajectory.at(ends_ns)
+    before, after = np.split(trajectory.at(np.concatenate([starts_ns, ends_ns])), 2)
     if of_speed:
         moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     else:

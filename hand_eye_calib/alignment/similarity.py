@@ -115,11 +115,16 @@ class SimilarityFit:
         """Whether the fit explains enough of the translations to trust its scale and offset."""
         return self.unexplained_translation < _MAX_UNEXPLAINED_TRANSLATION
 
+    @property
+    def is_in_one_unit(self) -> bool:
+        """Whether the lengths of both streams clearly do not differ by enough to matter."""
+        return abs(self.scale - 1.0) + _MIN_SIGMAS * self.scale_sigma < _MIN_DIFFERENCE
+
 
 def fit_similarity(
     pairs: MotionPairs,
     twists: tuple[FloatArray, FloatArray] | None = None,
-    start: SimilarityFit | None = None,
+    start: SimilarityFit | FloatArray | None = None,
     same_unit: bool = False,
 ) -> SimilarityFit:
     """Fit X, the scale and, with twists, the time offset.
@@ -142,7 +147,10 @@ def fit_similarity(
     SimilarityFit
     """
     problem = _Problem(pairs, twists, same_unit)
-    starts = [(start.T_parent_child, start.scale)] if start else _starts(pairs)
+    if isinstance(start, SimilarityFit):
+        starts = [(start.T_parent_child, start.scale)]
+    else:
+        starts = _starts(pairs) if start is None else [(start, 1.0)]
     fits: list[SimilarityFit] = []
     for T, scale in starts:
         fits.append(problem.describe(*problem.refine(T, 1.0 if same_unit else scale)))

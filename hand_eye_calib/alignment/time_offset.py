@@ -135,7 +135,7 @@ def refine_time_offset(
     best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation), start
     held: list[float] = []
     for lag_s in _LAGS_S:
-        found, fit = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit)
+        found, fit = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit, least_s)
         if fit is None:
             continue
         holds = fit.explains_translation and abs(found.seconds - correlation.offset_s) <= reach_s
@@ -154,8 +154,11 @@ def _fine_offset(
     lag_s: float,
     max_gap_s: float,
     fit: SimilarityFit | None,
+    least_s: float,
 ) -> tuple[TimeOffset, SimilarityFit | None]:
-    """Offset and fit over motions of ``lag_s``; no fit if there are too few."""
+    """Offset and fit over motions of ``lag_s``; no fit if there are too few. A clearly smaller
+    offset than ``least_s`` is not refined.
+    """
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
     offset_s, rate = correlation.offset_s, ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
@@ -184,7 +187,8 @@ def _fine_offset(
         of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(speed, 1e-9)
         span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))
         offset_s = float(offset_s + fit.offset_s)
-        if abs(fit.offset_s) < _SETTLED_S:
+        is_small = abs(offset_s) + abs(fit.offset_s) < least_s / 2
+        if abs(fit.offset_s) < _SETTLED_S or is_small:
             found = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
             is_settled = abs(found.used - rate.used) * child.duration_s < _SETTLED_S
             rate = found

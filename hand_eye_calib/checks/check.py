@@ -133,7 +133,7 @@ def check_streams(
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
         return CheckResult(gravest_first([*findings, *flat]), correlation)
-    explanation, found = _explained(aligned, correlation.is_clear)
+    explanation, found = _explained(aligned, correlation.is_clear, known[0] if known else None)
     findings += found
     if explanation is None:
         # Nothing is said about the rates of a frozen stream.
@@ -151,10 +151,11 @@ def check_streams(
         is_sound = not any(each.makes_unusable for each in findings)
     offset = _offset(streams, explanation, correlation)
     findings += check_offset(offset, time_offset_s)
-    found, fit = _check_sizes(streams, explanation, correlation.offset_s, scale)
+    right = explanation.hypothesis.undo(streams).shifted(offset.seconds)
+    found, fit = _check_sizes(right.synchronised, explanation, scale)
     findings += found
     if is_sound:
-        findings += _check_agreeing(streams.shifted(offset.seconds), streams, fit, known)
+        findings += _check_agreeing(right, streams, fit, known)
     return CheckResult(gravest_first(findings), correlation, explanation.fit, offset)
 
 
@@ -176,12 +177,14 @@ def _on_one_clock(
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
 
-def _explained(streams: StreamPair, is_clear: bool) -> tuple[Explanation | None, list[Finding]]:
+def _explained(
+    streams: StreamPair, is_clear: bool, start: FloatArray | None
+) -> tuple[Explanation | None, list[Finding]]:
     """The explanation that holds, if there is one, and findings; ``is_clear`` if the angular rates
     agree.
     """
     try:
-        explanation = explain(streams, thorough=is_clear)
+        explanation = explain(streams, is_clear, start)
     except NotEnoughDataError as error:
         return None, [finding("too_short", text=str(error))] if is_clear else []
     if explanation.holds:
@@ -203,18 +206,17 @@ def _offset(streams: StreamPair, explanation: Explanation, correlation: Correlat
 
 
 def _check_sizes(
-    streams: StreamPair, explanation: Explanation, offset_s: float, scale: float
+    pose_pairs: PosePairs, explanation: Explanation, scale: float
 ) -> tuple[list[Finding], SimilarityFit]:
     """Findings about the scale, beside the one that is known, and the axes of rotation of streams
-    that agree under a hypothesis, and the fit with the scale.
+    that agree, and the fit with the scale.
     """
-    pose_pairs = explanation.hypothesis.undo(streams).shifted(offset_s).synchronised
     rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
     findings, fit = _check_axes(rotations, explanation.fit.sigma_rotation), explanation.fit
-    if not explanation.same_unit:
+    if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
-            found = estimate_scale(pose_pairs, start=fit)
-            return [*_check_scale(found, scale), *findings], found
+            fit = estimate_scale(pose_pairs, start=fit)
+            findings = [*_check_scale(fit, scale), *findings]
     return findings, fit
 
 
@@ -228,7 +230,7 @@ def _check_agreeing(
     best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
     if copied := check_independent(streams.parent, streams.child, aligned.child):
         return [*copied, *check_same(*best)]
-    pose_pairs = replace(aligned, child=aligned.child.scaled(fit.scale)).synchronised
+    pose_pairs = aligned.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
     return check_agreement(pose_pairs, motions, fit.T_parent_child, best)
 

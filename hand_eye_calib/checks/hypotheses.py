@@ -4,7 +4,8 @@ follows shows whether the streams agree without it.
 For every motion pair and any X, both sensors rotate through the same angle and move by the same
 distance along the same screw axis. The robust fit of :mod:`~hand_eye_calib.alignment.similarity`
 measures how much of the motion breaks this. The plain hypothesis, nothing is wrong, is kept unless
-another leaves several times less of the motion unexplained.
+another leaves several times less of the motion unexplained. Before a fit, a closed form says about
+how much another one leaves: a fit that cannot win is not made.
 
 Two inverted streams agree with each other as well as two correct ones: X is then the pose of one
 world in the other. Path lengths tell them apart. The path of the world's origin, seen from a
@@ -12,10 +13,10 @@ rotating sensor, is longer than the sensor's own path, and the lever arm between
 longer than that between the sensors.
 """
 
-import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -26,19 +27,22 @@ from hand_eye_calib.checks.streams import coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
-from hand_eye_calib.solvers.park import align_rotation_vectors
-from hand_eye_calib.stats import median
+from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
-# Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree.
+# Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
+# so many at most, and in closed form.
 LAGS_S = (3.0, 1.0, 0.4)
-MAX_PAIRS, _MAX_PAIRS_FOR_AXES = 400, 120
+MAX_PAIRS, _MAX_ROUGH = 400, 120
 MIN_PAIRS = 12
 
 # A hypothesis holds if it leaves at most this share of the motion unexplained. It replaces the
-# plain one if it leaves this many times less.
-HOLDS, _DECISIVE = 0.12, 3.0
+# plain one if it leaves this many times less. The closed form is right to this factor.
+HOLDS, _DECISIVE, _ROUGHLY = 0.12, 3.0, 2.0
+
+# Rounds of weights for motions that are far off, in the closed form.
+_ROUNDS = 2
 
 # Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
 _NOISY = 0.3
@@ -80,7 +84,7 @@ class StreamPair:
         """The same with another clock of the child."""
         return replace(self, child=self.child.shifted(offset_s))
 
-    @functools.cached_property
+    @cached_property
     def synchronised(self) -> PosePairs:
         """Poses of both at common stamps."""
         return synchronise(self.parent, self.child, self.max_gap_s)
@@ -103,27 +107,30 @@ class StreamPair:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that ``correct`` undoes in a trajectory of a stream, "parent", "child" or "both".
-    ``code`` is that of its finding, empty if nothing is wrong; ``complexity`` counts what is wrong;
-    ``detail`` says of wrong axes what (x, y, z) should be.
+    """A mistake that ``correct`` undoes in the poses (N, 4, 4) of a stream, "parent", "child" or
+    "both". ``code`` is that of its finding, empty if nothing is wrong; ``complexity`` counts what
+    is wrong; ``detail`` says of wrong axes what (x, y, z) should be.
     """
 
     code: str
     stream: str
-    correct: Callable[[Trajectory], Trajectory]
+    correct: Callable[[FloatArray], FloatArray]
     complexity: int = 1
     detail: str = ""
+
+    def corrected(self, stream: str, poses: FloatArray) -> FloatArray:
+        """The poses of a stream without the mistake."""
+        return self.correct(poses) if self.stream in (stream, "both") else poses
 
     def undo(self, streams: StreamPair) -> StreamPair:
         """Both streams without the mistake."""
         if not self.code:
             return streams
-        parent, child = streams.parent, streams.child
-        return replace(
-            streams,
-            parent=parent if self.stream == "child" else self.correct(parent),
-            child=child if self.stream == "parent" else self.correct(child),
+        parent, child = (
+            Trajectory(stream.stamps_ns, self.corrected(name, stream.poses))
+            for name, stream in (("parent", streams.parent), ("child", streams.child))
         )
+        return replace(streams, parent=parent, child=child)
 
 
 @dataclass(frozen=True)
@@ -151,48 +158,39 @@ class Explanation:
         return self.hypothesis.complexity + int(odd_scale), by_stream
 
 
-def _misread(trajectory: Trajectory, **convention: str) -> Trajectory:
-    """The trajectory with its poses put right, but for its names."""
-    return Trajectory(trajectory.stamps_ns, se3.put_right(trajectory.poses, **convention))
-
-
-_reordered = functools.partial(_misread, quaternion="wxyz")
-_inverted = functools.partial(_misread, invert="poses")
-_orientations_inverted = functools.partial(_misread, invert="orientations")
-
-
-def _with_axes(matrix: FloatArray, trajectory: Trajectory) -> Trajectory:
-    poses = trajectory.poses.copy()
+def _with_axes(matrix: FloatArray, poses: FloatArray) -> FloatArray:
+    poses = poses.copy()
     poses[:, :3, 3] = poses[:, :3, 3] @ matrix.T
-    return Trajectory(trajectory.stamps_ns, poses)
+    return poses
 
 
 _MIRROR = -np.eye(3)
-_PLAIN = Hypothesis("", "child", lambda trajectory: trajectory, 0)
-_BOTH_INVERTED = Hypothesis("inverse_both", "both", _inverted)
+_REORDERED = partial(se3.put_right, quaternion="wxyz")
+_INVERTED_POSES = partial(se3.put_right, invert="poses")
+_PLAIN = Hypothesis("", "child", lambda poses: poses, 0)
 _USUAL = [
     *(
         Hypothesis(code, stream, correct)
         for stream in ("child", "parent")
         for code, correct in (
-            ("quaternion_order", _reordered),
-            ("inverse", _inverted),
-            ("left_handed", functools.partial(_with_axes, _MIRROR)),
+            ("quaternion_order", _REORDERED),
+            ("inverse", _INVERTED_POSES),
+            ("left_handed", partial(_with_axes, _MIRROR)),
         )
     ),
     # One exporter often writes both streams.
-    Hypothesis("quaternion_order", "both", _reordered),
-]
-
-# Less usual, and on flat ground the same as two axes swapped.
-_ORIENTATIONS = [
-    Hypothesis("inverse_orientation", stream, _orientations_inverted, 2)
-    for stream in ("child", "parent", "both")
+    Hypothesis("quaternion_order", "both", _REORDERED),
 ]
 
 
-def _axis_hypotheses() -> Iterator[Hypothesis]:
-    """All permutations and flips of the axes of the positions, except the mirror of all three."""
+def _unusual() -> Iterator[Hypothesis]:
+    """Inverted orientations, on flat ground the same as two axes swapped; and all permutations and
+    flips of the axes of the positions, except the mirror of all three.
+    """
+    for stream in ("child", "parent", "both"):
+        yield Hypothesis(
+            "inverse_orientation", stream, partial(se3.put_right, invert="orientations"), 2
+        )
     for order, signs in itertools.product(
         itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     ):
@@ -202,14 +200,14 @@ def _axis_hypotheses() -> Iterator[Hypothesis]:
         parts = zip(order, signs, strict=True)
         detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in parts)
         if n_changed and not np.array_equal(matrix, _MIRROR):
-            correct = functools.partial(_with_axes, matrix)
             for stream in ("child", "parent"):
-                yield Hypothesis("axes", stream, correct, n_changed, detail)
+                yield Hypothesis("axes", stream, partial(_with_axes, matrix), n_changed, detail)
 
 
-def explain(streams: StreamPair, thorough: bool) -> Explanation:
+def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None) -> Explanation:
     """Find the mistake that explains the streams, or that none does; ``thorough`` if the angular
-    rates agree, so that it pays to try wrong axes, too, which are many.
+    rates agree, so that it pays to try wrong axes, too, which are many. ``start`` (4, 4) is the
+    extrinsic if the streams are as they should be.
 
     Raises
     ------
@@ -219,12 +217,17 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     failed: list[Explanation] = []
     for lag_s in LAGS_S:
         try:
-            chosen = _plain_or_usual(streams, lag_s, _NOISY if thorough else HOLDS)
+            plain = _plain(streams, lag_s, start)
         except NotEnoughDataError as error:
             too_few = error
             continue
+        chosen = _or_rival(plain, _USUAL, streams, lag_s, _NOISY if thorough else HOLDS)
+        if chosen is plain and not plain.holds:
+            # A body that rotates about one of its sensors: that one's translations are noise.
+            in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
+            chosen = in_one_unit if in_one_unit.holds else plain
         if not chosen.holds and thorough and not failed:
-            chosen = _or_other_axes(chosen, streams, lag_s)
+            chosen = _or_rival(chosen, _unusual(), streams, lag_s, HOLDS)
         if chosen.holds:
             return _attributed(chosen, streams)
         # Jumps spoil long motions more than short ones.
@@ -242,62 +245,100 @@ def explain(streams: StreamPair, thorough: bool) -> Explanation:
     return replace(best, findings=(finding("unrelated", text=text, share=share),))
 
 
-def _plain_or_usual(streams: StreamPair, lag_s: float, limit: float) -> Explanation:
-    plain = _fitted(_PLAIN, streams, lag_s)
+def _plain(streams: StreamPair, lag_s: float, start: FloatArray | None) -> Explanation:
+    """The hypothesis that nothing is wrong, from a start if that leads to a fit that holds."""
+    if start is not None:
+        explanation = _fitted(_PLAIN, streams, lag_s, start)
+        if explanation.holds:
+            return explanation
+    return _fitted(_PLAIN, streams, lag_s)
+
+
+def _or_rival(
+    plain: Explanation,
+    rivals: Iterable[Hypothesis],
+    streams: StreamPair,
+    lag_s: float,
+    limit: float,
+) -> Explanation:
+    """The simplest of the rivals that explain the motion best, if they are decisively better."""
+    most = min(limit, plain.fit.unexplained / _DECISIVE)
     if plain.fit.unexplained < EXPLAINED:
         return plain
-    usual = _simplest_of_the_best([_fitted(hypothesis, streams, lag_s) for hypothesis in _USUAL])
-    if _is_decisive(plain, usual, limit):
-        return usual
-    if plain.holds:
+    pairs = streams.pairs(lag_s, _MAX_ROUGH)
+    rows, n_pairs = np.concatenate([pairs.i, pairs.j]), len(pairs)
+    few = streams.synchronised[rows]
+    tried = []
+    for rival in rivals:
+        poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
+        motions = pairs_between(*poses, np.arange(n_pairs), np.arange(n_pairs) + n_pairs)
+        if _left_unexplained(motions) < _ROUGHLY * most:
+            tried.append(_fitted(rival, streams, lag_s))
+    least = min((each.fit.unexplained for each in tried), default=np.inf)
+    if least >= most:
         return plain
-    # A body that rotates about one of its sensors: that one's translations are noise.
-    in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
-    return in_one_unit if in_one_unit.holds else plain
-
-
-def _or_other_axes(plain: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
-    """The explanation by wrong axes, or by inverted orientations, if it is decisive, otherwise the
-    given one.
-    """
-    tried = [_fitted(hypothesis, streams, lag_s) for hypothesis in _ORIENTATIONS]
-    # Wrong axes of the positions do not affect the rotations: they agree alone.
-    pairs = streams.pairs(lag_s, MAX_PAIRS)
-    T_rotation = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
-    errors = np.linalg.norm(pairs.residuals(T_rotation)[1], axis=1)
-    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
-    if median(errors) < 2 * HOLDS * np.sqrt(np.mean(angles**2)):
-        start = replace(plain.fit, T_parent_child=T_rotation)
-        tried = [
-            _fitted(hypothesis, streams, lag_s, _MAX_PAIRS_FOR_AXES, start)
-            for hypothesis in _axis_hypotheses()
-        ] + tried
-    best = _simplest_of_the_best(tried)
-    return best if _is_decisive(plain, best, HOLDS) else plain
+    best = [each for each in tried if each.fit.unexplained <= _ABOUT_EQUAL * least]
+    return min(best, key=lambda each: each.complexity)
 
 
 def _fitted(
     hypothesis: Hypothesis,
     streams: StreamPair,
     lag_s: float,
-    max_pairs: int = MAX_PAIRS,
-    start: SimilarityFit | None = None,
+    start: FloatArray | None = None,
     same_unit: bool = False,
 ) -> Explanation:
-    pairs = hypothesis.undo(streams).pairs(lag_s, max_pairs)
+    pairs = hypothesis.undo(streams).pairs(lag_s, MAX_PAIRS)
     fit = fit_similarity(pairs, start=start, same_unit=same_unit)
     return Explanation(hypothesis, fit, same_unit=same_unit)
 
 
-def _simplest_of_the_best(explanations: Sequence[Explanation]) -> Explanation:
-    limit = _ABOUT_EQUAL * min(explanation.fit.unexplained for explanation in explanations)
-    best = [explanation for explanation in explanations if explanation.fit.unexplained <= limit]
-    return min(best, key=lambda explanation: explanation.complexity)
+def _left_unexplained(pairs: MotionPairs) -> float:
+    """About the share of the motion that no extrinsic and scale explain, in closed form."""
+    A, B = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
+    a, b = se3.rotation_log(A[:, :3, :3]), se3.rotation_log(B[:, :3, :3])
+    # No extrinsic changes an angle: where angles differ, one is of a jump.
+    apart = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
+    kept = a * (apart <= 3.0 * median(apart))[:, None]
+    rotation = se3.nearest_rotation(kept.T @ b)
+    # The rotations may leave the angle about their main axis open: the translations show it then.
+    axis = np.linalg.eigh(kept.T @ kept)[1][:, -1]
+    chords, moved = A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ rotation.T
+    along = moved @ np.outer(axis, axis)
+    columns = np.stack([along - moved, np.cross(moved, axis), -along], axis=2)
+    of_path = _fit_robustly(np.concatenate([chords, columns], axis=2), -A[:, :3, 3])[0]
+    shares = []
+    for angle in (0.0, np.arctan2(of_path[4], of_path[3])):
+        turned = se3.rotation_exp(angle * axis)
+        column = -(moved @ turned.T)[:, :, None]
+        x, left_m = _fit_robustly(np.concatenate([chords, column], axis=2), -A[:, :3, 3])
+        left_rad = _deviation(a - b @ (turned @ rotation).T)
+        size_m = min(_rms(A[:, :3, 3]), max(x[3], 0.0) * _rms(moved))
+        shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (_rms(a) + 1e-12)))
+    return float(min(shares))
 
 
-def _is_decisive(plain: Explanation, rival: Explanation, limit: float) -> bool:
-    unexplained = rival.fit.unexplained
-    return unexplained < limit and _DECISIVE * unexplained < plain.fit.unexplained
+def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
+    """Unknowns (p,) of the equations ``rows @ x = target`` of (K, 3, p) and (K, 3), of which some
+    are far off, and the standard deviation per axis of what is left.
+    """
+    both, weights = np.concatenate([rows, target[:, :, None]], axis=2), np.ones(len(rows))
+    for _ in range(_ROUNDS):
+        flat = (weights[:, None, None] * both).reshape(-1, both.shape[2])
+        products = flat.T @ flat
+        x = np.linalg.pinv(products[:-1, :-1], rcond=1e-12, hermitian=True) @ products[:-1, -1]
+        left = rows @ x - target
+        sigma = _deviation(left)
+        weights = 1.0 / (1.0 + (left**2).sum(axis=1) / (6.0 * sigma + 1e-12) ** 2)
+    return x, sigma
+
+
+def _deviation(vectors: FloatArray) -> float:
+    return median(np.linalg.norm(vectors, axis=1)) / MEDIAN_LENGTH
+
+
+def _rms(vectors: FloatArray) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
@@ -317,7 +358,7 @@ def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
         # An option mends only what is clear.
         options = conventions(code, stream) if abs(evidence) > _INVERTED else {}
         found = finding(code, stream, options=options)
-        hypothesis = Hypothesis(code, stream, _inverted)
+        hypothesis = Hypothesis(code, stream, _INVERTED_POSES)
         return replace(explanation, hypothesis=hypothesis, fit=fit, findings=(found,))
     if evidence < _INVERTED:
         return explanation
@@ -325,7 +366,7 @@ def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
         found = finding("inverse_both", "both", Severity.WARNING)
         return replace(explanation, findings=(found,))
     found = finding("inverse_both", options=conventions("inverse", "both"))
-    return Explanation(_BOTH_INVERTED, inverted, (found,))
+    return Explanation(Hypothesis("inverse_both", "both", _INVERTED_POSES), inverted, (found,))
 
 
 def _may_be_an_arm(streams: StreamPair) -> bool:

@@ -36,8 +36,10 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     offset_s = calibration.time_offset_s if calibration else snapshot.config.time_offset
     scale = calibration.scale if calibration else snapshot.config.scale
     known = None
-    if calibration and not calibration.unobservable():
-        known = calibration.T_parent_child, np.sqrt(np.diag(calibration.covariance))
+    if calibration:
+        sigmas = np.sqrt(np.diag(calibration.covariance))
+        is_known = not calibration.unobservable()
+        known = calibration.T_parent_child, np.where(is_known, sigmas, np.inf)
     result = check_streams(
         *snapshot.streams,
         time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from os import PathLike
 from typing import Any, Protocol, Self, TypeAlias
 
@@ -245,7 +246,12 @@ class Trajectory:
     def _unchecked(self, name: str, value: IntArray | FloatArray) -> Self:
         changed = copy.copy(self)
         object.__setattr__(changed, name, value)
+        changed.__dict__.pop("_bends", None)
         return changed
+
+    @cached_property
+    def _bends(self) -> tuple[FloatArray, FloatArray]:
+        return bends(self.stamps_ns, self.poses)
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
@@ -289,7 +295,7 @@ class Trajectory:
             )
         bent = between & ~outside
         if bent.any() and not straight:
-            twists = corners(self.stamps_ns, self.poses, before[bent], fraction[bent])
+            twists = corners(self.stamps_ns, *self._bends, before[bent], fraction[bent])
             poses[bent] = poses[bent] @ se3.exp(twists)
         return poses
 
@@ -339,8 +345,23 @@ def _check_poses(poses: FloatArray) -> None:
         )
 
 
+def bends(stamps_ns: IntArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Change (N, 6) of the twist per second at each of the poses (N, 4, 4) at stamps (N,), zero at
+    the ends; and the share (N - 1, 6) of motion in those at both ends of each interval.
+    """
+    spans_s = np.diff(stamps_ns)[:, None] * 1e-9
+    twists = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / spans_s
+    changes = np.zeros((len(poses), 6))
+    changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
+    return changes, _shares_of_motion(changes)
+
+
 def corners(
-    stamps_ns: IntArray, poses: FloatArray, start: IntArray, fraction: FloatArray
+    stamps_ns: IntArray,
+    changes: FloatArray,
+    shares: FloatArray,
+    start: IntArray,
+    fraction: FloatArray,
 ) -> FloatArray:
     """Twists from a constant twist to the motion.
 
@@ -351,26 +372,14 @@ def corners(
     well are alike. The share of motion follows from the poses nearby. What is left of white noise
     halfway between two poses is between 0.71 (a constant twist) and 0.80 of it.
 
-    Of poses (N, 4, 4) at stamps (N,), ``start`` (M,) are the indices of those before each wanted
-    one, ``fraction`` (M,) is of the interval to the next. Returns xi (M, 6) in
+    Of poses at stamps (N,) with these :func:`bends`, ``start`` (M,) are the indices of those before
+    each wanted one, ``fraction`` (M,) is of the interval to the next. Returns xi (M, 6) in
     ``T_world_sensor exp(xi)``.
     """
-    spans_s = np.diff(stamps_ns) * 1e-9
-    # Intervals that tell what happens in the wanted ones; the twists of others count as zero.
-    is_near = np.zeros(len(spans_s), dtype=bool)
-    for step in range(-_NEARBY - 1, _NEARBY + 2):
-        is_near[np.clip(start + step, 0, len(spans_s) - 1)] = True
-    near = np.flatnonzero(is_near)
-    twists = np.zeros((len(spans_s), 6))
-    twists[near] = se3.log(se3.inverse(poses[near]) @ poses[near + 1]) / spans_s[near, None]
-    # Change of the twist per second at each pose; zero at the ends.
-    changes = np.zeros((len(poses), 6))
-    changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))[:, None]
-    shares = _shares_of_motion(changes)[start]
     at_start, at_end = changes[start], changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
-    missing = 0.5 * fraction * (1.0 - fraction) * spans_s[start] ** 2
-    return -missing[:, None] * shares * bend
+    missing = 0.5 * fraction * (1.0 - fraction) * (np.diff(stamps_ns)[start] * 1e-9) ** 2
+    return -missing[:, None] * shares[start] * bend
 
 
 def _shares_of_motion(changes: FloatArray) -> FloatArray:
