@@ -8,11 +8,8 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 
-#: No latitude is beyond it (deg).
-POLE_DEG = 90.0 + 1e-9
-# Equatorial radius (m), and the square of the eccentricity.
+# Equatorial radius (m) and flattening.
 _RADIUS_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
-_ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
 
 
 class LocalOrigin:
@@ -44,9 +41,10 @@ def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
 def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
     """Positions (N, 3) along the axes of the earth, from its centre (m)."""
     sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)
-    normal = _RADIUS_M / np.sqrt(1.0 - _ECCENTRICITY_2 * sin_lat**2)
+    eccentricity_2 = _FLATTENING * (2.0 - _FLATTENING)
+    normal = _RADIUS_M / np.sqrt(1.0 - eccentricity_2 * sin_lat**2)
     from_axis = (normal + height_m) * cos_lat
-    along_axis = ((1.0 - _ECCENTRICITY_2) * normal + height_m) * sin_lat
+    along_axis = ((1.0 - eccentricity_2) * normal + height_m) * sin_lat
     return np.stack([from_axis * np.cos(lon_rad), from_axis * np.sin(lon_rad), along_axis], axis=1)
 
 

@@ -3,7 +3,7 @@ bag, or numbers.
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -171,7 +171,7 @@ def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
     return ()
 
 
-def _of_sensors(nodes: list[_Node], keys: tuple[str, ...], frames: set[str]) -> list[Any]:
+def _of_sensors(nodes: list[_Node], keys: Sequence[str], frames: set[str]) -> list[Any]:
     """What stands under some keys; of several, that of these frames."""
     found = [(node, values) for node in nodes if (values := _at(node[1], keys))]
     if len(found) > 1:
@@ -188,7 +188,7 @@ def _of_sensors(nodes: list[_Node], keys: tuple[str, ...], frames: set[str]) -> 
     return found[0][1]
 
 
-def _at(node: Mapping[str, Any], keys: tuple[str, ...]) -> list[Any]:
+def _at(node: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
     """What stands under keys such as ``T`` or ``extrinsics.T``; empty if one is not there."""
     found = []
     for key in keys:

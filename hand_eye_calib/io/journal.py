@@ -17,8 +17,9 @@ from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,8 @@ from hand_eye_calib.io.files import open_regular
 from hand_eye_calib.io.limits import LONGEST_LINE
 from hand_eye_calib.io.trajectory_files.writing import tum_line
 
-_FORMAT, _VERSION = "hand_eye_calib/journal", 2
+_FORMAT = "hand_eye_calib/journal"
+_VERSION = 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
 _ADVICE = "move it away to start anew"
@@ -51,22 +53,19 @@ class JournalWriter:
     def __init__(
         self, directory: str | Path, about: About, resumed: "Journal | None" = None
     ) -> None:
-        self._directory = Path(directory)
-        self._directory.mkdir(parents=True, exist_ok=True)
+        Path(directory).mkdir(parents=True, exist_ok=True)
         before = resumed or Journal({}, np.array([]), np.array([]), np.array([]), {})
         self._parent_poses = int((before.streams == "parent").sum())
         self._about: dict[str, Mapping[str, Any]] = {**before.about}
         self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before.about}}
-        self._files: dict[str, BinaryIO] = {}
+        self._files: dict[str, FileIO] = {}
         for stream in self._pending:
             # Unbuffered: what is flushed is with the operating system and survives this process.
-            self._files[stream] = open(self._path(stream), "ab", buffering=0)  # noqa: SIM115
+            path = Path(directory, f"{stream}.tum")
+            self._files[stream] = open(path, "ab", buffering=0)  # noqa: SIM115
             self._files[stream].truncate(before.whole_bytes.get(stream, 0))
         head = {"format": _FORMAT, "version": _VERSION}
         self.describe({stream: head | {"stream": stream} | {**about[stream]} for stream in about})
-
-    def _path(self, stream: str) -> Path:
-        return self._directory / f"{stream}.tum"
 
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
@@ -95,7 +94,7 @@ class JournalWriter:
     def _write(self, stream: str, lines: Sequence[str]) -> None:
         file = self._files[stream]
         # A file that is no longer where it was would take what is written, and lose it.
-        if not os.path.samestat(os.stat(self._path(stream)), os.fstat(file.fileno())):
+        if not os.path.samestat(os.stat(file.name), os.fstat(file.fileno())):
             raise OSError("another program has replaced its file")
         file.write("\n".join([*lines, ""]).encode())
 
@@ -132,55 +131,49 @@ def read_journal(directory: str | Path) -> Journal:
     if not has_session(directory):
         raise InputError(f"no session journal in {directory}")
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
-    found = {stream: _File(path) for stream, path in paths.items() if os.path.lexists(path)}
-    files = found.values()
-    order = np.argsort(np.concatenate([each.arrived for each in files]), kind="stable")
+    found = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
+    abouts, stamps_ns, values, sizes = zip(*found.values(), strict=True)
+    rows = np.concatenate([np.reshape(each, (-1, 8)) for each in values])
+    order = np.argsort(rows[:, 0], kind="stable")
     return Journal(
-        about={stream: each.about for stream, each in found.items()},
-        streams=np.repeat([*found], [len(each.arrived) for each in files])[order],
-        stamps_ns=np.concatenate([each.stamps_ns for each in files])[order],
-        poses=np.concatenate([np.reshape(each.poses, (-1, 7)) for each in files])[order],
-        whole_bytes={stream: each.whole_bytes for stream, each in found.items()},
+        about=dict(zip(found, abouts, strict=True)),
+        streams=np.repeat([*found], [len(each) for each in stamps_ns])[order],
+        stamps_ns=np.concatenate(stamps_ns)[order],
+        poses=rows[order, 1:],
+        whole_bytes=dict(zip(found, sizes, strict=True)),
     )
 
 
-class _File:
-    """One stream: about, poses, and of each the time of its arrival in poses of the parent."""
-
-    def __init__(self, path: Path) -> None:
-        self.about: dict[str, Any] = {}
-        # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
-        self.stamps_ns, self.poses, self.arrived = array("q"), array("d"), array("d")
-        self.whole_bytes = 0
-        with open_regular(path) as file, suppress(*_UNREADABLE):
-            while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
-                self._add(line)
-                self.whole_bytes += len(line)
-        found = [self.about.get(key) for key in ("format", "version")]
-        if found[0] != _FORMAT:
-            raise InputError(
-                f"the session journal {path} is damaged from its first byte; {_ADVICE}"
-            )
-        if found[1] != _VERSION:
-            raise InputError(
-                f"the session journal {path} is of format version {found[1]}, this program reads "
-                f"{_VERSION}: use the version that wrote it, or {_ADVICE}"
-            )
-
-    def _add(self, line: bytes) -> None:
-        if line.startswith(b"# {"):
-            self.about |= json.loads(line[2:])
-        elif not line.startswith(b"#"):
-            stamp, *values = line.split()
-            seconds, _, decimals = stamp.partition(b".")
-            if len(values) != 7 or len(decimals) != 9:
-                raise ValueError("no pose")
-            pose = [float(value) for value in values]
-            # The parent's poses count from 0; others came between two of them.
-            arrived = self.about.get(_BATCH, len(self.stamps_ns) + 0.5) - 0.5
-            self.stamps_ns.append(int(seconds + decimals))
-            self.poses.extend(pose)
-            self.arrived.append(arrived)
+def _read(path: Path) -> tuple[dict[str, Any], "array[int]", "array[float]", int]:
+    """What is known of a stream; the stamps of its poses; one row after the other, of each its time
+    of arrival in poses of the parent and x y z qx qy qz qw; the bytes that could be read.
+    """
+    about: dict[str, Any] = {}
+    # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
+    stamps_ns, values, whole_bytes = array("q"), array("d"), 0
+    with open_regular(path) as file, suppress(*_UNREADABLE):
+        while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
+            if line.startswith(b"# {"):
+                about |= json.loads(line[2:])
+            elif not line.startswith(b"#"):
+                stamp, *cells = line.split()
+                seconds, _, decimals = stamp.partition(b".")
+                if len(cells) != 7 or len(decimals) != 9:
+                    break
+                # The parent's poses count from 0; others came between two of them.
+                arrived = about.get(_BATCH, len(stamps_ns) + 0.5) - 0.5
+                row = [float(cell) for cell in (arrived, *cells)]
+                stamps_ns.append(int(seconds + decimals))
+                values.extend(row)
+            whole_bytes += len(line)
+    if about.get("format") != _FORMAT:
+        raise InputError(f"the session journal {path} is damaged from its first byte; {_ADVICE}")
+    if about.get("version") != _VERSION:
+        raise InputError(
+            f"the session journal {path} is of format version {about.get('version')}, this program "
+            f"reads {_VERSION}: use the version that wrote it, or {_ADVICE}"
+        )
+    return about, stamps_ns, values, whole_bytes
 
 
 def has_session(directory: str | Path) -> bool:

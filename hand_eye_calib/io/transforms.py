@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, check_pose
 from hand_eye_calib.text import split_frames
 
 # An edge's stamps that jump back by more begin a new session (ns).
-_JUMP_BACK_NS = 1_000_000_000
+_JUMP_BACK_NS = STAMP_UNITS["s"]
 
 # Transforms of each moving edge from which its rate is taken, and most that are kept.
 _RATE_FROM, _MOST_KEPT = 5, 2000

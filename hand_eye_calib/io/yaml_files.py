@@ -13,11 +13,11 @@ import yaml
 
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import DEEPEST_YAML, LARGEST_YAML
+from hand_eye_calib.io.limits import DEEPEST_YAML, LARGEST_YAML, LONGEST_NAME
 from hand_eye_calib.plain import plain
+from hand_eye_calib.text import shortened
 
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
-_MOST_SHOWN = 300
 
 # libyaml is ten times as fast, and part of most builds.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -60,7 +60,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
         return yaml.load(text, Loader=_Loader)
     # A loader raises nearly anything at values that are not what their tags say.
     except Exception as error:
-        reason = " ".join(str(error).split())[:_MOST_SHOWN] or type(error).__name__
+        reason = shortened(" ".join(str(error).split()), LONGEST_NAME) or type(error).__name__
         raise InputError(f"{path} is not YAML that can be read: {reason}") from None
 
 

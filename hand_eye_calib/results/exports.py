@@ -37,14 +37,15 @@ _LONGEST_DELAY_MS = 300.0
 
 
 class Layout(NamedTuple):
-    """How a format writes one pair of sensors.
+    """How a format writes one pair of sensors: the numbers are ``T_target_source``.
 
     Attributes
     ----------
     target, source : str
-        The numbers are ``T_target_source``: sensors' roles, and after a colon which of the two it
-        always is.
-    keys : tuple of str
+        What the sensors are; empty for any.
+    is_inverted : bool or None
+        Whether the target is the child; None if both are possible.
+    keys : list of str
         What a reader looks for: a pose, or translation and rotation.
     text : str
         The file, with ``%(name)s`` where numbers and names go.
@@ -58,7 +59,8 @@ class Layout(NamedTuple):
 
     target: str
     source: str
-    keys: tuple[str, ...]
+    is_inverted: bool | None
+    keys: list[str]
     text: str
     clock: int
     axes: tuple[str, ...]
@@ -81,22 +83,21 @@ _PX4 = (
     "%(about)s\nparam set EKF2_{kind}_POS_X %(x)s\nparam set EKF2_{kind}_POS_Y %(y_frd)s\n"
     "param set EKF2_{kind}_POS_Z %(z_frd)s\n"
 )
-_PARENT, _CHILD = ":parent", ":child"
 
 #: The layouts of each format.
 FORMATS: dict[str, list[Layout]] = {}
 
 
 def _layout(
-    words: str,
-    text: str,
-    clock: int = 0,
-    axes: tuple[str, ...] = AXES,
-    axes_said: str = "",
+    words: str, text: str, clock: int = 0, axes: tuple[str, ...] = AXES, axes_said: str = ""
 ) -> None:
-    """Add a row to the table; the words are format, target, source and keys."""
+    """Add a row to the table; the words are format, target, source and keys. After a colon stands
+    which of both a sensor always is.
+    """
     name, target, source, *keys = words.split()
-    layout = Layout(target, source, tuple(keys), text, clock, axes, axes_said)
+    (target, _, place), source = target.partition(":"), source.partition(":")[0]
+    is_inverted = place == "child" if place else None
+    layout = Layout(target, source, is_inverted, keys, text, clock, axes, axes_said)
     FORMATS.setdefault(name, []).append(layout)
 
 
@@ -220,18 +221,15 @@ def arranged(
     """The layout that fits the sensors best, whether its numbers are ``T_child_parent``, and
     whether the names of the frames say so.
     """
-    roles = {"parent": role_of(parent_frame), "child": role_of(child_frame)}
-    found = []
+    roles, found = (role_of(parent_frame), role_of(child_frame)), []
     for order, layout in enumerate(layouts):
-        for places in (("parent", "child"), ("child", "parent")):
-            wanted = [each.partition(":") for each in layout[:2]]
-            if any(each[2] not in ("", place) for each, place in zip(wanted, places, strict=True)):
-                continue
-            role_at = {place: each[0] for each, place in zip(wanted, places, strict=True)}
-            matches = sum(role_at[place] == roles[place] != "" for place in places)
-            misses = sum(role_at[place] not in ("", roles[place]) for place in places)
-            is_natural = _RANKS.get(role_at["parent"], 0) <= _RANKS.get(role_at["child"], 0)
-            fit = layout, places[0] == "child", not misses
+        ways = (False, True) if layout.is_inverted is None else (layout.is_inverted,)
+        for is_inverted in ways:
+            wanted = (layout.source, layout.target) if is_inverted else layout[:2]
+            matches = sum(one == role != "" for one, role in zip(wanted, roles, strict=True))
+            misses = sum(one not in ("", role) for one, role in zip(wanted, roles, strict=True))
+            is_natural = _RANKS.get(wanted[0], 0) <= _RANKS.get(wanted[1], 0)
+            fit = layout, is_inverted, not misses
             found.append((matches, -misses, -order, is_natural, fit))
     return max(found, key=lambda each: each[:4])[4]
 
@@ -246,7 +244,7 @@ def export_text(result: Result, name: str, headline: str, is_usable: bool) -> st
         raise InputError(f"nothing is written: {headline}")
     frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
     layout, is_inverted, is_certain = arranged(FORMATS[name], *frames)
-    if layout.target == _PARENT:
+    if layout.is_inverted is False and not layout.target:  # the vehicle or robot, if it is known
         frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
     if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
         raise InputError(
@@ -274,8 +272,8 @@ def export_text(result: Result, name: str, headline: str, is_usable: bool) -> st
     if is_inverted:
         lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
     if not is_certain:
-        roles = zip((each.partition(":")[0] for each in layout[:2]), (target, source), strict=True)
-        said = ", ".join(f"{frame} is the {role}" for role, frame in roles if role)
+        roles = zip((target, source), layout[:2], strict=True)
+        said = ", ".join(f"{frame} is the {role}" for frame, role in roles if role)
         lines.append(f"Assumed, as the names of the frames do not say it: {said}.")
     if layout.axes_said:
         lines.append(layout.axes_said % {"target": target, "source": source})

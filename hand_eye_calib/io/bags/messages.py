@@ -23,7 +23,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator
 from hand_eye_calib.io.bags.poses import PoseColumns
 from hand_eye_calib.io.bags.storage import MessageKind
-from hand_eye_calib.io.geodetic import POLE_DEG, LocalOrigin
+from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.io.trajectory_files.table import TWIST
 from hand_eye_calib.io.transforms import PoseFields
@@ -412,7 +412,7 @@ class MessageReader:
             return se3.to_quat_xyzw(self._rates.rotations(stamps_ns[rows], values[rows]))
         if self._row.unpack is not _fix:
             return values[rows]
-        beyond = values[np.abs(values[:, 0]) > POLE_DEG]
+        beyond = values[np.abs(values[:, 0]) > 90]
         if len(beyond):
             raise InputError(
                 "found latitude {:.7g} and longitude {:.7g}: no latitude is beyond 90 deg; they "

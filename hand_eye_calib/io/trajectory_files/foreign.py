@@ -40,12 +40,7 @@ def foreign_table(
     path: str | Path, data: bytes, read: _Reader | str, choice: str | None, measures: str
 ) -> Table:
     """The rows of a file in one of these formats, with what :data:`PROGRAMS` has for it.
-    ``choice`` says which of several bodies is meant.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
+    ``choice`` says which of several bodies is meant. An InputError if it cannot be read.
     """
     if isinstance(read, str):
         raise InputError(f"{path}: {read}")

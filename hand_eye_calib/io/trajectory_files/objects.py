@@ -15,12 +15,8 @@ _KINDS = (
 
 
 def table_of_object(source: Any, times: Any = None) -> Table:
-    """The numbers of an array or of a table; see :func:`hand_eye_calib.read_trajectory`.
-
-    Raises
-    ------
-    InputError
-        If it is neither, or the stamps are no numbers or datetimes, one for each pose.
+    """The numbers of an array or of a table; see :func:`hand_eye_calib.read_trajectory`. An
+    InputError if it is neither, or the stamps are no numbers or datetimes, one for each pose.
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]

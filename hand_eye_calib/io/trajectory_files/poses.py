@@ -59,12 +59,7 @@ _SMALLEST_SCATTER, _CLEARLY = 0.05, 4.0
 
 def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     """Stamps (N,) in nanoseconds, in the unit that is given, that the format has, or that their
-    size tells.
-
-    Raises
-    ------
-    InputError
-        If there are none, they are too large, or their unit is not clear.
+    size tells; an InputError if there are none, they are too large, or their unit is not clear.
     """
     if not table.stamps:
         raise InputError(
@@ -98,12 +93,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Indices of poses in the order of time, each stamp once, and what was repaired for that.
-
-    Raises
-    ------
-    InputError
-        If it must not be repaired that stamps repeat or decrease.
+    """Indices of poses in the order of time, each stamp once, and what was repaired for that; an
+    InputError if it must not be repaired.
     """
     wrong = np.r_[False, stamps_ns[1:] <= stamps_ns[:-1]]
     if not repair:
@@ -135,12 +126,7 @@ def seconds(stamp_ns: int) -> str:
 def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     """Positions (N, 3), m, and quaternions (N, 4), scalar last, of a table, or its angular rates
     (N, 3), rad/s; what had to be guessed is added to its ``guesses``. A ``convention`` of its
-    angles goes before what the motion says.
-
-    Raises
-    ------
-    InputError
-        For values that cannot be; the message names the line.
+    angles goes before what the motion says. An InputError for values that cannot be, with the line.
     """
     table.refuse(
         np.asarray(~np.isfinite(table.values()).all(axis=1)),

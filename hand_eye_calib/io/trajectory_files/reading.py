@@ -63,12 +63,8 @@ _STEP_NS = 100_000_000
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
     """How to read a text file; see :func:`hand_eye_calib.read_trajectory`. ``pair_by`` is of all
-    files that belong together: "time", or "row" or "name" (of images) in place of stamps.
-
-    Raises
-    ------
-    ConfigError
-        For what is not known or does not go together.
+    files that belong together: "time", or "row" or "name" (of images) in place of stamps. A
+    ConfigError for what is not known or does not go together.
     """
 
     format: str = "tum"
@@ -227,12 +223,8 @@ def read_trajectory_file(
 
 def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
     """Read text files that belong together, with sensors named after the files: those with the same
-    columns, which come from one exporter, by one convention of their angles.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, or no convention fits the motion of all with the same columns.
+    columns, which come from one exporter, by one convention of their angles. An InputError if a
+    file cannot be read, or no convention fits the motion of all with the same columns.
     """
     tables = [read_table(*each) for each in files]
     pairs: Sequence[IntArray | None] = [None] * len(files)
@@ -332,12 +324,8 @@ def _read(
 
 
 def read_table(path: str | Path, options: FileOptions) -> Table:
-    """The rows of a file in its format, or in the one that it looks like.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, a line cannot be used, or columns have no names.
+    """The rows of a file in its format, or in the one that it looks like; an InputError if it
+    cannot be read, a line cannot be used, or columns have no names.
     """
     data = read_bytes(path)
     head = data[:LONGEST_LINE].removeprefix(b"\xef\xbb\xbf").lstrip()

@@ -93,12 +93,8 @@ class Table:
     quantity (``at``), such as "x" or "qw", those of the stamp (``stamp_at``: one, or that of
     seconds and that of nanoseconds), and the ``units`` of quantities and of "t" in the names.
     ``guesses`` are what a person should know of how the file was read, ``conventions`` those of
-    its angles that the motion does not contradict, the usual first.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, or several have the same meaning.
+    its angles that the motion does not contradict, the usual first. An InputError if a column is
+    missing, or several have the same meaning.
     """
 
     path: object
@@ -145,12 +141,8 @@ class Table:
     def fill(
         self, lines: Iterable[tuple[int, Any]], cells_of: Callable[[Any], Sequence[str]]
     ) -> Self:
-        """Add rows from their line numbers and texts.
-
-        Raises
-        ------
-        InputError
-            At the first line with another number of cells, or with something that is no number.
+        """Add rows from their line numbers and texts; an InputError at the first line with another
+        number of cells, or with something that is no number.
         """
         stamp_at, at, n_columns = self.stamp_at, [*self.at.values()], len(self.names)
         for number, text in lines:
@@ -162,12 +154,13 @@ class Table:
                 )
             try:
                 if stamp_at:
-                    self.stamps.append(_stamp(*(cells[index] for index in stamp_at)))
-                self.numbers.extend(float(cells[index]) for index in at)
+                    self.stamps.append(_stamp(*[cells[index] for index in stamp_at]))
+                self.numbers.extend([float(cells[index]) for index in at])
             except ValueError as error:
                 reason = f"expected {self.expected}; {shortened(str(error))}"
                 raise InputError(f"{self.path}, line {number}: {reason}") from None
-            self.images.extend(cells[index] for index in self._image_at)
+            if self._image_at:
+                self.images.append(cells[self._image_at[0]])
             self.line_numbers.append(number)
         return self
 
