@@ -158,13 +158,6 @@ def angular_rates(
     return rates
 
 
-def _compressed(rates: FloatArray) -> FloatArray:
-    """Rates with jumps clipped and large values compressed, less their mean."""
-    roots = np.sqrt(rates)
-    roots = np.minimum(roots, quantile(roots[np.isfinite(roots)], 1 - _CLIPPED_SHARE))
-    return roots - np.nanmean(roots)
-
-
 def _masked_correlation(
     first: FloatArray, second: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -173,9 +166,11 @@ def _masked_correlation(
     """
     size = 1 << (len(first) + len(second) - 1).bit_length()
     spectra = []
-    for signal in (_compressed(first), _compressed(second)):
-        mask = np.isfinite(signal)
-        filled = np.where(mask, signal, 0.0)
+    for rates in (first, second):
+        # Jumps are clipped and large values compressed.
+        mask, roots = np.isfinite(rates), np.sqrt(rates)
+        roots = np.minimum(roots, quantile(roots[mask], 1 - _CLIPPED_SHARE))
+        filled = np.where(mask, roots - np.nanmean(roots), 0.0)
         spectra += [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
     one_a, a, aa = spectra[:3]
     one_b, b, bb = np.conj(spectra[3:])

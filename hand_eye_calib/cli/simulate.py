@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
             write_bag(folder / name, streams, arguments.bag)
     if arguments.json:
         runs = [str(folder) for folder in folders]
-        options = {"drive": dataclasses.asdict(config), "noise": noise.to_options()}
+        options = {"drive": dataclasses.asdict(config), "noise": dataclasses.asdict(noise)}
         print(json.dumps({"runs": runs, "seed": arguments.seed, **options}, indent=2))
     else:
         print(f"{counted(len(folders), 'recording')} written to {arguments.out}")

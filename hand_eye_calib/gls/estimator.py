@@ -16,7 +16,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.increments import N_SYSTEMATIC, PARAMETERS, SYSTEMATIC, Streams
-from hand_eye_calib.gls.noise_model import ROTATION
+from hand_eye_calib.gls.noise_model import N_FAST, PARTS, ROTATION
 from hand_eye_calib.gls.problem import Fit, Problem
 from hand_eye_calib.gls.solution import AdaptiveSolution, parts_of
 from hand_eye_calib.gls.stages import STAGES, is_settled, start
@@ -134,7 +134,10 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
-    unseen = problem.tuning.unseen_share * fit.model.fixed_to_body(fit.levels)
+    unseen = np.zeros(6)
+    for process, level in zip(fit.model.slow, fit.levels[N_FAST::2], strict=True):
+        if process.kind == "body":
+            unseen[PARTS[process.part]] += problem.tuning.unseen_share * np.exp(level)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     final = fit.moved(normal.step, columns)
     is_there = fit.sigmas > problem.tuning.none

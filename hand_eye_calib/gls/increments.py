@@ -62,11 +62,6 @@ class Streams:
         return len(self.stamps_s)
 
     @cached_property
-    def typical_turn(self) -> float:
-        """Median angle (rad) that the parent turns by from pose to pose."""
-        return median(se3.rotation_angle(self.motions_p[:, :3, :3]))
-
-    @cached_property
     def motions_p(self) -> FloatArray:
         """Motions (N - 1, 4, 4) of the parent."""
         return motions(self.Ts_pw_p)

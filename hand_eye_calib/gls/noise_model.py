@@ -90,6 +90,9 @@ class NoiseModel:
         prior : (p + 1, p + 1) array
         """
         to_child, intervals_s = se3.adjoint(se3.inverse(T_parent_child)), np.diff(streams.stamps_s)
+        # Rotation noise, half of it the parent's, which moves the child by the lever arm.
+        both = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
+        is_swung = self.centre != "sensors"
         ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
         for process in self.slow:
             if process.kind == "scale":
@@ -105,8 +108,8 @@ class NoiseModel:
             columns=linearisation.columns,
             ahead=np.concatenate(ahead, axis=2),
             behind=np.concatenate(behind, axis=2),
-            white=(TRANSLATIONS[None], self._white_rotation(streams, to_child)),
-            walk=(TRANSLATIONS, _both_rotations(to_child)),
+            white=(TRANSLATIONS[None], self._swing(streams, to_child) if is_swung else both[None]),
+            walk=(TRANSLATIONS, both),
             twists=twists,
             sizes=tuple(part.shape[2] for part in ahead[1:]),
             weights=weights,
@@ -114,9 +117,8 @@ class NoiseModel:
             prior=prior,
         )
 
-    def _white_rotation(self, streams: Streams, to_child: FloatArray) -> FloatArray:
-        if self.centre == "sensors":
-            return _both_rotations(to_child)[None]
+    def _swing(self, streams: Streams, to_child: FloatArray) -> FloatArray:
+        """Covariances (N, 6, 6) of c by rotation noise of 1 rad about the origin of a world."""
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         swing = np.zeros((len(poses), 6, 3))
         swing[:, :3], swing[:, 3:] = se3.skew(se3.inverse(poses)[:, :3, 3]), np.eye(3)
@@ -142,9 +144,9 @@ class NoiseModel:
         if self.centre == "sensors":
             of_parent, of_child = of_parent + to_child @ turning @ to_child.T, of_child + turning
         elif self.centre == "child":
-            of_child = of_child + rotation * self._white_rotation(streams, to_child)
+            of_child = of_child + rotation * self._swing(streams, to_child)
         else:
-            of_parent = of_parent + rotation * self._white_rotation(streams, to_child)
+            of_parent = of_parent + rotation * self._swing(streams, to_child)
         return np.swapaxes(np.linalg.solve(of_parent + of_child, of_parent), 1, 2)
 
     def prior(self, levels: FloatArray) -> Prior:
@@ -173,14 +175,6 @@ class NoiseModel:
         starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
-    def fixed_to_body(self, levels: FloatArray) -> FloatArray:
-        """Variances (6,) of the lasting errors that are fixed to the body."""
-        variances = np.zeros(6)
-        for process, level in zip(self.slow, levels[N_FAST::2], strict=True):
-            if process.kind == "body":
-                variances[PARTS[process.part]] += np.exp(level)
-        return variances
-
     def lasting(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
@@ -201,11 +195,6 @@ def _directions(process: Slow, streams: Streams, to_child: FloatArray) -> FloatA
     if process.kind == "body":
         return np.broadcast_to(np.eye(6)[:, part], (len(streams), 6, 3))
     return to_child[:, part] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
-
-
-def _both_rotations(to_child: FloatArray) -> FloatArray:
-    """Rotation noise, half of it the parent's, which moves the child by the lever arm."""
-    return 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
 
 
 def whole(levels: FloatArray) -> FloatArray:

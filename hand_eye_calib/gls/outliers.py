@@ -14,8 +14,8 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.block_tridiagonal import transposed
 from hand_eye_calib.gls.increments import N_SYSTEMATIC, Course, Streams, linearise
+from hand_eye_calib.gls.normal import transposed
 from hand_eye_calib.gls.reml import walk_covariance
 from hand_eye_calib.gls.state_space import WHITE, Posterior
 from hand_eye_calib.gls.tuning import TUNING
@@ -113,7 +113,13 @@ def judged(
     neighbourhood is one, and what a walk makes probable is no jump.
     """
     alarming = chi_square_quantile(TUNING.false_alarms / len(of_white))
-    decisive = of_walk > _decisive(of_walk[~outliers.jumps], alarming)
+    # A step of the walk is a jump from the level of false alarms on if the others are normal, in
+    # units of what they usually are.
+    others = of_walk[~outliers.jumps]
+    ordinary, factor = others[others < alarming], TUNING.decisive
+    if len(ordinary) and np.mean(ordinary**2) <= TUNING.walk_kurtosis * np.mean(ordinary) ** 2:
+        factor = float(max(median(ordinary) / CHI2[0.5][6], 1.0))
+    decisive = of_walk > factor * alarming
     beside = np.maximum(of_white[1:], of_white[:-1])
     found = decisive & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
     jumps = outliers.jumps & decisive
@@ -124,16 +130,6 @@ def judged(
         walks = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
         spikes = spikes | (of_white > alarming) & _is_peak(of_white) & (of_white > walks)
     return Outliers(jumps, spikes)
-
-
-def _decisive(of_walk: FloatArray, alarming: float) -> float:
-    """Chi-square from which a step of the walk is a jump: that of false alarms if the others are
-    normal, in the units of what they are as a rule.
-    """
-    ordinary = of_walk[of_walk < alarming]
-    if len(ordinary) == 0 or np.mean(ordinary**2) > TUNING.walk_kurtosis * np.mean(ordinary) ** 2:
-        return TUNING.decisive * alarming
-    return float(max(median(ordinary) / CHI2[0.5][6], 1.0)) * alarming
 
 
 def _is_peak(values: FloatArray) -> BoolArray:

@@ -18,6 +18,7 @@ from hand_eye_calib.gls.noise_model import ROTATION, NoiseModel
 from hand_eye_calib.gls.outliers import Outliers, bridged
 from hand_eye_calib.gls.state_space import WHITE, Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING, Tuning
+from hand_eye_calib.stats import median
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,8 @@ class Problem:
 
     def is_noisy(self, fit: Fit) -> bool:
         """Whether the rotation between poses is not large beside its noise."""
-        noise = np.exp(0.5 * fit.levels[ROTATION])
-        return bool(noise > self.tuning.noisy * self.streams.typical_turn)
+        turns = se3.rotation_angle(self.streams.motions_p[:, :3, :3])
+        return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy * median(turns))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,10 +122,16 @@ class Fit:
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
 
     def moved(self, step: FloatArray, columns: list[int]) -> Fit:
-        """After a step of xi and of the parameters in the model."""
-        parameters = self.parameters.copy()
+        """After a step of xi and of these parameters; X as it is if noise alone makes a step so
+        long, along a direction that the motion hardly shows.
+        """
+        parameters, is_long = (
+            self.parameters.copy(),
+            np.linalg.norm(step[:3]) >= TUNING.longest_step_m,
+        )
         parameters[columns] += step[6:]
-        return replace(self, T=after(self.T, step[:6]), parameters=parameters)
+        T = self.T if is_long else self.T @ se3.exp(step[:6])
+        return replace(self, T=T, parameters=parameters)
 
     def freed(self, streams: Streams, states: FloatArray) -> Fit:
         """With the given poses freed of the errors that latent states (N, d) make.
@@ -161,13 +168,6 @@ def known_products(
     known[at, -1] = known[-1, at] = weights * values
     known[-1, -1] = weights @ values**2
     return known
-
-
-def after(T: FloatArray, step: FloatArray) -> FloatArray:
-    """X after a step (6,); as it is if noise alone makes a step so long, along a direction that the
-    motion hardly shows.
-    """
-    return T @ se3.exp(step) if np.linalg.norm(step[:3]) < TUNING.longest_step_m else T
 
 
 def sample(n_poses: int, most: int) -> IntArray | None:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.gls.block_tridiagonal import transposed
-from hand_eye_calib.gls.normal import multiplied
+from hand_eye_calib.gls.normal import multiplied, transposed
 from hand_eye_calib.gls.state_space import WHITE, Markov, Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
 

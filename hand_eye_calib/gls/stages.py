@@ -42,7 +42,7 @@ from hand_eye_calib.gls.outliers import (
     surprises,
     tail_weights,
 )
-from hand_eye_calib.gls.problem import Fit, Problem, after, sample
+from hand_eye_calib.gls.problem import Fit, Problem, sample
 from hand_eye_calib.gls.state_space import Posterior
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
@@ -111,14 +111,10 @@ def noise(problem: Problem, fit: Fit) -> Fit:
     """Noise levels of white noise and walk, and one step of X."""
     kept = sample(len(problem.streams), problem.tuning.most_poses)
     found, _ = reml.fit(problem.space(fit, kept), fit.levels, fit.model.prior(fit.levels))
-    step = NormalEquations(selected(found.products, list(range(6)))).step
-    T = after(fit.T, step)
-    return replace(
-        fit,
-        levels=found.levels,
-        T=T,
-        course=course_of(problem.streams, T, float(np.exp(0.5 * whole(found.levels)[0]))),
-    )
+    moved = fit.moved(NormalEquations(selected(found.products, list(range(6)))).step, [])
+    noise_m = float(np.exp(0.5 * whole(found.levels)[0]))
+    course = course_of(problem.streams, moved.T, noise_m)
+    return replace(moved, levels=found.levels, course=course)
 
 
 def outliers(problem: Problem, fit: Fit) -> Fit:

@@ -23,8 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.gls.block_tridiagonal import Factor, inverse_roots, transposed
-from hand_eye_calib.gls.normal import NormalEquations, multiplied
+from hand_eye_calib.gls.normal import Factor, NormalEquations, inverse_roots, multiplied, transposed
 from hand_eye_calib.gls.tuning import TUNING
 
 # States of a pose's white error.

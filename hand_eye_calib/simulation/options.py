@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from hand_eye_calib.option import OptionSet, option
-
 
 @dataclass(frozen=True, kw_only=True)
 class DriveConfig:
@@ -64,32 +62,25 @@ HILLY_DRIVE = DriveConfig(
 
 
 @dataclass(frozen=True)
-class NoiseConfig(OptionSet):
-    """Level of each kind of noise; the default is none."""
+class NoiseConfig:
+    """Level of each kind of noise; the default is none.
 
-    gaussian: float = option(
-        0.0,
-        "Standard deviation of each pose's translation error per axis (published: 0 to 0.010).",
-        unit="m",
-        within=(0.0, 10.0),
-    )
-    rotation_per_metre: float = option(
-        2.0,
-        "Standard deviation of each pose's Euler angles over that of its translation.",
-        unit="rad/m",
-        within=(0.0, 100.0),
-    )
-    outliers: float = option(
-        0.0,
-        "Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).",
-        within=(0.0, 1.0),
-    )
-    drift: float = option(
-        0.0,
-        "Drift of the child sensor along one of its axes (published: 0 to 0.05).",
-        unit="m/m",
-        within=(0.0, 10.0),
-    )
+    Attributes
+    ----------
+    gaussian : float
+        Standard deviation of each pose's translation error per axis, m (published: 0 to 0.010).
+    rotation_per_metre : float
+        That of each pose's Euler angles over it, rad/m.
+    outliers : float
+        Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).
+    drift : float
+        Drift of the child sensor along one of its axes, m/m (published: 0 to 0.05).
+    """
+
+    gaussian: float = 0.0
+    rotation_per_metre: float = 2.0
+    outliers: float = 0.0
+    drift: float = 0.0
 
 
 # Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a few SLAM corrections of

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hand_eye_calib.gls import reml
-from hand_eye_calib.gls.block_tridiagonal import Factor
-from hand_eye_calib.gls.normal import NormalEquations, answers_without
+from hand_eye_calib.gls.normal import Factor, NormalEquations, answers_without
 from hand_eye_calib.gls.outliers import surprises
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
 
