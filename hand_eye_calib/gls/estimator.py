@@ -17,9 +17,8 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.increments import N_SYSTEMATIC, PARAMETERS, SYSTEMATIC, Streams
 from hand_eye_calib.gls.noise_model import N_FAST, PARTS, ROTATION
-from hand_eye_calib.gls.problem import Fit, Problem
 from hand_eye_calib.gls.solution import AdaptiveSolution, parts_of
-from hand_eye_calib.gls.stages import STAGES, is_settled, start
+from hand_eye_calib.gls.stages import STAGES, Fit, Problem, is_settled, start
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 from hand_eye_calib.stats import median
 
@@ -110,11 +109,8 @@ def _strided(problem: Problem, fit: Fit) -> IntArray:
 
 def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
     """The solution of some poses, jumps and spikes told of all."""
-    jumps, spikes, weights = (
-        np.zeros(len(spikes) - 1, dtype=bool),
-        spikes.copy(),
-        np.ones(len(spikes)),
-    )
+    jumps, spikes = np.zeros(len(spikes) - 1, dtype=bool), spikes.copy()
+    weights = np.ones(len(spikes))
     jumps[kept[1:][fewer.jumps] - 1] = True
     spikes[kept[fewer.spikes]] = True
     weights[kept] = fewer.weights

@@ -50,9 +50,8 @@ from hand_eye_calib.gls.noise_model import (
 )
 from hand_eye_calib.gls.normal import NormalEquations, selected
 from hand_eye_calib.gls.outliers import Outliers, bridged, judged, surprises
-from hand_eye_calib.gls.problem import known_products, sample
 from hand_eye_calib.gls.solution import LeverArmSolution, parts_of
-from hand_eye_calib.gls.stages import rough_levels
+from hand_eye_calib.gls.stages import known_products, rough_levels, sample
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
 
@@ -91,10 +90,9 @@ def solve(
             state = state.with_outliers(posterior)
         normal = NormalEquations(selected(posterior.products, _SOLVED))
         step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
-        is_settled = (np.abs(step[:3]) < TUNING.settled_sigmas * sigmas) | (
-            sigmas > TUNING.unknown_m
-        )
-        converged = number > TUNING.fits[-1] and bool(is_settled.all())
+        is_small = np.abs(step[:3]) < TUNING.settled_sigmas * sigmas
+        is_settled = bool((is_small | (sigmas > TUNING.unknown_m)).all())
+        converged = number > TUNING.fits[-1] and is_settled
         if converged:
             break
         state = state.moved(posterior, step)

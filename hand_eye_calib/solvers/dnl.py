@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import quadratic_form
@@ -25,17 +25,6 @@ def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool, int]:
     Ts, values, converged, iterations = quadratic_form.minimise(Q, start_rotations(pairs))
     best = int(np.argmin(values))
     return Ts[best], bool(converged[best]), iterations
-
-
-def solve_without(pairs: MotionPairs, solution: Solution, left_out: BoolArray) -> FloatArray:
-    """Solve again near a solution without the pairs of each row of ``left_out`` (B, K), for
-    resampling; returns the transforms (B, 4, 4).
-    """
-    coefficients = quadratic_form.coefficients(pairs)
-    kept = (~left_out).astype(float)
-    forms = np.stack([quadratic_form.weighted_sum(coefficients, weights) for weights in kept])
-    starts = np.repeat(solution.T_parent_child[None, :3, :3], len(left_out), axis=0)
-    return quadratic_form.minimise(forms, starts)[0]
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
