@@ -1,6 +1,8 @@
 """Messages that are no poses by themselves: twists, two topics joined, fields of any message."""
 
 import json
+import re
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -14,10 +16,12 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags import PoseBag
+from hand_eye_calib.io.transforms import TfSource
 
 TIMES = np.arange(0, 30, 0.05)
 TRUTH = as_trajectory(smooth_poses(TIMES), rate_hz=20.0)
 P, Q = TRUTH.poses[:, :3, 3], se3.to_quat_xyzw(TRUTH.poses)
+GEODETIC = geodetic(P - P[0], (48.1, 11.5, 550.0))
 TWIST = "geometry_msgs/msg/TwistStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
@@ -38,7 +42,7 @@ def made(name, *values, **more):
 
 def messages():
     """Topic and type to the messages of all stamps."""
-    lat, lon, height = geodetic(P - P[0], (48.1, 11.5, 550.0))
+    lat, lon, height = GEODETIC
     steps = se3.log(se3.inverse(TRUTH.poses[:-1]) @ TRUTH.poses[1:]) / 0.05
     twists = np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
@@ -109,24 +113,75 @@ def test_the_poses_are_those_of_the_truth(bag, source, within):
     np.testing.assert_allclose(from_start(found.poses), from_start(TRUTH.poses), atol=within)
 
 
-def test_messages_of_json(tmp_path):
-    path = tmp_path / "poses.mcap"
+def foxglove(kind, k):
+    """A message of Foxglove's as plain values."""
+    lat, lon, height = (float(each[k]) for each in GEODETIC)
+    sec, nsec = divmod(int(TRUTH.stamps_ns[k]), 10**9)
+    place, turn = (dict(zip("xyzw", each[k].tolist(), strict=False)) for each in (P, Q))
+    pose = {"position": place, "orientation": turn}
+    frames = {"parent_frame_id": "map", "child_frame_id": "base"}
+    moving = {"timestamp": {"sec": sec, "nsec": nsec}} | frames
+    moving |= {"translation": place, "rotation": turn}
+    parts = {
+        "PoseInFrame": {"frame_id": "map", "pose": pose},
+        "PosesInFrame": {"frame_id": "map", "poses": [pose]},
+        "FrameTransform": moving,
+        "FrameTransforms": {"transforms": [moving]},
+        "LocationFix": {"latitude": lat, "longitude": lon, "altitude": height},
+    }
+    timed = {} if kind == "FrameTransforms" else {"timestamp": moving["timestamp"]}
+    return timed | parts[kind]
+
+
+def in_json(path, kind):
+    """An mcap file of the library's own writer, with the timestamps of Foxglove's JSON."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        schema = writer.register_schema("foxglove.PoseInFrame", "jsonschema", b"{}")
+        schema = writer.register_schema(f"foxglove.{kind}", "jsonschema", b"{}")
         channel = writer.register_channel("/pose", "json", schema)
         for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
-            sec, nsec = divmod(stamp_ns, 10**9)
-            parts = (("position", dict(zip("xyz", P[k], strict=True))),
-                     ("orientation", dict(zip("xyzw", Q[k], strict=True))))  # fmt: skip
-            message = {"timestamp": {"sec": sec, "nsec": nsec}, "pose": dict(parts)}
-            message["frame_id"] = "map"
-            writer.add_message(channel, stamp_ns, json.dumps(message).encode(), stamp_ns)
+            writer.add_message(channel, stamp_ns, json.dumps(foxglove(kind, k)).encode(), stamp_ns)
         writer.finish()
-    found = read_bag_trajectory(path, "/pose")
-    np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+
+
+def in_protobuf(path, kind):
+    """The same in Foxglove's own protobuf schemas, by the writer of mcap-protobuf-support."""
+    writing = pytest.importorskip("mcap_protobuf.writer", reason="needs mcap-protobuf-support")
+    name = f"foxglove_schemas_protobuf.{kind}_pb2"
+    schema = pytest.importorskip(name, reason="needs foxglove-schemas-protobuf")
+    json_format = pytest.importorskip("google.protobuf.json_format")
+    to_date = re.compile(r'\{"sec": (\d+), "nsec": (\d+)\}')
+    with path.open("wb") as file, writing.Writer(file) as writer:
+        for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
+            date = datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+            stamp = f'"{date}.{stamp_ns % 10**9:09d}Z"'
+            text = to_date.sub(stamp, json.dumps(foxglove(kind, k)))
+            message = json_format.Parse(text, getattr(schema, kind)())
+            writer.write_message("/pose", message, stamp_ns, stamp_ns)
+
+
+@pytest.mark.parametrize("write", [in_json, in_protobuf])
+@pytest.mark.parametrize(
+    "kind", ["PoseInFrame", "PosesInFrame", "FrameTransform", "FrameTransforms", "LocationFix"]
+)
+def test_messages_of_foxglove(tmp_path, kind, write):
+    write(tmp_path / "poses.mcap", kind)
+    source = "map:base" if kind == "FrameTransforms" else "/pose"
+    with PoseBag(tmp_path / "poses.mcap") as bag:
+        found, _ = bag.trajectory(TfSource.parse(source) if ":" in source else source)
+        assert bag.topics["/pose"].type == f"foxglove.{kind}"
     assert (found.stamps_ns == TRUTH.stamps_ns).all()
+    if kind == "LocationFix":
+        assert found.measures == "positions"
+        np.testing.assert_allclose(found.poses[:, :3, 3], P - P[0], atol=1e-5)
+    else:
+        np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+
+
+def test_fields_of_a_place_are_positions(bag):
+    fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
+    assert read_bag_trajectory(bag, f"/array?{fields}").measures == "positions"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bag_making import JAZZY, header, write_messages
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
@@ -9,6 +10,8 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.bags import PoseBag
+from hand_eye_calib.io.bags.writer import stamped_messages
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, images_in, read_camera
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
@@ -115,6 +118,66 @@ def test_aprilgrid_has_the_frame_of_kalibr():
     assert found.images == [0, 1, 2]
     assert np.abs(off[:, :3]).max() < 5e-3
     assert np.degrees(np.abs(off[:, 3:]).max()) < 0.4
+
+
+def image_messages(stamp_ns, image):
+    """The same image on two topics, and the intrinsics."""
+    types, head = JAZZY.types, header(JAZZY, stamp_ns, "eye")
+    coded, color = cv2.imencode(".png", image)[1].ravel(), np.repeat(image[:, :, None], 3, axis=2)
+    height, width = image.shape
+    about = "rgb8", 0, 3 * width, color.ravel()
+    raw = types["sensor_msgs/msg/Image"](head, height, width, *about)
+    compressed = types["sensor_msgs/msg/CompressedImage"](head, "png", coded)
+    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    P = np.c_[MATRIX, np.zeros(3)].ravel()
+    lens = "plumb_bob", np.zeros(5), MATRIX.ravel(), np.eye(3).ravel(), P, 0, 0, region
+    info = types["sensor_msgs/msg/CameraInfo"](head, height, width, *lens)
+    for topic, message in (("image_raw", raw), ("image_raw/compressed", compressed)):
+        yield stamp_ns, f"/eye/{topic}", message.__msgtype__, lambda _, made=message: made
+    yield stamp_ns, "/eye/camera_info", info.__msgtype__, lambda _: info
+
+
+def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys):
+    rng, count = np.random.default_rng(7), 24
+    times = np.arange(count) / 6
+    stamps_ns = 1_700_000_000_000_000_000 + np.int64(1e9 / 6 * np.arange(count))
+    turns = 0.45 * np.stack([np.sin(1.3 * times), np.sin(1.9 * times + 1), np.sin(times)], axis=1)
+    Rs, far = Rotation.from_rotvec(turns).as_matrix(), [0.0, 0.0, 0.62]
+    Ts = se3.from_rotation_translation(Rs, far - Rs @ [0.175, 0.125, 0.0])
+    X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
+    hand = Trajectory(stamps_ns, se3.inverse(Ts) @ se3.inverse(X), "hand", "base")
+    messages = [
+        (stamp_ns, "/hand", "geometry_msgs/msg/PoseStamped", lambda _, made=message: made)
+        for stamp_ns, message in stamped_messages(
+            JAZZY.types, hand, "geometry_msgs/msg/PoseStamped", is_ros1=False
+        )
+    ]
+    picture = charuco_picture()
+    for stamp_ns, T in zip(stamps_ns.tolist(), Ts, strict=True):
+        messages += image_messages(stamp_ns, rendered(picture, T, rng))
+    bag = write_messages(tmp_path / "bag", messages)
+    board = "charuco:7x5:0.05:0.037:5X5_100"
+    with pytest.warns(UserWarning, match="seen in 24 of 24 images, its corners to 0[.]"):
+        found = hec.read_trajectory(bag, topic=f"/eye/image_raw?{board}")
+    off = se3.log(Ts @ found.poses)
+    assert np.median(np.abs(off[:, :3])) < 1e-3
+    assert np.degrees(np.median(np.abs(off[:, 3:]))) < 0.1
+    assert (found.world_frame, found.sensor_frame) == ("target", "eye")
+    (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
+    with PoseBag(bag) as opened:
+        of_file = f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
+        np.testing.assert_array_equal(opened.trajectory(of_file)[0].poses, found.poses)
+        for topic, said in (
+            ("/eye/image_raw", "name what images show"),
+            (f"/hand?{board}", "has no images"),
+        ):
+            with pytest.raises(InputError, match=said):
+                opened.trajectory(topic)
+    topics = ["--parent-topic", "/hand", "--child-topic", "/eye/image_raw", "--target", board]
+    assert main(["calibrate", str(bag), *topics, "--out", str(tmp_path / "out")]) == 0
+    error = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
+    assert np.abs(error[:3]).max() < 3e-3
+    assert np.degrees(np.abs(error[3:]).max()) < 0.2
 
 
 def test_images_without_the_target_are_left_out():
