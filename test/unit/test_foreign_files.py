@@ -2,12 +2,15 @@
 what cannot be read is told in one sentence.
 """
 
+import importlib.util
 import json
+import struct
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from motions import as_trajectory, geodetic, wandering_poses
+from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -214,31 +217,54 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_pa
     assert "no image has a name that is in all files" in capsys.readouterr().err
 
 
-def test_the_axes_of_a_log_of_px4_are_turned(tmp_path, monkeypatch):
-    """With pyulog's own objects where it is installed, and without it one sentence."""
-    (tmp_path / "log.ulg").write_bytes(b"ULog\x01\x12\x35" + bytes(20))
-    try:
-        import pyulog
-    except ImportError:
+# Fields of the topics of a log of PX4, as its own definitions of messages have them.
+PX4 = {
+    "vehicle_odometry": "uint64_t timestamp;uint64_t timestamp_sample;uint8_t pose_frame;"
+    "float[3] position;float[4] q;",
+    "vehicle_local_position": "uint64_t timestamp;uint64_t timestamp_sample;"
+    "float x;float y;float z;",
+    "vehicle_attitude": "uint64_t timestamp;uint64_t timestamp_sample;float[4] q;",
+}
+
+
+def of_ulog(*topics):
+    """A log by the published format of ULog files, in axes north, east, down."""
+
+    def message(kind, data):
+        return struct.pack("<HB", len(data), ord(kind)) + data
+
+    flip = np.diag([1.0, -1, -1])
+    places, turns = P @ flip, Rotation.from_matrix(flip @ TRUTH.poses[:, :3, :3] @ flip).as_quat()
+    log = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))
+    log += b"".join(message("F", f"{name}:{PX4[name]}".encode()) for name in topics)
+    for number, name in enumerate(topics):
+        log += message("A", struct.pack("<BH", 0, number) + name.encode())
+    for k, stamp in enumerate((TRUTH.stamps_ns // 1000).tolist()):
+        for number, name in enumerate(topics):
+            place, turn = tuple(places[k]), tuple(np.roll(turns[k], 1))
+            form, values = {
+                "vehicle_odometry": ("B7f", (1, *place, *turn)),
+                "vehicle_local_position": ("3f", place),
+                "vehicle_attitude": ("4f", turn),
+            }[name]
+            log += message("D", struct.pack(f"<HQQ{form}", number, stamp + 900, stamp, *values))
+    return log
+
+
+@pytest.mark.parametrize("topics", [[*PX4][:1], [*PX4][1:], [*PX4], [*PX4][2:]])
+def test_a_log_of_px4(tmp_path, topics):
+    """Odometry before positions and attitudes; without pyulog one sentence."""
+    (tmp_path / "log.ulg").write_bytes(of_ulog(*topics))
+    if not importlib.util.find_spec("pyulog"):
         with pytest.raises(MissingDependencyError, match=r"hand_eye_calib\[px4\]"):
             read_trajectory_file(tmp_path / "log.ulg", AUTO)
-        return
-    flip = np.diag([1.0, -1, -1])
-    poses = se3.from_rotation_translation(flip @ TRUTH.poses[:, :3, :3] @ flip, P @ flip)
-    quats, positions = se3.to_quat_xyzw(poses), poses[:, :3, 3]
-    data = {f"q[{k}]": quats[:, (k - 1) % 4] for k in range(4)}
-    data |= {f"position[{k}]": positions[:, k] for k in range(3)}
-    data["timestamp_sample"] = (TRUTH.stamps_ns // 1000).astype(np.uint64)
-
-    class Log:
-        def __init__(self, *_):
-            message = type("Data", (), {"name": "vehicle_odometry", "data": data})
-            self.data_list = [message]
-
-    monkeypatch.setattr(pyulog, "ULog", Log)
-    found = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
-    np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-9)
-    assert (found.stamps_ns == TRUTH.stamps_ns).all()
+    elif len(topics) == 1 and topics != ["vehicle_odometry"]:
+        with pytest.raises(InputError, match="without vehicle_odometry or vehicle_local_position"):
+            read_trajectory_file(tmp_path / "log.ulg", AUTO)
+    else:
+        found = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
+        np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-5)
+        assert (found.stamps_ns == TRUTH.stamps_ns).all()
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import InputError, MissingDependencyError
+from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.errors import InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.io.trajectory_files.table import MATRIX, POSITION, QUATERNION, Table
 from hand_eye_calib.text import shortened
@@ -218,30 +219,40 @@ def _of_numpy(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_ulog(data: bytes, _: str | None) -> _Rows:
-    """A log of PX4: the odometry of its estimator."""
+    """A log of PX4: the odometry of its estimator, or local positions with attitudes."""
+    reading = required("pyulog", "a log of PX4", "hand_eye_calib[px4]")
+    quaternion = [f"q[{k}]" for k in (1, 2, 3, 0)]
     try:
-        from pyulog import ULog
-    except ImportError:
-        raise MissingDependencyError(
-            "to read a log of PX4 needs pyulog: pip install 'hand_eye_calib[px4]'"
-        ) from None
-    try:
-        log = ULog(io.BytesIO(data), ["vehicle_odometry"]).data_list[0]
-        names = "xyz" if "x" in log.data else [f"position[{k}]" for k in range(3)]
-        names = [*names, *(f"q[{k}]" for k in (1, 2, 3, 0))]
-        stamps = log.data["timestamp_sample" if "timestamp_sample" in log.data else "timestamp"]
-        values = np.stack([log.data[name] for name in names], axis=1).astype(float)
+        topics = ["vehicle_odometry", "vehicle_local_position", "vehicle_attitude"]
+        logged = reading.ULog(io.BytesIO(data), topics).data_list
+        of = {each.name: each.data for each in logged if each.multi_id == 0}
+        if "vehicle_odometry" in of:
+            place = "xyz" if "x" in of["vehicle_odometry"] else [f"position[{k}]" for k in range(3)]
+            stamps, values = _logged(of["vehicle_odometry"], *place, *quaternion)
+            Ts = se3.from_quat_xyzw(values[:, :3], values[:, 3:])
+        else:
+            stamps, places = _logged(of["vehicle_local_position"], *"xyz")
+            times, turns = _logged(of["vehicle_attitude"], *quaternion)
+            attitudes = Trajectory.from_quat_xyzw(1000 * times, 0.0 * turns[:, :3], turns)
+            inside = (stamps >= times[0]) & (stamps <= times[-1])
+            stamps, Ts = stamps[inside], attitudes.at(1000 * stamps[inside])
+            Ts[:, :3, 3] = places[inside]
     except Exception as error:  # of many kinds, at damaged logs
         reason = f"{type(error).__name__} {error}"
-        raise ValueError(f"a log of PX4 without vehicle_odometry ({reason})") from None
-    good = np.isfinite(values).all(axis=1)
-    positions, quats = values[good, :3], values[good, 3:]
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    rotations = _FLIP @ se3.from_quat_xyzw(positions, quats)[:, :3, :3] @ _FLIP
-    poses = _as_rows(se3.from_rotation_translation(rotations, positions @ _FLIP)).tolist()
-    rows = [(int(stamp), *pose) for stamp, pose in zip(stamps[good], poses, strict=True)]
+        raise ValueError(f"a log of PX4 without {' or '.join(topics[:2])} ({reason})") from None
+    flip = np.diag([*np.diag(_FLIP), 1.0])
+    rows = np.c_[stamps, _as_rows(flip @ Ts @ flip)].tolist()
     note = "axes: x forward, y left, z up, in north, west, up; PX4 has forward, right, down"
-    return ("t [us]", *MATRIX), rows, [note]
+    return ("t [us]", *MATRIX), [(int(row[0]), *row[1:]) for row in rows], [note]
+
+
+def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]:
+    """Increasing stamps (us) and the values of a topic in a log of PX4, where all are finite."""
+    values = np.stack([data[name] for name in names], axis=1).astype(float)
+    good = np.isfinite(values).all(axis=1)
+    stamps = data.get("timestamp_sample", data["timestamp"])[good].astype(np.int64)
+    stamps, first = np.unique(stamps, return_index=True)
+    return stamps, values[good][first]
 
 
 def _as_rows(poses: FloatArray) -> FloatArray:
