@@ -52,7 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "biases that X can be told from": _with(most_growth=1e6),
     "fewer poses of a target": _with(strides=()),
     "following X": _with(max_rounds=1),
-    "all poses for the noise": _with(most_poses=10**6, most_poses_lasting=10**6),
+    "all poses for the noise": _with(most_poses=10**6),
 }
 
 

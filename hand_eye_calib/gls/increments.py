@@ -108,7 +108,8 @@ class Course:
 
 
 def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.inf) -> Course:
-    """Course of both sensors; the child's steps are the mean of what both streams say.
+    """Course of both sensors; the child's steps are the mean of what both streams say, the metres
+    that a bias of them grows with those that the parent travels: they have no bias.
 
     Parameters
     ----------
@@ -121,11 +122,12 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     of_parent, of_child = streams.motions_p[:, :3, 3], streams.motions_c[:, :3, 3]
     rotation, lever_arm = T_parent_child[:3, :3], T_parent_child[:3, 3]
     chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
-    of_both = 0.5 * (of_child + (chords + of_parent) @ rotation)
-    step, child_step = (
-        _cleaned(each, np.diff(streams.stamps_s), noise_m) for each in (of_both, of_child)
+    by_parent = (chords + of_parent) @ rotation
+    step, true_step = (
+        _cleaned(each, np.diff(streams.stamps_s), noise_m)
+        for each in (0.5 * (of_child + by_parent), by_parent)
     )
-    metres_c = np.linalg.norm(child_step, axis=1)
+    metres_c = np.linalg.norm(true_step, axis=1)
     axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,

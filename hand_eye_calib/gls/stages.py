@@ -331,7 +331,7 @@ def tails(problem: Problem, fit: Fit) -> Fit:
 def lasting(problem: Problem, fit: Fit) -> Fit:
     """Errors that last, if the data ask for them."""
     tuning = problem.tuning
-    kept = sample(len(problem.streams), tuning.most_poses_lasting)
+    kept = sample(len(problem.streams), tuning.most_poses)
     # No white noise and no walk is so small that the search cannot hear it.
     levels, total = fit.levels.copy(), whole(fit.levels)
     levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible_white))

@@ -21,9 +21,8 @@ class Tuning:
 
     # -- Noise levels, which are logarithms of variances --
     # They need no more poses than this, in bursts that are spread evenly: bursts show the fast
-    # errors, the time between them the slow ones. Slow errors take more time and need fewer.
+    # errors, the time between them the slow ones.
     most_poses: int = 300
-    most_poses_lasting: int = 200
     burst: tuple[int, ...] = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)
     # Poses farther apart than this say nothing of the noise levels: over such a gap a walk of the
     # rotation shifts positions in a way that the model of one increment does not follow. In
