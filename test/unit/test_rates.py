@@ -189,9 +189,9 @@ class TestFiles:
         path.write_text("1 0 0 1\n2 0 0 1\n")
         with pytest.raises(InputError, match="name the 4 with `columns`"):
             read_trajectory_file(path, "auto")
-        assert read_trajectory_file(path, "auto", measures="rates").trajectory.measures == "rates"
-        found = read_trajectory_file(path, "auto", measures="positions").trajectory
-        assert found.measures == "positions"
+        for columns, measures in (("t,wx,wy,wz", "rates"), ("t,x,y,z", "positions")):
+            found = read_trajectory_file(path, "auto", columns=columns).trajectory
+            assert found.measures == measures
 
     def test_the_command(self, streams, tmp_path, capsys):
         parent, stamps_ns, rates = smooth_streams(n_poses=200)

@@ -27,12 +27,13 @@ from hand_eye_calib.io.trajectory_files.table import (
     DIGITS,
     MATRIX,
     NUMBER,
+    PLANAR_POSITIONS,
     POSITION,
     QUATERNION,
     RATES,
     UNNAMED,
     Table,
-    are_columns,
+    named_columns,
 )
 from hand_eye_calib.text import told_apart
 
@@ -51,8 +52,6 @@ _FORMATS: dict[str, tuple[Sequence[str], str]] = {
 }
 # A stamp, a position and a quaternion, whose order is to be found.
 _UNNAMED = ("t", *POSITION, *UNNAMED)
-# What four columns without names are.
-_OF_FOUR = {"positions": ("t", *POSITION), "rates": ("t", *RATES)}
 _TIMES = "times.txt"
 _LINE = re.compile(r"\S[^\n]*")
 _DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+([eE][-+]?\d+)?)")
@@ -342,17 +341,17 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
         format = options.format if options.format != AUTO else "csv" if columns else "kitti"
         header = _FORMATS[format][0] if format != "csv" else names
     else:
-        header = header or _OF_FOUR.get(options.measures) if len(cells) == 4 else header
         if format != "tum":
             guesses = [f"{path} looks like format {format}; to change that, give `format`"]
         beside = Path(path).with_name(_TIMES)
         if format == "kitti" and beside.is_file():
             times = beside
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
-    is_header = names is cells and (format == "csv" or are_columns(names))
+    is_header = not any(map(NUMBER.fullmatch, cells))
     if columns:
         header = [name.strip() for name in columns.split(",")]
-        is_header = not any(map(NUMBER.fullmatch, cells))
+    elif format == "csv":
+        is_header = names is cells
     if header is None and cells:
         raise InputError(
             f"{path}: the first line names no columns, so that their order is unknown; name the "
@@ -419,8 +418,9 @@ def _beginning(
     found: tuple[str, Sequence[str] | None]
     names: Sequence[str] | None = comments.get(len(cells)) if is_row else cells
     is_separated, n_cells = "," in line or ";" in line, len(cells)
-    if names and (names is cells or are_columns(names)):
-        is_tum = " ".join(names).lower().endswith(TUM_COLUMNS.partition(" ")[2])
+    known = named_columns(names or ())[0].keys()
+    if names is cells or any({*group} <= known for group in (*PLANAR_POSITIONS, RATES)):
+        is_tum = " ".join(names or ()).lower().endswith(TUM_COLUMNS.partition(" ")[2])
         found = ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", names)
     elif not is_separated and n_cells != 4:
         found = ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)

@@ -29,7 +29,7 @@ TWIST = ("vx", "vy", "vz", *RATES)
 # Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
 # plane, fewer.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
-_PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
+PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
 _ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"), UNNAMED)
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
 
@@ -192,12 +192,6 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
     return found, [*units]
 
 
-def are_columns(names: Sequence[str]) -> bool:
-    """Whether these are names of columns, or some other text."""
-    found = named_columns(names)[0].keys()
-    return any({*group} <= found for group in (*_POSITIONS, *_PLANAR_POSITIONS, RATES))
-
-
 def _measured(
     found: Mapping[str, Any], names: Sequence[str], measures: str
 ) -> tuple[str, Sequence[str]]:
@@ -205,9 +199,9 @@ def _measured(
     quantities in doubt, so that what is missing is named.
     """
 
-    known = [*_POSITIONS, *_PLANAR_POSITIONS, *_ORIENTATIONS, *_PLANAR_ORIENTATIONS]
+    known = [*_POSITIONS, *PLANAR_POSITIONS, *_ORIENTATIONS, *_PLANAR_ORIENTATIONS]
     known = [group for group in known if {*group} <= found.keys()]
-    flat = next((group for group in known if group in (*_POSITIONS, *_PLANAR_POSITIONS)), ())
+    flat = next((group for group in known if group in (*_POSITIONS, *PLANAR_POSITIONS)), ())
     turn = next((group for group in known if group in _ORIENTATIONS), ())
     heading = next((group for group in known if group in _PLANAR_ORIENTATIONS), ())
     if measures == "auto":
