@@ -139,7 +139,7 @@ def check_streams(
         # Nothing is said about the rates of a frozen stream.
         if not correlation.is_clear and not frozen:
             is_still = correlation.variation < MIN_VARIATION
-            doubt = f"the angular rates agree at no clock offset: {correlation.doubt()}"
+            doubt = f"the streams agree at no clock offset: {correlation.doubt()}"
             found = [finding("no_turning") if is_still else finding("unrelated", text=doubt)]
             findings += found
         return CheckResult(gravest_first(findings), correlation)

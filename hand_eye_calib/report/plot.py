@@ -22,6 +22,7 @@ from hand_eye_calib.report.style import (
     plain_label,
 )
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import listing
 
 # The three views: which axes of the parent go across and up, and what that is on a vehicle.
 _VIEWS = {"xy": "from above", "xz": "from the side", "yz": "from behind"}
@@ -73,7 +74,7 @@ def said_of_views(*calibrations: Calibration) -> str:
         text += f", drawn {larger:,.0f} times as large." if larger > 1 else "."
     if not known.all():
         unknown = [axis for axis, each in zip("xyz", known.T, strict=True) if not each.all()]
-        text += f" Unknown along {' and '.join(unknown)}: the dashed line."
+        text += f" Unknown along {listing(unknown)}: the dashed line."
     return text
 
 

@@ -196,6 +196,7 @@ def _direction(transform: Plain, unknown: set[str]) -> dict[str, Any]:
 def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
     """Rows of the table of uncertainties, along and about the parent's axes."""
     totals = calibration.sigmas_with_floor.tolist()
+    is_bad = calibration.verdict is Verdict.DO_NOT_USE
     for dof, total in zip(calibration.observability, totals, strict=True):
         if dof.name not in calibration.out_of_reach:
             yield {
@@ -203,7 +204,7 @@ def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
                 "title": _AXIS_NAMES[dof.name],
                 "sigma": amount(dof.name, total),
                 "verdict": dof.verdict.value,
-                "words": _WORDS[dof.verdict.value],
+                "words": _WORDS["unobservable" if is_bad else dof.verdict.value],
                 "bar": _bar(total / target_of(dof.name, calibration)),
             }
 
