@@ -140,7 +140,7 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
     yield calibration.headline
     for number, reason in enumerate(shown(calibration.reasons)):
         # What to do about the first one may follow the headline, which says why, at once.
-        if number or not calibration.headline.endswith(reason.sentence):
+        if number or reason.sentence not in calibration.headline:
             yield from wrapped(reason.sentence, "- ", "  ")
         options = typed_options(reason.options.items())
         yield from wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")

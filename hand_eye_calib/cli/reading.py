@@ -112,9 +112,10 @@ def read_files(
         files.append((Path(path), FileOptions(**given, measures=measures, repair=True)))
     with waiting_for(f"reading {' and '.join(map(str, paths))}"):
         readings = read_trajectory_files(files)
-    for reading, stream in zip(readings, streams, strict=True):
+    for (path, _), reading, stream in zip(files, readings, streams, strict=True):
         for text in reading.guesses:
             named_as = rf"`{stream}_\1`" if stream else r"`\1`"
+            text = text.replace(str(path), path.name)
             note(re.sub(f"`({'|'.join(FILE_OPTIONS)})`", named_as, text))
     return [each.trajectory for each in readings], [
         text for reading in readings for text in reading.repairs
