@@ -212,7 +212,8 @@ class SolveCycle:
         self._is_unchecked |= self._session.has_new_poses
         self._session.has_new_poses = False
         self._asked_in_flight, self._asked = self._asked, []
-        if check := self._must_check(now_s):
+        # What somebody asks for is told together with what speaks against it.
+        if check := self._must_check(now_s) or (self._is_unchecked and bool(self._asked_in_flight)):
             self._is_unchecked, self._check_due_s = False, now_s + _CHECK_PERIOD_S
         self._submitted = deepcopy(self._session.calibrator)
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))

@@ -131,10 +131,6 @@ class PoseInput:
             self._on_jump_back(self)
         self._use(judgement)
 
-    def flush(self) -> None:
-        """Take messages that waited for others, if none came; to be called often."""
-        self._use(self._guard.flush(time.monotonic()))
-
     def refuse(self, which: str, reason: str, text: str) -> None:
         """Count a message that cannot be used, and say why."""
         self._refused[reason] += 1

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 WITNESSES = 6
 
 # Near another message: within so much (ns), or so many periods. A real change farther back is a
-# jump of the clock, and a new session. Messages that wait follow each other, and those at the end
-# of a stream follow it, within the longest pause (ns).
+# jump of the clock, and a new session. Messages that wait follow each other within the longest
+# pause (ns).
 NEAR_NS, _PERIODS, _LONGEST_PAUSE_NS = 1_000_000_000, 5, 60_000_000_000
 
-# A stream is silent after so long (s), or so many periods. After one stream has jumped back, the
-# others' messages of before are left out for as long.
+# A stream is silent after so long (s). After one has jumped back, the others' messages of before
+# are left out for as long.
 SILENT_AFTER_S = 2.0
 
 Stamped = tuple[int, Any]
@@ -44,7 +44,6 @@ class StampGuard:
     """
 
     def __init__(self) -> None:
-        self._arrived_s = 0.0
         self._begin()
 
     def _begin(self) -> None:
@@ -56,7 +55,6 @@ class StampGuard:
 
     def check(self, stamp_ns: int, message: Any, now_s: float) -> Judgement:
         """Judge the next message; ``now_s`` is steady time."""
-        self._arrived_s = now_s
         if self._is_near(stamp_ns):
             if now_s < self._outdated_until_s:
                 return Judgement()
@@ -65,17 +63,8 @@ class StampGuard:
         if self._held and not 0 < abs(stamp_ns - self._held[-1][0]) <= _LONGEST_PAUSE_NS:
             dropped = self._drop_held()
         self._held.append((stamp_ns, message))
-        judgement = self._believe() if len(self._held) >= WITNESSES else Judgement()
+        judgement = self._believe(now_s) if len(self._held) >= WITNESSES else Judgement()
         return judgement._replace(dropped=dropped)
-
-    def flush(self, now_s: float) -> Judgement:
-        """Judge the messages that wait if the stream is silent; to be called often."""
-        silence_s = max(SILENT_AFTER_S, _PERIODS * self._period_ns() * 1e-9)
-        if not self._held or now_s - self._arrived_s < silence_s:
-            return Judgement()
-        # A short stream, or the last ones after a pause: as good as it gets.
-        is_after = self.last_ns is None or 0 < self._held[0][0] - self.last_ns <= _LONGEST_PAUSE_NS
-        return self._believe() if is_after else Judgement(dropped=self._drop_held())
 
     def restart(self, now_s: float | None = None) -> None:
         """Begin a new session; with ``now_s`` (steady time) as another stream has jumped back."""
@@ -111,12 +100,12 @@ class StampGuard:
         dropped, self._held = [stamp_ns for stamp_ns, _ in self._held], []
         return dropped
 
-    def _believe(self) -> Judgement:
+    def _believe(self, now_s: float) -> Judgement:
         """Take the messages that wait."""
         members, self._held = self._held, []
         before_ns = statistics.median_low(self._recent_ns or [members[0][0]])
         jumped = members[0][0] < before_ns - NEAR_NS
-        follows = self._arrived_s < self._outdated_until_s
+        follows = now_s < self._outdated_until_s
         self._outdated_until_s = -math.inf
         if jumped:
             self._begin()

@@ -160,7 +160,6 @@ class CalibratorNode(Node):
     def _discover(self) -> None:
         for each in self._inputs:
             each.discover()
-            each.flush()
         self._session.flush_journal()
 
     def _on_solve_timer(self) -> None:

@@ -37,27 +37,28 @@ class ResultTopics:
         self._advertise()
 
     def _advertise(self) -> None:
+        self._is_told = False
         make = self._node.create_publisher
         self._transform = make(TransformStamped, "~/extrinsic", LATCHED)
         self._pose = make(PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED)
 
     def publish(self, calibration: Calibration) -> None:
-        """Publish a result: with its covariance always, alone if that says enough to be used."""
-        self._pose.publish(to_pose_with_covariance(calibration))
-        if _is_known(calibration):
+        """Publish a result: with its covariance always, alone if the rotation and two axes of the
+        translation are determined, as the others are zeros; if not, an earlier one is withdrawn.
+        """
+        hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
+        if hidden.isdisjoint(ROTATIONS) and len(hidden) <= 1:
             self._transform.publish(to_transform(calibration))
+            self._is_told = True
+        elif self._is_told:
+            self.clear()
+        self._pose.publish(to_pose_with_covariance(calibration))
 
     def clear(self) -> None:
         """Withdraw the results: who subscribes from now on gets none."""
         for publisher in (self._transform, self._pose):
             self._node.destroy_publisher(publisher)
         self._advertise()
-
-
-def _is_known(calibration: Calibration) -> bool:
-    """Whether the rotation and two axes of the translation are determined: the others are zeros."""
-    hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
-    return hidden.isdisjoint(ROTATIONS) and len(hidden) <= 1
 
 
 class StateTopics:

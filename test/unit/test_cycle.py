@@ -44,7 +44,8 @@ def lines():
 @pytest.fixture
 def cycle(lines, monkeypatch):
     """A cycle whose process answers nothing, with what it has published."""
-    nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
+    jobs = []
+    nothing = SimpleNamespace(submit=jobs.append, stop=lambda s: None, answers=list)
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
     levels = ("debug", "info", "warning", "error")
     write = {level: lambda text, level=level: lines.append((level, text)) for level in levels}
@@ -58,7 +59,7 @@ def cycle(lines, monkeypatch):
         published.append,
         TARGETS,
     )
-    made.published = published
+    made.published, made.jobs = published, jobs
     made.ask(lambda good, text: None)
     return made
 
@@ -95,6 +96,13 @@ def test_what_is_kept_is_answered_published_and_saved_and_says_why_it_is_not_the
     _, text = answered(cycle, 48.0, 0.003, 130)
     assert "130 poses, " in text
     assert cycle.result.warnings == ()
+
+
+def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minute(cycle):
+    for is_asked in (False, False, True):
+        cycle._session.has_new_poses, cycle.is_solving = True, False
+        cycle.ask(lambda good, text: None) if is_asked else cycle.start_if_due()
+    assert [job.check for job in cycle.jobs] == [False, True, False, True]
 
 
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
