@@ -79,8 +79,7 @@ def _with_robot(
     they were asked for.
     """
     installed, base = arguments.installed, arguments.base_frame
-    from hand_eye_calib.io.installed import frames_of_bag, open_installed
-    from hand_eye_calib.io.urdf import read_urdf
+    from hand_eye_calib.io.installed import frames_of_bag, open_installed, read_urdf
     from hand_eye_calib.session.compare import with_comparison
 
     if installed:

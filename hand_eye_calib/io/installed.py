@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import FrameTree, numbers_of, pose_of
+from hand_eye_calib.io.files import read_bytes
 from hand_eye_calib.io.results import FILE_NAME, load_result
-from hand_eye_calib.io.urdf import read_urdf
 from hand_eye_calib.io.yaml_files import read_yaml
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.exports import FORMATS, arranged
@@ -197,3 +198,58 @@ def _at(node: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
             value = value.get(part) if isinstance(value, Mapping) else None
         found.append(value)
     return [] if None in found else found
+
+
+# ---- robot descriptions
+
+
+def read_urdf(path: str | Path) -> FrameTree:
+    """The frames of a URDF file; an InputError if it cannot be read, is no URDF, or has macros of
+    xacro in it, as nobody can tell where in such a file a value comes from.
+    """
+    data = read_bytes(path)
+    try:
+        return _frames(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _frames(data: bytes) -> FrameTree:
+    if b"<xacro:" in data:
+        raise InputError("has xacro macros; give the URDF that xacro makes of it")
+    try:
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise InputError(f"not XML: {error}; expected a URDF file") from None
+    if root.tag != "robot":
+        raise InputError(f"expected a URDF file, found <{root.tag}>")
+    joints = root.findall("joint")
+    values = np.array([_origin(joint) for joint in joints]).reshape(-1, 6)
+    poses = se3.from_rotation_translation(se3.rotation_from_rpy(values[:, 3:]), values[:, :3])
+    found = FrameTree("the robot description")
+    for joint, T_parent_child in zip(joints, poses, strict=True):
+        links = [
+            part.get("link", "") for each in ("parent", "child") for part in joint.findall(each)
+        ]
+        if len(links) != 2 or not all(links):
+            raise InputError(f"joint {joint.get('name', '')!r} has no parent or no child")
+        found.add(links[0], links[1], T_parent_child, joint.get("type") == "fixed")
+    return found
+
+
+def _origin(joint: ElementTree.Element) -> list[float]:
+    """x, y, z, roll, pitch and yaw of a joint's origin."""
+    origin = joint.find("origin")
+    attributes = {} if origin is None else dict(origin.attrib)
+    try:
+        values = [
+            float(text) for name in ("xyz", "rpy") for text in attributes.pop(name, "0 0 0").split()
+        ]
+    except ValueError:
+        values = []
+    if attributes or len(values) != 6 or not np.isfinite(values).all():
+        raise InputError(
+            f"the origin of joint {joint.get('name', '')!r} is not six numbers, xyz and rpy: "
+            f"{dict(origin.attrib) if origin is not None else {}}"
+        )
+    return values

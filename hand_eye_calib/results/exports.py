@@ -165,7 +165,12 @@ _layout(
     "  value: [ %(t)s, %(xyzw)s ]\n",
 )
 _FRD = "x forward, y right, z down, from axes of %(target)s forward, left, up."
-_layout("px4 :parent gnss:child", _PX4.format(kind="GPS"), axes=TRANSLATIONS, axes_said=_FRD)
+_layout(
+    "px4 :parent gnss:child",
+    _PX4.format(kind="GPS"),
+    axes=TRANSLATIONS,
+    axes_said=f"{_FRD} Since PX4 1.18: SENS_GPS0_OFFX, SENS_GPS0_OFFY, SENS_GPS0_OFFZ.",
+)
 _layout(
     "px4 :parent :child",
     _PX4.format(kind="EV") + "%(ev_delay)s\n",
