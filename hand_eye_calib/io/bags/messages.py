@@ -10,9 +10,10 @@ import json
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, printable, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import RateIntegrator
-from hand_eye_calib.io.bags.poses import PoseColumns
+from hand_eye_calib.io.bags.poses import PoseTable
 from hand_eye_calib.io.bags.storage import MessageKind
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.limits import LONGEST_NAME
@@ -30,8 +31,6 @@ from hand_eye_calib.io.transforms import PoseFields
 
 # What unpacking bytes that are not a message of its type may raise.
 MALFORMED = (struct.error, ValueError)
-
-T = TypeVar("T")
 
 _NS_PER_S = STAMP_UNITS["s"]
 _POSE_SIZE = struct.calcsize("=7d")
@@ -144,13 +143,27 @@ PATH_TYPE = "nav_msgs/msg/Path"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 #: Images, which are read with a target.
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_FRAME_TRANSFORM = "foxglove.FrameTransform"
 #: Lists of transforms, and one alone.
-TF_TYPES = (
-    *("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
-    *("foxglove.FrameTransforms", "foxglove.FrameTransform"),
-)
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", f"{_FRAME_TRANSFORM}s", _FRAME_TRANSFORM)
 
-# The likeliest first; of an array in a message, the first element is read.
+# Types that are read by their fields; of an array in a message, the first element.
+_FIELDS = {
+    "geographic_msgs/msg/GeoPoseStamped": "t=header.stamp,"
+    + f"{_PLACE.format('pose.position.')},{_TURN.format('pose.orientation')}",
+    "geometry_msgs/msg/TwistStamped": _twist_at("twist"),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_at("twist.twist"),
+    "px4_msgs/msg/VehicleOdometry": "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,"
+    "qw=q.0,qx=q.1,qy=q.2,qz=q.3",
+    "geometry_msgs/msg/PoseArray": _pose_at("poses.0."),
+    "mocap4r2_msgs/msg/RigidBodies": _pose_at("rigidbodies.0.pose."),
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose_at("poses.0.pose."),
+    "foxglove.PoseInFrame": _pose_at("pose.", "timestamp"),
+    "foxglove.PosesInFrame": _pose_at("poses.0.", "timestamp"),
+    _FRAME_TRANSFORM: _pose_at("", "timestamp", "translation rotation"),
+    "foxglove.LocationFix": f"t=timestamp,{_PLACE.format('')}",
+}
+# The likeliest first.
 _ROWS = (
     MessageType("nav_msgs/msg/Odometry", _OF_POSES, _pose, has_child_frame=True),
     MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, _pose),
@@ -160,34 +173,10 @@ _ROWS = (
     MessageType("sensor_msgs/msg/Imu", ("rates", "rotations"), _imu),
     MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, _fix),
     MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, lambda cursor: cursor.read("3d")),
-    MessageType(
-        "geographic_msgs/msg/GeoPoseStamped",
-        _OF_POSES,
-        fields="t=header.stamp,"
-        + ",".join([_PLACE.format("pose.position."), _TURN.format("pose.orientation")]),
-    ),
     *(
-        MessageType(name, _OF_POSES, fields=fields)
-        for name, fields in (
-            ("geometry_msgs/msg/TwistStamped", _twist_at("twist")),
-            ("geometry_msgs/msg/TwistWithCovarianceStamped", _twist_at("twist.twist")),
-            (
-                "px4_msgs/msg/VehicleOdometry",
-                "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,"
-                "qw=q.0,qx=q.1,qy=q.2,qz=q.3",
-            ),
-            ("geometry_msgs/msg/PoseArray", _pose_at("poses.0.")),
-            ("mocap4r2_msgs/msg/RigidBodies", _pose_at("rigidbodies.0.pose.")),
-            (
-                "motion_capture_tracking_interfaces/msg/NamedPoseArray",
-                _pose_at("poses.0.pose."),
-            ),
-            ("foxglove.PoseInFrame", _pose_at("pose.", "timestamp")),
-            ("foxglove.PosesInFrame", _pose_at("poses.0.", "timestamp")),
-            ("foxglove.FrameTransform", _pose_at("", "timestamp", "translation rotation")),
-        )
+        MessageType(name, _OF_POINTS if name.endswith("Fix") else _OF_POSES, fields=fields)
+        for name, fields in _FIELDS.items()
     ),
-    MessageType("foxglove.LocationFix", _OF_POINTS, fields=f"t=timestamp,{_PLACE.format('')}"),
     MessageType(POINTS_TYPE, _OF_POSES),
 )
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
@@ -222,19 +211,16 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
     name, (language, content) = kind.type, kind.definition
     if kind.encoding == "json":
         return partial(json.loads, object_hook=lambda fields: SimpleNamespace(**fields))
+    if kind.encoding not in ("cdr", "ros1", "protobuf"):
+        raise InputError(
+            f"messages of type {name} are encoded as {kind.encoding[:40]!r}; expected cdr, ros1, "
+            "json or protobuf"
+        )
     try:
         if kind.encoding == "protobuf":
-            of_protobuf = required("mcap_protobuf.decoder", name, "hand_eye_calib[foxglove]")
+            reading = required("mcap_protobuf.decoder", name, "hand_eye_calib[foxglove]")
             schema = SimpleNamespace(id=0, name=name, encoding=language, data=content)
-            decode: Callable[[bytes], Any] = of_protobuf.DecoderFactory().decoder_for(
-                kind.encoding, schema
-            )
-            return decode
-        if kind.encoding not in ("cdr", "ros1"):
-            raise InputError(
-                f"messages of type {name} are encoded as {kind.encoding[:40]!r}; expected cdr, "
-                "ros1, json or protobuf"
-            )
+            return reading.DecoderFactory().decoder_for(kind.encoding, schema)
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         types = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
@@ -288,17 +274,6 @@ class Run(NamedTuple):
     messages: list[bytes]
     bag_ns: IntArray
 
-    def read(self, unpack: Callable[..., T]) -> T:
-        """What is unpacked of the messages and whether they are of ROS 1; an InputError if they
-        are MALFORMED.
-        """
-        try:
-            return unpack(self.messages, self.kind.is_ros1)
-        except HandEyeCalibError:
-            raise
-        except MALFORMED as error:
-            raise self._unreadable(error) from error
-
     def decoded(self) -> Iterator[Any]:
         """The messages as objects with their fields; an InputError at one that cannot be read."""
         decode = _decoder(self.kind)
@@ -306,10 +281,11 @@ class Run(NamedTuple):
             try:
                 message = decode(data)
             except Exception as error:  # the libraries' are of many kinds
-                raise self._unreadable(error) from error
+                raise self.unreadable(error) from error
             yield message
 
-    def _unreadable(self, error: Exception) -> InputError:
+    def unreadable(self, error: Exception) -> InputError:
+        """What to raise for a message that is not of its type."""
         return InputError(
             f"{self.kind.topic}: a message is not a readable {self.kind.type} ({error}); the bag "
             "is damaged, record it again"
@@ -336,7 +312,7 @@ def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     return stamp_ns, frame, sensor_frame, values, cursor.position
 
 
-def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseColumns:
+def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseTable:
     """Unpack one or more messages of one of MESSAGE_TYPES, poses together if they differ only in
     stamps and values; raises MALFORMED.
     """
@@ -348,10 +324,10 @@ def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) ->
         is_alike = is_ros1 or bool((bytes_of[:, :2] == bytes_of[0, :2]).all())
         found = _unpack_together(bytes_of[:, _START:end], is_ros1)
         if found is not None and is_alike:
-            return PoseColumns.of_frames(*found, world, sensor)
+            return PoseTable.of(*found, world, sensor)
     rows = (_unpack(row, is_ros1, data) for data in messages)
     stamps_ns, worlds, sensors, values, _ = zip(*rows, strict=True)
-    return PoseColumns(np.array(stamps_ns, dtype=np.int64), [*worlds], [*sensors], np.array(values))
+    return PoseTable.of(stamps_ns, values, worlds, sensors)
 
 
 def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatArray] | None:
@@ -384,7 +360,7 @@ class MessageReader:
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
-    def columns(self, messages: Sequence[bytes], is_ros1: bool) -> tuple[PoseColumns, BoolArray]:
+    def columns(self, messages: Sequence[bytes], is_ros1: bool) -> tuple[PoseTable, BoolArray]:
         """The next messages, and which of them have what is measured; the others are not finite.
 
         Raises as :func:`unpack_poses`, and InputError at a latitude beyond 90 deg.
@@ -400,11 +376,10 @@ class MessageReader:
             part = _PARTS["positions" if self._measures == "positions" else "rotations"]
             poses[is_usable, part] = self._measured(columns.stamps_ns, values, is_usable)
         poses[~is_usable] = np.nan
-        columns = columns._replace(poses=poses)
-        if self._row.unpack in (_imu, _fix):  # whose header has the sensor's frame
-            frames = columns.world_frames
-            columns = columns._replace(world_frames=[""] * len(poses), sensor_frames=frames)
-        return columns, is_usable
+        if self._row.unpack not in (_imu, _fix):
+            return replace(columns, poses=poses), is_usable
+        # Whose header has the sensor's frame.
+        return PoseTable.of(columns.stamps_ns, poses, "", columns.world_frames), is_usable
 
     def _measured(self, stamps_ns: IntArray, values: FloatArray, rows: BoolArray) -> FloatArray:
         """Positions (N, 3) or quaternions (N, 4) of what was read in some rows."""

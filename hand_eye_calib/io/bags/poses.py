@@ -1,8 +1,8 @@
 """Poses of messages and of bags in columns."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +13,6 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 # A delay against the bag's time (s) is of a wrong stamp if it is so much farther from both
 # neighbours than these are from each other and than the usual step: computers delay for less.
 _JUMP_S = 0.5
-
-
-class PoseColumns(NamedTuple):
-    """The unpacked part of N messages in columns: stamps (N,), frames, and poses (N, 7) of
-    x y z qx qy qz qw; of messages that are no poses, what is unpacked of them.
-    """
-
-    stamps_ns: IntArray
-    world_frames: Sequence[str]
-    sensor_frames: Sequence[str | None]
-    poses: FloatArray
-
-    @classmethod
-    def of_frames(
-        cls, stamps_ns: IntArray, poses: FloatArray, world: str = "", sensor: str | None = None
-    ) -> "PoseColumns":
-        """All in the same frames."""
-        return cls(stamps_ns, [world] * len(stamps_ns), [sensor] * len(stamps_ns), poses)
-
-
-NOTHING = PoseColumns(np.empty(0, dtype=np.int64), [], [], np.empty((0, 7)))
 
 
 @dataclass(frozen=True)
@@ -51,21 +30,27 @@ class PoseTable:
     poses: FloatArray
     bag_ns: IntArray
 
+    @classmethod
+    def of(cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None) -> Self:
+        """Poses of no stream yet, whose stamps (N,) count as bag times; frames are one for all, or
+        (N,). Of messages that are no poses, ``poses`` are what is unpacked of them.
+        """
+        stamps_ns = np.array(stamps_ns, dtype=np.int64)
+        of_all = (np.array(each, dtype=object) for each in ("", world, sensor))
+        stream, *frames = (np.broadcast_to(each, stamps_ns.shape) for each in of_all)
+        return cls(stream, stamps_ns, *frames, np.asarray(poses), stamps_ns)
+
+    def recorded(self, stream: str, bag_ns: Any) -> Self:
+        """The same of a stream, at bag times (N,)."""
+        streams = np.full(len(self), stream, dtype=object)
+        return replace(self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64))
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     def __getitem__(self, index: Any) -> Self:
         """A part of the table: any slice, mask or index array."""
         return type(self)(*(column[index] for column in vars(self).values()))
-
-    @classmethod
-    def of_columns(cls, stream: str, columns: PoseColumns, bag_ns: Any) -> "PoseTable":
-        """Of one stream."""
-        stamps_ns, *frames, poses = columns
-        streams = np.full(len(stamps_ns), stream, dtype=object)
-        world, sensor = (np.array(each, dtype=object) for each in frames)
-        bag_ns = np.array(bag_ns, dtype=np.int64)
-        return cls(streams, stamps_ns, world, sensor, poses, bag_ns)
 
     @classmethod
     def joined(cls, tables: Iterable["PoseTable"]) -> "PoseTable":

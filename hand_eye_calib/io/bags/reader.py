@@ -1,14 +1,12 @@
 """Reading the poses of two streams from bags."""
 
-import heapq
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, pairwise
-from operator import itemgetter
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
@@ -18,31 +16,11 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.messages import (
-    IMAGE_TYPES,
-    MESSAGE_TYPES,
-    PATH_TYPE,
-    POINTS_TYPE,
-    POSE_TYPES,
-    TF_TYPES,
-    Run,
-    measured_as,
-    transforms_in,
-)
+from hand_eye_calib.io.bags import messages, sources
+from hand_eye_calib.io.bags.messages import Run
 from hand_eye_calib.io.bags.poses import PoseTable
-from hand_eye_calib.io.bags.sources import (
-    FieldReading,
-    ImageReading,
-    JoinedReading,
-    PathReading,
-    Reading,
-    ScanReading,
-    Source,
-    TopicReading,
-    TransformReading,
-    is_static,
-)
-from hand_eye_calib.io.bags.storage import Message, message_blocks, open_bags
+from hand_eye_calib.io.bags.sources import Reading, Source, is_static
+from hand_eye_calib.io.bags.storage import open_bags
 from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.io.target_images import Target, camera_of, read_camera
 from hand_eye_calib.io.transforms import TfSource, TfStream
@@ -126,14 +104,16 @@ class PoseBag:
         return self.topics[source].type if source in self.topics else ""
 
     def _of_transforms(self) -> list[str]:
-        return [topic.name for topic in self.topics.values() if topic.type in TF_TYPES]
+        return [topic.name for topic in self.topics.values() if topic.type in messages.TF_TYPES]
 
     def edges_on(self, topic: str) -> list[str]:
         """Pairs of frames, ``parent:child``, in the first messages of a topic, if these are
         transforms. An InputError if they cannot be read.
         """
-        runs = self._runs([topic] if self.topics[topic].type in TF_TYPES else [])
-        first = chain.from_iterable(map(transforms_in, next((run.decoded() for run in runs), ())))
+        runs = self._runs([topic] if self.topics[topic].type in messages.TF_TYPES else [])
+        first = chain.from_iterable(
+            map(messages.transforms_in, next((run.decoded() for run in runs), ()))
+        )
         return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in first})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
@@ -142,11 +122,11 @@ class PoseBag:
         """
         topic, _, fields = str(source).partition("?")
         if "=" in fields:
-            usual = FieldReading("", topic, fields).measures
+            usual = sources.FieldReading("", topic, fields).measures
             if usual != "poses" and wanted not in ("auto", usual):
                 raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
             return usual if wanted == "auto" else wanted
-        return measured_as(self._type_of(source), wanted, source)
+        return messages.measured_as(self._type_of(source), wanted, source)
 
     def check(self, source: Source) -> None:
         """Raise InputError, with the topics that are there, for a topic without poses, and for
@@ -164,15 +144,15 @@ class PoseBag:
         if len(parts) > 1:
             for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
                 self.measured(part, wanted)
-        elif not fields and (type_ := self._type_of(topic)) not in MESSAGE_TYPES:
+        elif not fields and (type_ := self._type_of(topic)) not in messages.MESSAGE_TYPES:
             hint = "read others by their fields, TOPIC?t=header.stamp,x=..."
-            if type_ in TF_TYPES:
+            if type_ in messages.TF_TYPES:
                 hint = "name two of its frames with --parent-tf and --child-tf"
-            elif type_ in IMAGE_TYPES:
+            elif type_ in messages.IMAGE_TYPES:
                 hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
             raise InputError(
                 f"topic {source} of {self} is of type {type_ or 'several types'}; accepted are "
-                f"{', '.join(MESSAGE_TYPES)}; {hint}. {self._listing()}"
+                f"{', '.join(messages.MESSAGE_TYPES)}; {hint}. {self._listing()}"
             )
 
     def select(
@@ -194,9 +174,9 @@ class PoseBag:
                 f"parent and child topic are both {parent}; name two topics. {self._listing()}"
             )
         free = [topic for name, topic in self.topics.items() if name not in named]
-        poses = [topic for topic in free if topic.type in POSE_TYPES]
+        poses = [topic for topic in free if topic.type in messages.POSE_TYPES]
         moving = [topic for topic in poses if topic.count >= _FEWEST_POSES]
-        paths = [topic for topic in free if topic.type == PATH_TYPE]
+        paths = [topic for topic in free if topic.type == messages.PATH_TYPE]
         wanted = 2 - len(named)
         choices = [topics for topics in (poses, moving, moving + paths) if len(topics) == wanted]
         if wanted and not choices:
@@ -224,22 +204,15 @@ class PoseBag:
         measures: Mapping[str, str] | None = None,
     ) -> PoseTable:
         """The poses of one or two streams in the order of the bag's time; an InputError if the bag
-        is damaged, or the transforms do not lead from one frame to the other.
-
-        Parameters
-        ----------
-        parent, child : str or TfSource
-            A topic, or a pair of frames.
-        max_gap_s : float
-            Longest time that is interpolated between two transforms of a chain.
-        measures : mapping, optional
-            "parent" and "child" to what their topics are read as, see :meth:`measured`.
+        is damaged, or the transforms do not lead from one frame to the other. Up to ``max_gap_s``
+        is interpolated between two transforms of a chain; ``measures`` are what the topics of
+        "parent" and "child" are read as, see :meth:`measured`.
         """
         measures = measures or {}
-        sources = {"parent": parent} | ({"child": child} if child else {})
+        wanted = {"parent": parent} | ({"child": child} if child else {})
         readings = [
             self._reading(stream, source, measures.get(stream, "auto"), max_gap_s)
-            for stream, source in sources.items()
+            for stream, source in wanted.items()
         ]
         topics = {topic for reading in readings for topic in reading.topics}
         count, runs = sum(self.topics[topic].count for topic in topics), self._runs(topics)
@@ -255,32 +228,35 @@ class PoseBag:
         if isinstance(source, TfSource):
             self.static_frames.route(*source)  # or it raises
             of_tree = TfStream(source, max_gap_s, self.static_frames)
-            return TransformReading(stream, of_tree, self._of_transforms())
+            return sources.TransformReading(stream, of_tree, self._of_transforms())
         topic, _, fields = source.partition("?")
         if ":" in fields and "=" not in fields:
             return self._images(stream, topic, fields)
         type_ = self._type_of(topic)
-        row = MESSAGE_TYPES.get(type_)
+        row = messages.MESSAGE_TYPES.get(type_)
         if fields := fields or (row.fields if row else ""):
-            return FieldReading(stream, topic, fields)
+            return sources.FieldReading(stream, topic, fields)
         if row and row.unpack:
-            return TopicReading(stream, topic, type_, self.measured(source, measures))
-        if type_ == PATH_TYPE:
-            return PathReading(stream, topic)
-        if type_ == POINTS_TYPE:
-            return ScanReading(stream, topic, self.paths[0], self.files)
+            return sources.TopicReading(stream, topic, type_, self.measured(source, measures))
+        if type_ == messages.PATH_TYPE:
+            return sources.PathReading(stream, topic)
+        if type_ == messages.POINTS_TYPE:
+            return sources.ScanReading(stream, topic, self.paths[0], self.files)
         parts = zip(self._parts_of(topic), ("positions", "rotations"), strict=True)
-        return JoinedReading(
-            *(TopicReading(stream, part, self._type_of(part), wanted) for part, wanted in parts)
+        return sources.JoinedReading(
+            *(
+                sources.TopicReading(stream, part, self._type_of(part), wanted)
+                for part, wanted in parts
+            )
         )
 
     def _images(self, stream: str, topic: str, text: str) -> Reading:
         """Reads images of a target, with the intrinsics of a file or of the camera_info beside."""
         target, _, file = text.partition("@")
-        if (type_ := self._type_of(topic)) not in IMAGE_TYPES:
+        if (type_ := self._type_of(topic)) not in messages.IMAGE_TYPES:
             raise InputError(f"{topic} is of type {type_}, which has no images of {target}")
         if file:
-            return ImageReading(stream, topic, Target.parse(target), read_camera(file))
+            return sources.ImageReading(stream, topic, Target.parse(target), read_camera(file))
         beside = (str(folder / "camera_info") for folder in PurePosixPath(topic).parents)
         info = next((each for each in beside if each in self.topics), "")
         run = next(self._runs([info]), None)
@@ -290,7 +266,7 @@ class PoseBag:
                 f"--camera, or {topic}?{target}@FILE"
             )
         camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
-        return ImageReading(stream, topic, Target.parse(target), camera)
+        return sources.ImageReading(stream, topic, Target.parse(target), camera)
 
     def trajectory(self, source: Source, measures: str = "auto") -> tuple[Trajectory, list[str]]:
         """The trajectory of one source in the order of stamps, of those with equal stamps the
@@ -318,7 +294,9 @@ class PoseBag:
         tree, notes = FrameTree("the bag's transforms"), {}
         for run in self._runs(self._of_transforms()):
             is_fixed = is_static(run.kind.topic)
-            for _, parent, frame, *values in chain.from_iterable(map(transforms_in, run.decoded())):
+            for _, parent, frame, *values in chain.from_iterable(
+                map(messages.transforms_in, run.decoded())
+            ):
                 try:
                     pose = checked_pose(*values) if is_fixed else None
                 except InputError as error:
@@ -331,20 +309,14 @@ class PoseBag:
     # ---- messages
 
     def _runs(self, topics: Collection[str]) -> Iterator[Run]:
-        """Messages of some topics in the order of bag time, many of a kind at once."""
-        for block in self._blocks(topics):
+        """Messages of some topics, many of a kind at once: in the order of bag time, or one file
+        after the other if they were recorded at the same time.
+        """
+        for block in chain.from_iterable(each.blocks(topics) for each in self._storages):
             for kind in {id(each): each for each, _, _ in block}.values():
-                messages = [data for each, _, data in block if each is kind]
+                data = [data for each, _, data in block if each is kind]
                 bag_ns = [bag_ns for each, bag_ns, _ in block if each is kind]
-                yield Run(kind, messages, np.array(bag_ns))
-
-    def _blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
-        """Messages of some topics in the order of bag time, many at once."""
-        spans = [each.span_ns for each in self._storages if each.span_ns]
-        if all(one[1] < two[0] for one, two in pairwise(spans)):
-            return chain.from_iterable(each.blocks(topics) for each in self._storages)
-        streams = (chain.from_iterable(each.blocks(topics)) for each in self._storages)
-        return message_blocks(heapq.merge(*streams, key=itemgetter(1)))
+                yield Run(kind, data, np.array(bag_ns))
 
 
 def _parent_first(topic: str) -> tuple[int, str]:

@@ -30,43 +30,28 @@ _TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "
 
 @dataclass(frozen=True)
 class Tuning:
-    """Numbers of the registration, tried on simulated scans of 16 and 64 rings, in rooms and yards.
+    """Numbers of the registration."""
 
-    Attributes
-    ----------
-    longest_s : float
-        No scan lasts longer: tells the unit of the times of its points.
-    nearest_m, farthest_m : float
-        Ranges that are used: the robot itself is nearer, and beyond a scan is too sparse.
-    voxel_share, least_voxel_m, most_voxel_m : float
-        Size of a voxel as a share of the median range, within limits.
-    match_voxels : tuple of float
-        Over so many voxels points are matched: each scan is registered twice, its distortion
-        corrected anew.
-    n_neighbours : int
-        Points that a local plane is fitted to.
-    key_m, key_rad : float
-        A scan becomes part of the map after so much motion.
-    n_keys : int
-        Scans in the map: a neighbourhood, which drift does not tear.
-    n_parts : int
-        Parts of a scan whose points have the same correction for motion.
-    least_matched : float
-        A registration with a smaller share of matched points counts as failed.
-    """
-
+    # No scan lasts longer (s): tells the unit of the times of its points.
     longest_s: float = 1.0
+    # Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
     nearest_m: float = 1.0
     farthest_m: float = 80.0
+    # Size of a voxel as a share of the median range, within limits (m).
     voxel_share: float = 0.03
     least_voxel_m: float = 0.1
     most_voxel_m: float = 0.4
+    # Over so many voxels points are matched, in two registrations: the first corrects distortion.
     match_voxels: tuple[float, ...] = (6.0, 2.0)
+    # Points that a local plane is fitted to.
     n_neighbours: int = 12
+    # A scan becomes part of the map, of so many scans, after so much motion (m, rad).
     key_m: float = 0.7
     key_rad: float = 0.06
     n_keys: int = 30
+    # Parts of a scan whose points have the same correction for motion.
     n_parts: int = 40
+    # A registration with a smaller share of matched points counts as failed.
     least_matched: float = 0.3
 
 

@@ -18,8 +18,15 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import MessageReader, Run, ns_of, pose_row, transforms_in
-from hand_eye_calib.io.bags.poses import NOTHING, PoseColumns, PoseTable, are_believable
+from hand_eye_calib.io.bags.messages import (
+    MALFORMED,
+    MessageReader,
+    Run,
+    ns_of,
+    pose_row,
+    transforms_in,
+)
+from hand_eye_calib.io.bags.poses import PoseTable, are_believable
 from hand_eye_calib.io.bags.scans import ScanOdometry, scan_of
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
@@ -27,6 +34,7 @@ from hand_eye_calib.io.trajectory_files.table import TWIST, Table
 from hand_eye_calib.io.transforms import TfSource, TfStream
 
 Source = str | TfSource
+_NOTHING = PoseTable.of([], np.empty((0, 7)))
 
 
 class Reading(ABC):
@@ -47,11 +55,6 @@ class Reading(ABC):
     def table(self) -> PoseTable:
         """The poses of all messages; an InputError if there can be none."""
 
-    def _of_frames(self, stamps_ns: Any, poses: FloatArray, bag_ns: Any, *frames: Any) -> PoseTable:
-        """A table whose poses are all in the same frames: of the world, of the sensor."""
-        columns = PoseColumns.of_frames(np.array(stamps_ns, dtype=np.int64), poses, *frames)
-        return PoseTable.of_columns(self.stream, columns, bag_ns)
-
 
 class TopicReading(Reading):
     """A topic with a pose, or what is measured of one, in each message."""
@@ -59,11 +62,16 @@ class TopicReading(Reading):
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
         self._reader = MessageReader(message_type, measures)
-        self._tables = [PoseTable.of_columns(stream, NOTHING, [])]
+        self._tables = [_NOTHING]
 
     def take(self, run: Run) -> None:
-        columns, keep = run.read(self._reader.columns)
-        self._tables.append(PoseTable.of_columns(self.stream, columns, run.bag_ns)[keep])
+        try:
+            columns, keep = self._reader.columns(run.messages, run.kind.is_ros1)
+        except InputError:
+            raise
+        except MALFORMED as error:
+            raise run.unreadable(error) from error
+        self._tables.append(columns.recorded(self.stream, run.bag_ns)[keep])
 
     def table(self) -> PoseTable:
         table = PoseTable.joined(self._tables)
@@ -105,7 +113,8 @@ class JoinedReading(Reading):
         fixes = fixes[(fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)]
         quats_xyzw = se3.to_quat_xyzw(orientations.at(fixes.stamps_ns))
         poses, frame = np.c_[fixes.poses[:, :3], quats_xyzw], orientations.sensor_frame
-        return self._of_frames(fixes.stamps_ns, poses, fixes.bag_ns, "", frame)
+        table = PoseTable.of(fixes.stamps_ns, poses, "", frame)
+        return table.recorded(self.stream, fixes.bag_ns)
 
 
 class PathReading(Reading):
@@ -120,7 +129,7 @@ class PathReading(Reading):
 
     def table(self) -> PoseTable:
         if self._newest is None:
-            return self._of_frames([], np.empty((0, 7)), [])
+            return _NOTHING
         (path,) = self._newest.decoded()
         rows = [pose_row(each.pose.position, each.pose.orientation) for each in path.poses]
         stamps_ns = [ns_of(each.header.stamp) for each in path.poses]
@@ -129,8 +138,9 @@ class PathReading(Reading):
                 f"the poses of path {self.topics[0]} have no stamps: all are zero; use the "
                 "odometry that the path was made from"
             )
-        poses, frame = np.reshape(rows, (-1, 7)), printable(path.header.frame_id)
-        return self._of_frames(stamps_ns, poses, stamps_ns, frame)
+        frame = printable(path.header.frame_id)
+        table = PoseTable.of(stamps_ns, np.reshape(rows, (-1, 7)), frame)
+        return table.recorded(self.stream, stamps_ns)
 
 
 class ScanReading(Reading):
@@ -149,8 +159,8 @@ class ScanReading(Reading):
         about = f"{self._topic}: odometry from {len(found.poses)} scans"
         lost = f", {found.n_failed} of which could not be registered" if found.n_failed else ""
         self.notes.append(f"{about}{lost}; it is kept in {self._lidar.place}")
-        columns = found.stamps_ns, found.poses, found.bag_ns
-        return self._of_frames(*columns, "scans", str(found.frame))
+        table = PoseTable.of(found.stamps_ns, found.poses, "scans", str(found.frame))
+        return table.recorded(self.stream, found.bag_ns)
 
 
 class ImageReading(Reading):
@@ -177,7 +187,8 @@ class ImageReading(Reading):
         self.notes.append(f"{self.topics[0]}: {found}")
         Ts = se3.inverse(found.Ts_camera_target)
         poses = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
-        return self._of_frames(self._stamps_ns, poses, self._bag_ns, "target", self._frame)
+        table = PoseTable.of(self._stamps_ns, poses, "target", self._frame)
+        return table.recorded(self.stream, self._bag_ns)
 
 
 class FieldReading(Reading):
@@ -197,13 +208,14 @@ class FieldReading(Reading):
         self._paths = [path.split(".") for _, path in pairs]
         of_table = "twists" if {*TWIST} <= {*self._names} else "auto"
         self._table = Table(topic, self._names, of_table)
-        self._rows, self._bag_ns = list[list[str]](), list[int]()
+        self._bag_ns: list[int] = []
         self.measures = "poses" if of_table == "twists" else self._table.measures
         if self.measures == "rates":
             raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
 
     def take(self, run: Run) -> None:
-        self._rows += [[self._cell(each, path) for path in self._paths] for each in run.decoded()]
+        rows = ([self._cell(each, path) for path in self._paths] for each in run.decoded())
+        self._table.fill(enumerate(rows, len(self._bag_ns) + 1), list)
         self._bag_ns += run.bag_ns.tolist()
 
     def _cell(self, value: Any, path: list[str]) -> str:
@@ -219,14 +231,17 @@ class FieldReading(Reading):
         return str(value) if stamp_ns is None else f"{Decimal(stamp_ns).scaleb(-9):f}"
 
     def table(self) -> PoseTable:
-        table = self._table.fill(enumerate(self._rows, 1), list)
+        table = self._table
         if not table.stamps:
             topic = self.topics[0]
             raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
         stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
-        if table.measures == "twists":
-            return self._of_frames(stamps_ns, _integrated(stamps_ns, table.values()), self._bag_ns)
-        return self._of_frames(stamps_ns, np.c_[poses_of(table)], self._bag_ns)
+        poses = (
+            np.c_[poses_of(table)]
+            if table.measures != "twists"
+            else _integrated(stamps_ns, table.values())
+        )
+        return PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
@@ -263,7 +278,7 @@ class TransformReading(Reading):
         moving = {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
         Ts = self._source.composed(moving)
         poses = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
-        return self._of_frames(stamps_ns, poses, bag_ns, *frames)
+        return PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
 
 
 def is_static(topic: str) -> bool:

@@ -57,37 +57,35 @@ def _kind(topic: str, name: str, encoding: str, language: str, content: bytes) -
 
 
 class Storage(ABC):
-    """A storage file opened for reading: ``path`` is its name for a person, ``file`` where it is,
-    unpacked. An InputError if nothing in it can be read.
+    """A storage file opened for reading, until ``opened`` is closed: ``path`` is its name for a
+    person, ``file`` where it is, unpacked. An InputError if nothing in it can be read.
 
     ``counts`` has the number of messages of each kind, ``span_ns`` the bag times of the first and
     the last, if there are any, and ``losses`` what could not be read, one line each.
     """
 
-    def __init__(self, path: Path, file: Path) -> None:
+    def __init__(self, path: Path, file: Path, opened: ExitStack) -> None:
         self.path, self._file = path, file
         self.counts = Counter[MessageKind]()
         self.span_ns: tuple[int, ...] = ()
         self.losses: list[str] = []
+        # By the number of a topic or channel in the file.
         self._kinds: dict[int, MessageKind] = {}
         with self._guarded():
-            self._open()
+            self._open(opened)
 
     @abstractmethod
-    def _open(self) -> None: ...
+    def _open(self, opened: ExitStack) -> None: ...
 
     @abstractmethod
-    def close(self) -> None:
-        """Close the file."""
-
-    @abstractmethod
-    def _messages(self, topics: Collection[str]) -> Iterable[Message]: ...
+    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]: ...
 
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over the messages of some topics in the order of bag time, many at once. Chunks
         of mcap that overlap come one after the other.
         """
-        blocks, block = message_blocks(self._messages(topics)), None
+        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
+        blocks, block = message_blocks(self._messages(kinds) if kinds else ()), None
         while block != []:
             with self._guarded():
                 block = next(blocks, [])
@@ -119,26 +117,23 @@ class Storage(ABC):
 class RosbagsFile(Storage):
     """A .db3 or .bag file, through the library rosbags."""
 
-    def _open(self) -> None:
-        self._reader = rosbags()[self._file.suffix != ".bag"].Reader(self._file)
+    def _open(self, opened: ExitStack) -> None:
+        self._reader = reader = rosbags(1 if self._file.suffix == ".bag" else 2).Reader(self._file)
         if self._file.suffix == ".db3":  # whose path SQLite reads as an address
-            self._reader.storage.path = Path(quote(str(self._file)))
-        self._reader.open()
-        for each in self._reader.connections:
+            reader.storage.path = Path(quote(str(self._file)))
+        reader.open()
+        opened.callback(reader.close)
+        for each in reader.connections:
             encoding = getattr(each.ext, "serialization_format", "ros1")
             definition = each.msgdef.format.name, each.msgdef.data.encode()
             self._kinds[each.id] = _kind(each.topic, each.msgtype, encoding, *definition)
             self.counts[self._kinds[each.id]] += each.msgcount
-        if self._reader.message_count:
-            self.span_ns = self._reader.start_time, self._reader.end_time - 1
+        if reader.message_count:
+            self.span_ns = reader.start_time, reader.end_time - 1
 
-    def close(self) -> None:
-        self._reader.close()
-
-    def _messages(self, topics: Collection[str]) -> Iterable[Message]:
-        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
+    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
         wanted = [each for each in self._reader.connections if each.id in kinds]
-        messages = self._reader.messages(wanted) if wanted else ()
+        messages = self._reader.messages(wanted)
         return ((kinds[each.id], bag_ns, data) for each, bag_ns, data in messages)
 
 
@@ -151,9 +146,9 @@ class McapFile(Storage):
     record up to the first that is damaged; of a chunk that is cut off, what is there.
     """
 
-    def _open(self) -> None:
-        reading = required("mcap.reader", "reading mcap files", "mcap")
-        self._stream = _WholeReads(self._file.open("rb", buffering=0))
+    def _open(self, opened: ExitStack) -> None:
+        reading = required("mcap.reader", "this bag", "mcap")
+        self._stream = _WholeReads(opened.enter_context(self._file.open("rb", buffering=0)))
         self._chunks: list[Any] | None = None
         try:
             summary = reading.make_reader(self._stream).get_summary()
@@ -168,20 +163,29 @@ class McapFile(Storage):
             return
         self._chunks = sorted(chunks, key=attrgetter("message_start_time"))
         for key, channel in summary.channels.items():
-            self._kinds[key] = _kind_of(channel, summary.schemas)
+            self._add_kind(channel, summary.schemas)
             self.counts[self._kinds[key]] += about.channel_message_counts.get(key, 0)
         if about.message_count:
             self.span_ns = about.message_start_time, about.message_end_time
 
-    def close(self) -> None:
-        self._stream.close()
+    def _add_kind(self, channel: Any, schemas: Mapping[int, Any]) -> None:
+        schema = schemas.get(channel.schema_id)
+        definition = (schema.encoding, schema.data) if schema else ("", b"")
+        about = schema.name if schema else "", channel.message_encoding, *definition
+        self._kinds[channel.id] = _kind(channel.topic, *about)
 
     def _search(self, reason: Exception) -> None:
         """Count what is in a file without an index."""
-        times_ns = []
-        for kind, bag_ns, _ in self._recovered(self.losses):
-            self.counts[kind] += 1
-            times_ns.append(bag_ns)
+        schemas, times_ns = {}, []
+        for record in self._records(self.losses):
+            kind = type(record).__name__
+            if kind == "Schema":
+                schemas[record.id] = record
+            elif kind == "Channel":
+                self._add_kind(record, schemas)
+            elif kind == "Message" and record.channel_id in self._kinds:
+                self.counts[self._kinds[record.channel_id]] += 1
+                times_ns.append(record.log_time)
         if self.losses and not times_ns:
             raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
         if times_ns:
@@ -189,41 +193,21 @@ class McapFile(Storage):
             about = f"{len(times_ns)} messages covering {np.ptp(self.span_ns) * 1e-9:.1f}"
             self.losses = [f"{loss}; recovered are {about} s" for loss in self.losses]
 
-    def _messages(self, topics: Collection[str]) -> Iterable[Message]:
-        if self._chunks is None:  # what is lost was told when it was opened
-            yield from (each for each in self._recovered([]) if each[0].topic in topics)
-            return
-        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
-        for index in self._chunks:
+    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
+        from mcap import data_stream, records, stream_reader
+
+        if self._chunks is None:
+            for record in self._records([]):  # what is lost was told when it was opened
+                if isinstance(record, records.Message) and record.channel_id in kinds:
+                    yield kinds[record.channel_id], record.log_time, record.data
+        for index in self._chunks or ():
             channels = index.message_index_offsets
-            if kinds and (not channels or kinds.keys() & channels.keys()):
-                found = _messages_of_chunk(self._content(index), kinds)
+            if not channels or kinds.keys() & channels.keys():
+                self._stream.seek(index.chunk_start_offset + _RECORD.size)
+                chunk = records.Chunk.read(data_stream.ReadDataStream(self._stream))
+                stream, size = stream_reader.get_chunk_data_stream(chunk, validate_crc=True)
+                found = _messages_of_chunk(bytes(stream.read(size)), kinds)
                 yield from sorted(found, key=itemgetter(1))
-
-    def _content(self, index: Any) -> bytes:
-        """The records of a chunk."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Chunk
-        from mcap.stream_reader import get_chunk_data_stream
-
-        self._stream.seek(index.chunk_start_offset + _RECORD.size)
-        chunk = Chunk.read(ReadDataStream(self._stream))
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        return bytes(stream.read(size))
-
-    def _recovered(self, losses: list[str]) -> Iterator[Message]:
-        """The messages of the file in their order, as far as it goes; adds what is lost."""
-        from mcap import records as mcap
-
-        schemas: dict[int, Any] = {}
-        kinds: dict[int, MessageKind] = {}
-        for record in self._records(losses):
-            if isinstance(record, mcap.Schema):
-                schemas[record.id] = record
-            elif isinstance(record, mcap.Channel):
-                kinds[record.id] = _kind_of(record, schemas)
-            elif isinstance(record, mcap.Message) and record.channel_id in kinds:
-                yield kinds[record.channel_id], record.log_time, record.data
 
     def _records(self, losses: list[str]) -> Iterator[Any]:
         from mcap import data_stream, opcode, records, stream_reader
@@ -250,14 +234,6 @@ class McapFile(Storage):
                     unpack = unpackers.get(chunk.compression, bytes)
                     rest = _WholeReads(BytesIO(unpack(chunk.data)))
                     yield from stream_reader.StreamReader(rest, skip_magic=True).records
-
-
-def _kind_of(channel: Any, schemas: Mapping[int, Any]) -> MessageKind:
-    """The kind of the messages of an mcap channel."""
-    schema = schemas.get(channel.schema_id)
-    definition = (schema.encoding, schema.data) if schema else ("", b"")
-    name = schema.name if schema else ""
-    return _kind(channel.topic, name, channel.message_encoding, *definition)
 
 
 def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
@@ -295,12 +271,9 @@ def _reason_of(error: BaseException) -> str:
     return " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(".:")
 
 
-def rosbags() -> tuple[Any, Any]:
-    """The modules of the library for bags of ROS 1 and ROS 2."""
-    of_ros1, of_ros2 = (
-        required(f"rosbags.rosbag{version}", "a bag", "rosbags") for version in "12"
-    )
-    return of_ros1, of_ros2
+def rosbags(version: int) -> Any:
+    """The library's module for bags of ROS 1 or ROS 2."""
+    return required(f"rosbags.rosbag{version}", "this bag", "rosbags")
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
@@ -341,8 +314,8 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
             folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
             readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
             lost = _unpack(file, readable)
-        storage = (McapFile if _suffix(file) == ".mcap" else RosbagsFile)(file, readable)
-        opened.callback(storage.close)
+        kind = McapFile if _suffix(file) == ".mcap" else RosbagsFile
+        storage: Storage = kind(file, readable, opened)
         storage.losses[:0] = [lost] * bool(lost)
         found.append(storage)
     return sorted(found, key=attrgetter("span_ns"))

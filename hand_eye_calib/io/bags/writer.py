@@ -11,10 +11,10 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.messages import POSE_TYPES
 from hand_eye_calib.io.bags.storage import rosbags
 
 STORAGES = ("mcap", "sqlite3", "rosbag1")
+_ODOMETRY, _POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 
 Streams = Mapping[str, tuple[Trajectory, str]]
 
@@ -27,17 +27,17 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
     path : str or path-like
         Directory to make, or for rosbag1 the ``.bag`` file; an InputError if it exists.
     streams : mapping of str to (Trajectory, str)
-        Topic to trajectory and message type, one of POSE_TYPES. If the type has a place for the
-        sensor's frame, the trajectory's is put there. Stamps are written to both header and bag.
+        Topic to trajectory and message type, Odometry (with the sensor's frame) or PoseStamped.
+        Stamps are written to both header and bag.
     storage : str
         One of STORAGES.
     """
     path = Path(path)
-    unknown = [each for _, each in streams.values() if each not in POSE_TYPES]
+    unknown = [each for _, each in streams.values() if each not in (_ODOMETRY, _POSE)]
     if storage not in STORAGES or unknown:
         raise ConfigError(
             f"cannot write messages of {', '.join(unknown) or 'poses'} as {storage}; known are "
-            f"{', '.join((*STORAGES, *POSE_TYPES))}"
+            f"{', '.join((*STORAGES, _ODOMETRY, _POSE))}"
         )
     if (path.suffix == ".bag") != (storage == "rosbag1"):
         raise InputError(
@@ -46,13 +46,13 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
         )
     if path.exists():
         raise InputError(f"{path} exists already; remove it or choose another name")
-    rosbag1, rosbag2 = rosbags()
+    library = rosbags(1 if storage == "rosbag1" else 2)
+    about: dict[str, Any] = {}
+    if storage != "rosbag1":
+        about = {"version": 9, "storage_plugin": library.StoragePlugin[storage.upper()]}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer: Any = rosbag1.Writer(path) if storage == "rosbag1" else None
-        if writer is None:
-            plugin = rosbag2.StoragePlugin[storage.upper()]
-            writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        writer = library.Writer(path, **about)
         with writer:
             write_streams(writer, streams, storage)
     except OSError as error:
@@ -88,19 +88,13 @@ def stamped_messages(
     quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
     rows = zip(trajectory.stamps_ns, trajectory.poses[:, :3, 3], quats_xyzw, strict=True)
     for number, (stamp_ns, position, quat_xyzw) in enumerate(rows):
-        header = types["std_msgs/msg/Header"](
-            stamp=types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), STAMP_UNITS["s"])),
-            frame_id=trajectory.world_frame,
-            **({"seq": number} if is_ros1 else {}),
-        )
+        stamp = types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), STAMP_UNITS["s"]))
+        sequence = {"seq": number} if is_ros1 else {}
+        head = {"stamp": stamp, "frame_id": trajectory.world_frame, **sequence}
         rotation = make("Quaternion", *quat_xyzw.tolist())
         pose = make("Pose", make("Point", *position.tolist()), rotation)
-        transform = make("Transform", make("Vector3", *position.tolist()), rotation)
-        with_covariance = make("PoseWithCovariance", pose, no_covariance)
-        parts = {
-            "nav_msgs/msg/Odometry": (trajectory.sensor_frame, with_covariance, twist),
-            "geometry_msgs/msg/PoseStamped": (pose,),
-            "geometry_msgs/msg/PoseWithCovarianceStamped": (with_covariance,),
-            "geometry_msgs/msg/TransformStamped": (trajectory.sensor_frame, transform),
-        }[message_type]
-        yield int(stamp_ns), types[message_type](header, *parts)
+        parts: tuple[Any, ...] = (pose,)
+        if message_type == _ODOMETRY:
+            with_covariance = make("PoseWithCovariance", pose, no_covariance)
+            parts = (trajectory.sensor_frame, with_covariance, twist)
+        yield int(stamp_ns), types[message_type](types["std_msgs/msg/Header"](**head), *parts)
