@@ -12,6 +12,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import chain
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -283,6 +284,10 @@ class Run(NamedTuple):
             except Exception as error:  # the libraries' are of many kinds
                 raise self.unreadable(error) from error
             yield message
+
+    def transforms(self) -> Iterator[PoseFields]:
+        """The transforms of all messages, which are of one of TF_TYPES."""
+        return chain.from_iterable(map(transforms_in, self.decoded()))
 
     def unreadable(self, error: Exception) -> InputError:
         """What to raise for a message that is not of its type."""

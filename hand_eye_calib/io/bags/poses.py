@@ -36,9 +36,11 @@ class PoseTable:
         (N,). Of messages that are no poses, ``poses`` are what is unpacked of them.
         """
         stamps_ns = np.array(stamps_ns, dtype=np.int64)
-        of_all = (np.array(each, dtype=object) for each in ("", world, sensor))
-        stream, *frames = (np.broadcast_to(each, stamps_ns.shape) for each in of_all)
-        return cls(stream, stamps_ns, *frames, np.asarray(poses), stamps_ns)
+        stream, world, sensor = (
+            np.broadcast_to(np.array(each, dtype=object), stamps_ns.shape)
+            for each in ("", world, sensor)
+        )
+        return cls(stream, stamps_ns, world, sensor, np.asarray(poses), stamps_ns)
 
     def recorded(self, stream: str, bag_ns: Any) -> Self:
         """The same of a stream, at bag times (N,)."""

@@ -111,9 +111,7 @@ class PoseBag:
         transforms. An InputError if they cannot be read.
         """
         runs = self._runs([topic] if self.topics[topic].type in messages.TF_TYPES else [])
-        first = chain.from_iterable(
-            map(messages.transforms_in, next((run.decoded() for run in runs), ()))
-        )
+        first = next((run.transforms() for run in runs), ())
         return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in first})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
@@ -294,9 +292,7 @@ class PoseBag:
         tree, notes = FrameTree("the bag's transforms"), {}
         for run in self._runs(self._of_transforms()):
             is_fixed = is_static(run.kind.topic)
-            for _, parent, frame, *values in chain.from_iterable(
-                map(messages.transforms_in, run.decoded())
-            ):
+            for _, parent, frame, *values in run.transforms():
                 try:
                     pose = checked_pose(*values) if is_fixed else None
                 except InputError as error:
