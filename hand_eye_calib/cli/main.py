@@ -122,10 +122,6 @@ def named_command() -> int:
 class CommandParser(argparse.ArgumentParser):
     """Parser whose errors are one line on stderr, with exit code 2."""
 
-    def __init__(self, **options: Any) -> None:
-        options |= {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-        super().__init__(**options)
-
     def error(self, message: str) -> NoReturn:
         """Print one line on stderr and exit with code 2."""
         text = as_typed(f"{message} (see {self.prog} --help)")
@@ -134,17 +130,20 @@ class CommandParser(argparse.ArgumentParser):
 
 def _run(argv: Sequence[str]) -> int:
     command = next((word for word in argv if not word.startswith("-")), None)
+    look: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
+    look["allow_abbrev"] = False
     parser = CommandParser(
         prog="hand_eye_calib",
         description="Extrinsic calibration of two sensors on one rigid body from their motion.",
         epilog=_EPILOG,
+        **look,
     )
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     if command is not None and command not in COMMANDS:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    added = {each: commands.add_parser(each, help=COMMANDS[each]) for each in COMMANDS}
+    added = {each: commands.add_parser(each, help=COMMANDS[each], **look) for each in COMMANDS}
     is_completing = "_ARGCOMPLETE" in os.environ  # set by the shell functions of argcomplete
     for name in COMMANDS if is_completing else filter(None, [command]):
         added[name].description = COMMANDS[name]

@@ -1,12 +1,9 @@
 """``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence."""
 
 import math
-import os
-import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +12,7 @@ import numpy as np
 
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.streams import summarise
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.evidence import Evidence, gather
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
@@ -84,7 +82,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": fixed, "in_words": in_words, "printable": printable}
+    environment.filters |= {"number": fixed, "printable": printable}
     environment.globals |= {"amount": amount, "counted": counted, "axis_names": _AXIS_NAMES}
     environment.globals |= {"with_sigma": with_sigma, "printed_angle": printed_angle}
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
@@ -219,7 +217,7 @@ def _bar(ratio: float) -> float:
     return float(np.clip(100 * (1 - decades / LOOK.bar_decades), 1, 100))
 
 
-# ---------------------------------------------------------------- data and provenance
+# ---------------------------------------------------------------- data and solution
 
 
 def _data(
@@ -227,6 +225,9 @@ def _data(
 ) -> dict[str, Any]:
     """What the result comes from, for the template."""
     options = snapshot.config.to_options() if snapshot else {}
+    usual = CalibratorConfig().to_options()
+    given = {name: each for name, each in options.items() if each != usual[name]}
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     rows, kind = summary(calibration), "stops"
     if evidence:
         kind = f"synchronised pose pairs over {duration(evidence.times_s[-1])}"
@@ -234,10 +235,10 @@ def _data(
     names = [name for name in ("parent", "child") if name in streams or name in inputs]
     return {
         "labels": inputs.get("labels", {}),
-        "summary": rows | {"Poses": f"{calibration.n_poses:,} {kind}"},
+        "summary": rows
+        | {"Poses": f"{calibration.n_poses:,} {kind}", "Options": in_words(given) or "defaults"}
+        | {"Written": f"{now}, hand_eye_calib {package_version()}; extrinsic.yaml has the rest"},
         "streams": [_stream(name, inputs, streams.get(name)) for name in names],
-        "provenance": list(_provenance(inputs)),
-        "options": {name: each for name, each in options.items() if each != ""},
     }
 
 
@@ -255,25 +256,3 @@ def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, st
         row |= {"duration": duration(whole.duration_s)}
         row |= {"path": "-" if whole.path_m is None else length(whole.path_m)}
     return row if count is None else row | {"poses": f"{count:,}"}
-
-
-def _provenance(inputs: Plain) -> Iterable[tuple[str, str]]:
-    """Versions, files and the rest of the inputs, as names and values."""
-    versions = {"python": platform.python_version(), "hand_eye_calib": package_version()}
-    versions |= {name: metadata.version(name) for name in ("numpy", "scipy")}
-    yield "Written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    yield "Versions", in_words(versions)
-    # Without folders, which are nobody's business who gets this page; extrinsic.yaml has them.
-    for name, value in inputs.items():
-        if name not in ("parent", "child", "options", "files", "labels"):
-            yield name.capitalize(), in_words(_without_folders(value))
-    for file in inputs.get("files", ()):
-        said = f"{file['bytes']:,} bytes, SHA-256 {file['sha256']}"
-        yield f"File {Path(file['file']).name}", said
-
-
-def _without_folders(value: Any) -> Any:
-    """A path, or paths in a mapping, as names alone; anything else as it is."""
-    if isinstance(value, Mapping):
-        return {name: _without_folders(item) for name, item in value.items()}
-    return Path(value).name if isinstance(value, str) and os.path.exists(value) else value
