@@ -3,6 +3,7 @@ traceback, never a hang, and nothing outside the directory of the results.
 """
 
 import os
+import time
 import tracemalloc
 import xml.dom.minidom
 
@@ -155,6 +156,15 @@ def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix(tmp_path):
     tracemalloc.stop()
     assert len(reading.trajectory) == 5_000
     assert peak / 5_000 < 900  # bytes; 1,120 with lists of lines and of numbers
+
+
+def test_a_file_of_line_ends_is_refused_at_once(tmp_path):
+    path = tmp_path / "poses.tum"
+    path.write_bytes(b"\n" * 10_000_000)
+    began = time.process_time()
+    with pytest.raises(InputError, match="no poses in it"):
+        read_trajectory_file(path, "auto")
+    assert time.process_time() - began < 0.7  # 0.15; 1.4 line by line
 
 
 def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
