@@ -26,9 +26,22 @@ TWIST = "geometry_msgs/msg/TwistStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
 GEO = "geographic_msgs/msg/GeoPoseStamped"
+MARKER, BODY, BODIES = (f"mocap4r2_msgs/msg/{x}" for x in ("Marker", "RigidBody", "RigidBodies"))
+NAMED, NAMED_ARRAY = (
+    f"motion_capture_tracking_interfaces/msg/{x}" for x in ("NamedPose", "NamedPoseArray")
+)
 POINT, POSE = "geographic_msgs/msg/GeoPoint", "geographic_msgs/msg/GeoPose"
 for name, fields in {
-    PX4: "uint64 timestamp\nuint64 timestamp_sample\nfloat32[3] position\nfloat32[4] q\n",
+    PX4: "uint64 timestamp\nuint64 timestamp_sample\nuint8 pose_frame\nfloat32[3] position\n"
+    "float32[4] q\nuint8 velocity_frame\nfloat32[3] velocity\nfloat32[3] angular_velocity\n"
+    "float32[3] position_variance\nfloat32[3] orientation_variance\nfloat32[3] velocity_variance\n"
+    "uint8 reset_counter\nint8 quality",
+    MARKER: "int64 index\ngeometry_msgs/Point translation",
+    BODY: "std_msgs/Header header\nuint32 frame_number\nstring rigid_body_name\n"
+    "mocap4r2_msgs/Marker[] markers\ngeometry_msgs/Pose pose",
+    BODIES: "std_msgs/Header header\nuint32 frame_number\nmocap4r2_msgs/RigidBody[] rigidbodies",
+    NAMED: "string name\ngeometry_msgs/Pose pose",
+    NAMED_ARRAY: "std_msgs/Header header\nmotion_capture_tracking_interfaces/NamedPose[] poses",
     POINT: "float64 latitude\nfloat64 longitude\nfloat64 altitude",
     POSE: "geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation",
     GEO: "std_msgs/Header header\ngeographic_msgs/GeoPose pose",
@@ -47,8 +60,13 @@ def messages():
     twists = np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
     types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
+    types |= {
+        "/twists": f"{TWIST[:-7]}WithCovarianceStamped",
+        "/bodies": BODIES,
+        "/named": NAMED_ARRAY,
+    }
     found = {key: [] for key in types.items()}
-    zero, nine = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9)
+    zero, nine, nothing = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9), np.zeros(3, "f4")
     for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
         head, quaternion = header(JAZZY, stamp_ns, "sensor"), made("Quaternion", *Q[k])
         linear, angular = (made("Vector3", *part) for part in (twists[k, :3], twists[k, 3:]))
@@ -56,9 +74,18 @@ def messages():
         point = made(POINT, lat[k], lon[k], height[k])
         each = {
             TWIST: (head, made("Twist", linear, angular)),
+            types["/twists"]: (
+                *(head, made("TwistWithCovariance", made("Twist", linear, angular), np.zeros(36))),
+            ),
             FIX: (head, status, lat[k], lon[k], height[k], nine, 0),
             IMU: (head, quaternion, nine, zero, nine, zero, nine),
-            PX4: (0, stamp_ns // 1000, P[k].astype("f4"), np.roll(Q[k], 1).astype("f4")),
+            PX4: (
+                *(0, stamp_ns // 1000, 1, P[k].astype("f4"), np.roll(Q[k], 1).astype("f4"), 1),
+                *(nothing for _ in range(5)),
+                *(0, 0),
+            ),
+            BODIES: (head, k, [made(BODY, head, k, "cart", [], pose)]),
+            NAMED_ARRAY: (head, [made(NAMED, "cart", pose)]),
             ARRAY: (head, [pose, pose]),
             GEO: (head, made(POSE, point, quaternion)),
         }
@@ -92,10 +119,13 @@ def from_start(poses):
     ("source", "within"),
     [
         ("/twist", 0.05),  # integrated over 30 s
+        ("/twists", 0.05),
         ("/fix+/imu", 1e-6),
         ("/geo", 1e-5),
         ("/px4", 1e-5),
         ("/array", 1e-12),
+        ("/bodies", 1e-12),
+        ("/named", 1e-12),
         ("/array?t=header.stamp,x=poses.1.position.x,y=poses.1.position.y,z=poses.1.position.z,"
          "qx=poses.1.orientation.x,qy=poses.1.orientation.y,qz=poses.1.orientation.z,"
          "qw=poses.1.orientation.w", 1e-12),

@@ -247,9 +247,11 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
 
 
 def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]:
-    """Increasing stamps (us) and the values of a topic in a log of PX4, where all are finite."""
+    """Increasing stamps (us) and the values of a topic in a log of PX4, where all are known."""
     values = np.stack([data[name] for name in names], axis=1).astype(float)
     good = np.isfinite(values).all(axis=1)
+    for valid in {"xy_valid", "z_valid"} & data.keys():  # of local positions
+        good &= data[valid] > 0
     stamps = data.get("timestamp_sample", data["timestamp"])[good].astype(np.int64)
     stamps, first = np.unique(stamps, return_index=True)
     return stamps, values[good][first]
