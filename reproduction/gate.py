@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Container, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,9 +63,7 @@ class Case(NamedTuple):
 def real_cases(
     folder: Path, pieces: int, rng: np.random.Generator, asked: Container[str] = ("time_offset",)
 ) -> Iterator[Case]:
-    """Recordings with a known answer, and pieces with a random start and length of each, with those
-    of their options that are asked for.
-    """
+    """Recordings with a known answer, with some of their options, and random pieces of each."""
     for rig in real_rigs(folder)[0]:
         if rig.truth is None or rig.is_refused or rig.name == "boreas":
             continue
@@ -86,11 +85,10 @@ def real_cases(
 
 def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
     """Random platforms."""
-    for number in range(repeats):
-        for name in MIXED:
-            drive = make(name, seed, number)
-            truth = drive.T_parent_child, np.zeros(6)
-            yield Case(name, (drive.parent, drive.child), {}, *truth, drive.bound())
+    for number, name in product(range(repeats), MIXED):
+        drive = make(name, seed, number)
+        truth = drive.T_parent_child, np.zeros(6)
+        yield Case(name, (drive.parent, drive.child), {}, *truth, drive.bound())
 
 
 def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
