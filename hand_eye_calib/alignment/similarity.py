@@ -95,6 +95,8 @@ class SimilarityFit:
         the former over the root mean square of the parent's translations or of the child's times s,
         whichever are smaller: a scale near zero explains nothing, however small the residuals. If
         the scale is kept at 1, whichever are larger.
+    explains_translation : bool
+        Whether the fit explains enough of the translations to trust its scale and offset.
     """
 
     T_parent_child: FloatArray
@@ -108,12 +110,8 @@ class SimilarityFit:
     sigma_translation: float
     sigma_rotation: float
     unexplained_translation: float
+    explains_translation: bool
     unexplained: float
-
-    @property
-    def explains_translation(self) -> bool:
-        """Whether the fit explains enough of the translations to trust its scale and offset."""
-        return self.unexplained_translation < _MAX_UNEXPLAINED_TRANSLATION
 
     @property
     def is_in_one_unit(self) -> bool:
@@ -404,6 +402,7 @@ class _Problem:
             sigma_translation=sigma_translation,
             sigma_rotation=sigma_rotation,
             unexplained_translation=of_translation,
+            explains_translation=of_translation < _MAX_UNEXPLAINED_TRANSLATION,
             unexplained=float(np.hypot(of_translation, of_rotation)),
         )
 

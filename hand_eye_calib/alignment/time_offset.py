@@ -13,7 +13,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import pairs_over
+from hand_eye_calib.pairing.motion_pairs import MAX_PAIRS, pairs_over
 from hand_eye_calib.pairing.synchronise import find_leap, synchronise
 from hand_eye_calib.results.records import ClockRate
 
@@ -21,7 +21,7 @@ from hand_eye_calib.results.records import ClockRate
 # Short motions show the offset best. Most motions that are compared, and if there is a rate to be
 # measured.
 _LAGS_S = (1.0, 0.3, 3.0)
-_PAIRS, _PAIRS_OF_RATE = 800, 4_000
+_PAIRS, _PAIRS_OF_RATE = MAX_PAIRS, 5 * MAX_PAIRS
 
 # Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
 # intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
@@ -135,8 +135,8 @@ def refine_time_offset(
     best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation), start
     held: list[float] = []
     for lag_s in _LAGS_S:
-        found, fit = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit, least_s)
-        if fit is None:
+        found = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit, least_s)
+        if (fit := found.fit) is None:
             continue
         holds = fit.explains_translation and abs(found.seconds - correlation.offset_s) <= reach_s
         held += [found.seconds] if holds else []
@@ -155,7 +155,7 @@ def _fine_offset(
     max_gap_s: float,
     fit: SimilarityFit | None,
     least_s: float,
-) -> tuple[TimeOffset, SimilarityFit | None]:
+) -> TimeOffset:
     """Offset and fit over motions of ``lag_s``; no fit if there are too few. A clearly smaller
     offset than ``least_s`` is not refined.
     """
@@ -168,15 +168,14 @@ def _fine_offset(
         pose_pairs = synchronise(parent, shifted, max_gap_s)
         pairs = pairs_over(pose_pairs, lag_s, most_pairs)
         if len(pairs) < MIN_PAIRS:
-            return TimeOffset(offset_s, np.inf, correlation), None
+            return TimeOffset(offset_s, np.inf, correlation)
         # Velocities of the child in its own frame, over less at the ends of the trajectory.
         at, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
         stamps_ns, span_ns = pose_pairs.stamps_ns[at], round(span_s * 1e9)
-        first_ns, last_ns = shifted.stamps_ns[[0, -1]]
-        before = np.clip(stamps_ns - span_ns, first_ns, last_ns)
-        after = np.clip(stamps_ns + span_ns, first_ns, last_ns)
-        steps = se3.log(se3.inverse(shifted.at(before)) @ shifted.at(after))
-        twists = (steps / ((after - before) * 1e-9)[:, None])[where]
+        ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*shifted.stamps_ns[[0, -1]])
+        before, after = (shifted.at(each) for each in ends_ns)
+        steps, spans_s = se3.log(se3.inverse(before) @ after), np.diff(ends_ns, axis=0)[0] * 1e-9
+        twists = (steps / spans_s[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
         fit = fit_similarity(pairs, of_child, start=fit)
         if not fit.explains_translation:
@@ -197,7 +196,7 @@ def _fine_offset(
             most_pairs = _PAIRS_OF_RATE if rate.is_used else _PAIRS
     known = rate if np.isfinite(rate.sigma_ppm) else None
     assert fit is not None
-    return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known), fit
+    return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known)
 
 
 def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:

@@ -211,12 +211,12 @@ def linearise(
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
     step = turned(back_c, np.diff(course.path, axis=0))
     metres = back_c @ np.diff(course.along, axis=0)
-    Ts_cw_c = streams.Ts_cw_c
+    Ts_cw_c, has_rates = streams.Ts_cw_c, RATE[0] in columns
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     by_child = motions(Ts_cw_c)
-    by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
-    if parameters[RATE].any():
+    if has_rates:
+        by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
@@ -227,7 +227,8 @@ def linearise(
     by_parameter[:, :3, SCALE] = -turned(back[:, :3, :3], step)
     by_parameter[:, :3, BIAS] = back[:, :3, :3] @ metres
     by_parameter[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-    by_parameter[:, 3:, RATE] = by_rate
+    if has_rates:
+        by_parameter[:, 3:, RATE] = by_rate
     moved = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(by_child.shape)
     residuals[:] = se3.log(back @ (se3.inverse(T_parent_child) @ moved))
     if error is not None:

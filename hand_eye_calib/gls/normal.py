@@ -172,12 +172,6 @@ class NormalEquations:
         return np.asarray(axes / np.linalg.norm(axes, axis=0))
 
 
-def selected(products: FloatArray, columns: list[int]) -> FloatArray:
-    """The products (..., p + 1, p + 1) of some parameters."""
-    rows = [*columns, products.shape[-1] - 1]
-    return products[..., rows, :][..., rows]
-
-
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
     """Products (k, l) of columns (n, d, k) with columns (n, d, l)."""
     return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])

@@ -17,7 +17,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.increments import N_SYSTEMATIC, Course, Streams, linearise
 from hand_eye_calib.gls.normal import transposed
 from hand_eye_calib.gls.reml import walk_covariance
-from hand_eye_calib.gls.state_space import WHITE, Posterior
+from hand_eye_calib.gls.state_space import WHITE, Posterior, combined
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.stats import CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
 
@@ -85,9 +85,11 @@ def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Floa
         space.cut,
     )
     white, weights = states[:, :WHITE], np.where(spikes, 1.0, space.weights)
+    along = np.exp(levels[len(space.white)]) * space.twists
     of_white = _chi_squares(
         white[:, :, 0],
-        space.white_covariance(levels) / weights[:, None, None],
+        (combined(levels, space.white) + along[:, :, None] * space.twists[:, None])
+        / weights[:, None, None],
         posterior.selected_inverse[0][:, :WHITE, :WHITE]
         + white[:, :, 1:] @ transposed(white[:, :, 1:]),
         spikes,

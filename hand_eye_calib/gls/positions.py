@@ -48,7 +48,7 @@ from hand_eye_calib.gls.noise_model import (
     NoiseModel,
     Slow,
 )
-from hand_eye_calib.gls.normal import NormalEquations, selected
+from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.gls.outliers import Outliers, bridged, judged, surprises
 from hand_eye_calib.gls.solution import LeverArmSolution, parts_of
 from hand_eye_calib.gls.stages import known_products, rough_levels, sample
@@ -56,11 +56,9 @@ from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
 
 # A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
-# acceleration (s^2). Those in the model, and the columns of the lever arm and of those that it is
-# solved with: all but the last.
+# acceleration (s^2). It is not solved with those in the model.
 RESPONSE = N_SYSTEMATIC
 _SHARED = [SCALE, *BIAS, TIME]
-_SOLVED = list(range(3 + len(_SHARED)))
 
 
 def solve(
@@ -88,7 +86,7 @@ def solve(
         posterior = Posterior(state.space(), state.levels)
         if number + 1 in TUNING.fits[1:]:
             state = state.with_outliers(posterior)
-        normal = NormalEquations(selected(posterior.products, _SOLVED))
+        normal = NormalEquations(_solved(posterior.products))
         step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
         is_small = np.abs(step[:3]) < TUNING.settled_sigmas * sigmas
         is_settled = bool((is_small | (sigmas > TUNING.unknown_m)).all())
@@ -284,9 +282,9 @@ def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
 def _solution(
     state: _State, posterior: Posterior, converged: bool, first_scale: float
 ) -> LeverArmSolution:
-    normal = NormalEquations(selected(posterior.products, _SOLVED))
+    normal = NormalEquations(_solved(posterior.products))
     n_evidence = len(state.boost) - int(state.left_out.sum())
-    misfit = float(normal.cost) / max(3 * n_evidence - len(_SOLVED), 1)
+    misfit = float(normal.cost) / max(3 * n_evidence - 3 - len(_SHARED), 1)
     # With the answer to acceleration, and by what it would move the lever arm.
     whole = posterior.normal
     covariance, shift = max(misfit, 1.0) * whole.covariance, (whole.step[:-1] - normal.step)[:3]
@@ -305,11 +303,17 @@ def _solution(
         worse=state.worse,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
-        part_products=selected(posterior.part_products(), _SOLVED),
+        part_products=_solved(posterior.part_products()),
         misfit=misfit,
         objective=0.5 * (posterior.log_determinant + float(normal.cost)),
         converged=converged,
     )
+
+
+def _solved(products: FloatArray) -> FloatArray:
+    """The products (..., 9, 9) of what the lever arm is solved with, and of the residuals."""
+    rows = [*range(3 + len(_SHARED)), products.shape[-1] - 1]
+    return products[..., rows, :][..., rows]
 
 
 def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:

@@ -38,7 +38,7 @@ from hand_eye_calib.gls.noise_model import (
     NoiseModel,
     whole,
 )
-from hand_eye_calib.gls.normal import NormalEquations, selected
+from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.gls.outliers import (
     Outliers,
     bridged,
@@ -276,7 +276,8 @@ def noise(problem: Problem, fit: Fit) -> Fit:
     """Noise levels of white noise and walk, and one step of X."""
     kept = sample(len(problem.streams), problem.tuning.most_poses)
     found, _ = reml.fit(problem.space(fit, kept), fit.levels, fit.model.prior(fit.levels))
-    moved = fit.moved(NormalEquations(selected(found.products, list(range(6)))).step, [])
+    of_xi = [*range(6), -1]
+    moved = fit.moved(NormalEquations(found.products[np.ix_(of_xi, of_xi)]).step, [])
     noise_m = float(np.exp(0.5 * whole(found.levels)[0]))
     course = course_of(problem.streams, moved.T, noise_m)
     return replace(moved, levels=found.levels, course=course)

@@ -71,19 +71,15 @@ class StateSpace:
     cut: BoolArray
     prior: FloatArray
 
-    def white_covariance(self, levels: FloatArray) -> FloatArray:
-        """Covariances (N, 6, 6) of the white errors at log levels, weights left out."""
-        along = np.exp(levels[len(self.white)]) * self.twists
-        return _combined(levels, self.white) + along[:, :, None] * self.twists[:, None, :]
-
     def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Inverses (N, 6, 6) of :meth:`white_covariance`, logarithms (N,) of its determinants.
+        """Inverses (N, 6, 6) of the white errors' covariances at log levels, weights left out, and
+        logarithms (N,) of their determinants.
 
         With ``S S' = (sum exp(level) basis)^-1``, ``z = S' v`` and the variance j along v the
         inverse is R'R, ``R = (I - a z z') S'``, ``a = (1 - (1 + j z'z)^-1/2) / z'z``: unlike a
         difference, never indefinite.
         """
-        roots, log_determinants = inverse_roots(_combined(levels, self.white))
+        roots, log_determinants = inverse_roots(combined(levels, self.white))
         along = roots @ self.twists[:, :, None]
         squares = (along**2).sum(axis=1, keepdims=True)
         grown = np.log1p(np.exp(levels[len(self.white)]) * squares)
@@ -192,7 +188,7 @@ class Posterior:
         weights = space.weights[:, None, None]
         free = TUNING.free * np.eye(WHITE)
         self._of_poses = np.where(weights > 0.0, weights * self.white, free)
-        self.walk_covariance = _combined(levels[n_white:], space.walk)
+        self.walk_covariance = combined(levels[n_white:], space.walk)
         self.walk = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
         self._weights = self.evidence[:, None, None] * self.walk
@@ -341,7 +337,7 @@ def _mixed(columns: FloatArray, mixing: FloatArray) -> FloatArray:
     return (columns.reshape(n * size, -1) @ mixing).reshape(n, size, -1)
 
 
-def _combined(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
+def combined(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
     """Sum of bases, each times the exponential of its level."""
     total = np.exp(levels[0]) * bases[0]
     for level, basis in zip(levels[1:], bases[1:], strict=False):

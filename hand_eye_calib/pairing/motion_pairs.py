@@ -12,7 +12,8 @@ from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.stats import median
 from hand_eye_calib.text import parse_reference
 
-_MAX_PAIRS = 800
+# Pairs that are compared where the choice of poses is free.
+MAX_PAIRS = 800
 
 
 def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]:
@@ -127,7 +128,7 @@ def pairs_between(
     return MotionPairs(motions[0], motions[1], i, j)
 
 
-def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = _MAX_PAIRS) -> MotionPairs:
+def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) -> MotionPairs:
     """Motion pairs between poses about ``lag_s`` seconds apart (their interval if that is longer),
     evenly over the recording; none if no two poses lie that far apart.
     """

@@ -13,7 +13,8 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, quadratic_form, zhuang
 from hand_eye_calib.solvers.solution import Solution
 
-# Each has ``solve(pairs, *rejection)``; for rejection see Method.rejection.
+# Each has ``solve(pairs)``, or ``solve(pairs, threshold, min_inlier_fraction)`` if it rejects
+# outliers.
 _SOLVERS: dict[str, ModuleType] = {
     "dnlo": dnlo,
     "dnl": dnl,
@@ -55,12 +56,6 @@ class Method:
             raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}")
         require_backend(self.name, self.backend)
 
-    @property
-    def rejection(self) -> tuple[float, ...]:
-        """``threshold`` and ``min_inlier_fraction``; empty if the method rejects no outliers."""
-        rejects = METHODS[self.name].rejects_outliers
-        return (self.threshold, self.min_inlier_fraction) if rejects else ()
-
     def solve(self, pairs: MotionPairs) -> Solution:
         """Solve AX = XB.
 
@@ -73,12 +68,13 @@ class Method:
             raise NotEnoughDataError(
                 "no motion pairs: there are too few common poses for the chosen reference"
             )
-        solve = _SOLVERS[self.name].solve
+        solve, rejection = _SOLVERS[self.name].solve, (self.threshold, self.min_inlier_fraction)
         if self.backend == "ipopt":
             from hand_eye_calib.solvers import ipopt  # takes a second
 
             solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
-        solution: Solution = solve(pairs, *self.rejection)
+        has_outliers = METHODS[self.name].rejects_outliers
+        solution: Solution = solve(pairs, *rejection) if has_outliers else solve(pairs)
         return solution
 
     def proved_global(self, pairs: MotionPairs, solution: Solution) -> str:
@@ -97,5 +93,6 @@ class Method:
         ``left_out`` (B, K), for resampling.
         """
         if self.name == "dnlo":  # the search is quicker from a solution than from nothing
-            return dnlo.solve_without(pairs, solution, left_out, *self.rejection)
+            rejection = self.threshold, self.min_inlier_fraction
+            return dnlo.solve_without(pairs, solution, left_out, *rejection)
         return np.stack([self.solve(pairs[~row]).T_parent_child for row in left_out])
