@@ -141,6 +141,7 @@ class Calibrator:
     Parameters
     ----------
     config : CalibratorConfig, optional
+        In use until :meth:`reconfigure`.
     limits : BufferLimits, optional
 
     Examples
@@ -153,14 +154,9 @@ class Calibrator:
     def __init__(
         self, config: CalibratorConfig | None = None, limits: BufferLimits | None = None
     ) -> None:
-        self._config = config or CalibratorConfig()
+        self.config = config or CalibratorConfig()
         self._limits = limits or BufferLimits()
         self.reset()
-
-    @property
-    def config(self) -> CalibratorConfig:
-        """The CalibratorConfig in use."""
-        return self._config
 
     def reset(self) -> None:
         """Forget all poses, frames and statistics."""
@@ -175,9 +171,9 @@ class Calibrator:
 
     def reconfigure(self, config: CalibratorConfig) -> None:
         """Use other options. Poses are kept, except pairs made with another time offset."""
-        if config.time_offset != self._config.time_offset:
+        if config.time_offset != self.config.time_offset:
             self._forget_pairs()
-        self._config = config
+        self.config = config
 
     def inputs(self, topics: Mapping[str, object]) -> dict[str, Any]:
         """Where a result came from, in plain values: options, and streams by their topics."""
@@ -205,7 +201,7 @@ class Calibrator:
             If the name is empty, or another than before.
         """
         known = self._buffers[stream].frame
-        if getattr(self._config, f"{stream}_frame") or (sensor_frame and sensor_frame == known):
+        if getattr(self.config, f"{stream}_frame") or (sensor_frame and sensor_frame == known):
             return
         if not sensor_frame:
             raise InputError(
@@ -263,10 +259,10 @@ class Calibrator:
         """All that is known now, for an estimate in this or another thread."""
         parent, child = self._buffers["parent"], self._buffers["child"]
         parent_frame, child_frame, warnings = name_frames(
-            self._config, {"parent": parent.frame, "child": child.frame}
+            self.config, {"parent": parent.frame, "child": child.frame}
         )
         return Snapshot(
-            config=self._config,
+            config=self.config,
             kept=self._kept,
             buffered_parent=parent.trajectory(),
             buffered_child=child.trajectory(),
@@ -303,7 +299,7 @@ class Calibrator:
         parent, child, limits = self._buffers["parent"], self._buffers["child"], self._limits
         if not len(parent) or not len(child):
             return
-        config = self._config
+        config = self.config
         if isinstance(config.time_offset, str):
             if self._time_offset is None and is_full:
                 with contextlib.suppress(NotEnoughDataError):

@@ -135,11 +135,16 @@ def _repaired(first: Run, second: Run, options: Options) -> Run:
     undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
     told = (
         f"repaired: {'; '.join(what)}. Solved with {done}: {second.calibration.verdict.value}; as "
-        f"the streams are: {first.calibration.verdict.value} (undo with {undo})",
+        f"the streams are: {first.calibration.verdict.value} (undo with {undo})"
     )
-    calibration = second.calibration
-    calibration = replace(calibration, warnings=(*told, *calibration.warnings))
-    return replace(second, calibration=calibration, options=dict(options), told=told)
+    return _saying(second, options, (told,))
+
+
+def _saying(found: Run, options: Options, told: tuple[str, ...]) -> Run:
+    """With options that were set, and what is said of them among the warnings."""
+    warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
+    calibration = replace(found.calibration, warnings=warnings)
+    return replace(found, calibration=calibration, options=dict(options), told=told)
 
 
 def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
@@ -197,17 +202,17 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
         f"{getattr(CalibratorConfig, name)}"
         for name, value in options.items()
     )
-    warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
-    calibration = replace(found.calibration, warnings=warnings)
-    if "time_offset" in options and abs(offset_s) > UNASKED_S:
-        sizes: dict[str, Any] = {
-            "offset_s": offset_s,
-            "size_s": abs(offset_s),
-            "total_s": round(offset_s, 4),
-        }
-        large = finding("large_time_offset", "child", direction=direction, **sizes)
-        calibration = replace(calibration, findings=gravest_first((*calibration.findings, large)))
-    return replace(found, calibration=calibration, options=dict(options), told=told)
+    found = _saying(found, options, told)
+    if "time_offset" not in options or abs(offset_s) <= UNASKED_S:
+        return found
+    sizes: dict[str, Any] = {
+        "offset_s": offset_s,
+        "size_s": abs(offset_s),
+        "total_s": round(offset_s, 4),
+    }
+    large = finding("large_time_offset", "child", direction=direction, **sizes)
+    findings = gravest_first((*found.calibration.findings, large))
+    return replace(found, calibration=replace(found.calibration, findings=findings))
 
 
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:

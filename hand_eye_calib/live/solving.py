@@ -196,11 +196,6 @@ class SolvingProcess:
         self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
         self._thread.start()
 
-    @property
-    def pid(self) -> int:
-        """Id of the process that solves."""
-        return self._process.pid
-
     def submit(self, job: Job) -> None:
         """Queue a job."""
         self._jobs.put(job)

@@ -165,7 +165,7 @@ class CalibratorNode(Node):
     def _on_solve_timer(self) -> None:
         silent = [each for each in self._inputs if not each.has_poses]
         if silent and silent[0].is_enabled:
-            text = "; ".join(each.describe_silence() for each in silent)
+            text = "; ".join(f"no pose yet on {each.topic}: {each.problem}" for each in silent)
             self._log.info(text, GOES_ON_S)
         self._cycle.start_if_due()
 

@@ -56,7 +56,8 @@ class TopicInput(PoseInput):
         """
         # Of the topic as resolved: rclpy's count does not follow remaps itself.
         publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
-        self.problem, self._n_publishers = self._why_deaf(publishers), len(publishers)
+        self._n_publishers = len(publishers)
+        self.problem = self._why_deaf(publishers) or counted(len(publishers), "publisher")
         is_wanted = self._wanted_type != "auto"
         offered = {each.topic_type for each in publishers}
         usable = [self._wanted_type] if is_wanted else [each for each in _TYPES if each in offered]
@@ -75,10 +76,6 @@ class TopicInput(PoseInput):
                 f"{self.topic} has type {', '.join(sorted(offered))}; expected "
                 f"{', '.join(_TYPES)}: remap {self._relative_topic} to a topic with poses"
             )
-
-    def describe_silence(self) -> str:
-        """Why nothing has come yet, as far as the graph tells."""
-        return f"no pose yet on {self.topic} ({counted(self._n_publishers, 'publisher')})"
 
     def _why_deaf(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Why the middleware brings nothing of these publishers; empty if it does."""
@@ -138,7 +135,7 @@ class TfInput(PoseInput):
 
     def __init__(self, node: Node, name: str, source: TfSource, parts: Parts) -> None:
         super().__init__(name, str(source), *parts)
-        self._source, self._stream = source, TfStream(source, max_gap_s=0.0)
+        self._stream = TfStream(source, max_gap_s=0.0)
         self._subscriptions: dict[str, Subscription] = {}
         kind = message_type(f"{name}_tf")
         for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, quick())):
@@ -153,10 +150,6 @@ class TfInput(PoseInput):
     def discover(self) -> None:
         """Say what is missing; to be called often."""
         self.problem = self._stream.describe_missing()
-
-    def describe_silence(self) -> str:
-        """Why nothing has come yet, as far as the transforms tell."""
-        return f"no pose yet of {self._source}: {self.problem}"
 
     def _hear(self, topic: str, message: Any) -> None:
         waiting = (queued for queued, _ in waiting_messages(self._subscriptions.get(topic)))

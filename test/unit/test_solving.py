@@ -115,7 +115,7 @@ def test_what_is_missing_and_defects_are_told_apart():
     unusable = answer(Job(0, poses(parent_frame="one", child_frame="one"))).failure
     assert (unusable.is_early, unusable.details) == (False, "")
     broken = poses()
-    broken._config = None
+    broken.config = None
     defect = answer(Job(0, broken)).failure
     assert "AttributeError" in defect.what
     assert "Traceback" in defect.details
@@ -124,22 +124,22 @@ def test_what_is_missing_and_defects_are_told_apart():
 def test_killed_it_is_started_again_and_the_job_in_hand_has_failed(start):
     process = start(SLOW)
     for kill in range(2):
-        old = process.pid
+        old = process._process.pid
         process.submit(Job(kill, poses()))
         os.kill(old, signal.SIGKILL)
         failure = Failure("the solving process was ended by SIGKILL", "it was started again")
         assert process.next() == Answer(kill, 0.0, failure=failure)
-        assert process.pid != old
+        assert process._process.pid != old
 
 
 def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(start, monkeypatch):
     monkeypatch.setattr(solving, "HANGS_AFTER_S", 0.5)
     process = start(SLOW)
-    old = process.pid
+    old = process._process.pid
     process.submit(Job(7, poses(), check=True))
     what = "the solving process had no answer after 0.5 s and was killed"
     assert process.next() == Answer(7, 0.0, failure=Failure(what, "it was started again"))
-    assert process.pid != old
+    assert process._process.pid != old
     wait_gone(old)
 
 
@@ -149,7 +149,7 @@ def test_stop_does_not_wait_for_a_long_solve(start):
         process.submit(Job(0, poses()))
         time.sleep(wait_s)
         process.stop(timeout_s=0.1)
-        wait_gone(process.pid)
+        wait_gone(process._process.pid)
         assert not list(process.answers())
 
 
@@ -163,7 +163,7 @@ from hand_eye_calib.live.solving import Job, SolvingProcess
 process = SolvingProcess(lambda: None, {SLOW!r})
 if {command == "busy"}:
     process.submit(Job(0, Calibrator()))
-print(process.pid, flush=True)
+print(process._process.pid, flush=True)
 time.sleep(3600.0)
 """
     node = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
