@@ -78,7 +78,7 @@ def save_rig(
     transforms that may be used, and a directory for each sensor with the files of
     :func:`save_result`; returns the first.
     """
-    folders: set[str] = set()
+    folders = {RIG_NAME, LAUNCH_NAME, "report.html"}
     for calibration in calibrations:
         # A frame's name, with what a folder's should not have replaced.
         name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"

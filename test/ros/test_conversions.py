@@ -1,6 +1,7 @@
 """Between messages and numbers, without a node."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +14,15 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
 from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.results.calibration import Calibration, SolveStatus
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.ros import conversions
+from hand_eye_calib.ros.outputs import ResultTopics
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
@@ -93,6 +101,34 @@ def test_messages_carry_frames_stamp_and_transform():
     ):
         read = se3.from_quat_xyzw([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
         np.testing.assert_allclose(read, T_PARENT_CHILD, atol=1e-15)
+
+
+def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
+    """A late subscriber gets what the page says, not an older pose."""
+    made, gone = [], []
+
+    def create(kind, name, qos):
+        sent = []
+        made.append(SimpleNamespace(name=name, sent=sent, publish=sent.append))
+        return made[-1]
+
+    topics = ResultTopics(SimpleNamespace(create_publisher=create, destroy_publisher=gone.append))
+    sure, unsure = (
+        dataclasses.replace(
+            calibration(np.eye(6)),
+            observability=tuple(DofObservability(axis, verdict, 0.01) for axis in AXES),
+        )
+        for verdict in (DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE)
+    )
+    for each in (unsure, sure, unsure, unsure):
+        topics.publish(each)
+    assert [(each.name, len(each.sent)) for each in made] == [
+        ("~/extrinsic", 1),
+        ("~/extrinsic_with_covariance", 2),
+        ("~/extrinsic", 0),
+        ("~/extrinsic_with_covariance", 2),
+    ]
+    assert gone == made[:2]
 
 
 def test_covariance_is_about_the_fixed_axes_of_the_parent():

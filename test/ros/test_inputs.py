@@ -133,7 +133,7 @@ def test_best_effort_publishers_of_a_remapped_topic_are_counted_heard_and_named(
     parent = peer.node.create_publisher(Odometry, "/lidar/odom", BEST_EFFORT)
     peer.wait_matched(parent)
     node.wait_for_log("no pose yet on /lidar/odom: 1 publisher")
-    peer.feed((parent, peer.publisher(Odometry, "child_odom")), *drive(5))
+    peer.feed((parent, peer.publisher(Odometry, "child_odom")), *drive(8))
     node.wait_for_log("first pose on /lidar/odom", "first pose on /child_odom")
 
 

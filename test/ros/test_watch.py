@@ -7,13 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
 
 from hand_eye_calib.live.state import JournalState, Level, NodeState
 from hand_eye_calib.plain import json_text
-from hand_eye_calib.ros.watcher import state_of
+from hand_eye_calib.ros.watcher import Watcher, state_of
+from hand_eye_calib.watch.board import Board
 
 QUICK = ("-p solve_period:=0.2", *RELIABLE_INPUTS)
 
@@ -24,6 +26,19 @@ def test_what_is_no_state_is_left_out_and_control_characters_are_escaped():
     assert state_of(json_text(state)).journal.text == r"a\x1bb"
     for text in ("", "[]", "{", "[" * 100_000, '{"inputs": {}}', "7"):
         assert state_of(text) is None
+
+
+def test_of_ten_thousand_names_on_the_network_a_few_are_kept():
+    heard = []
+    watcher = Watcher.__new__(Watcher)
+    watcher._board, watcher._heard = Board(), set()
+    topics = [(f"/n{k}/progress", ["std_msgs/msg/String"]) for k in range(10_000)]
+    watcher._node = SimpleNamespace(
+        get_topic_names_and_types=lambda: topics,
+        create_subscription=lambda kind, topic, *_: heard.append(topic),
+    )
+    watcher._look()
+    assert 10 < len(heard) == len(watcher._heard) < 100
 
 
 class Watch:

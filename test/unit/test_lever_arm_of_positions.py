@@ -197,6 +197,9 @@ class TestLeverArm:
         assert codes(parent, both) == ["unrelated", "interleaved"]
         north_east = Trajectory.from_positions(child.stamps_ns, child.poses[:, [1, 0, 2], 3])
         assert codes(parent, north_east) == ["unrelated"]
+        from_pole_to_pole = [0.0, 0.0, 6.4e6] * (-1.0) ** np.arange(80)[:, None]
+        poles = Trajectory.from_positions(child.stamps_ns, from_pole_to_pole)
+        assert "unrelated" in codes(parent, poles)
         kept = np.r_[0:30, 60:80]
         fixes = Trajectory.from_positions(child.stamps_ns[kept], child.poses[kept, :3, 3])
         assert "gaps" in codes(parent, fixes)

@@ -103,6 +103,13 @@ def test_the_command_prints_and_saves_a_tree(files, capsys, tmp_path):
     np.testing.assert_allclose(hec.load("rig/rear").T_parent_child[:3, 3], translation)
 
 
+def test_a_sensor_may_have_the_name_of_a_file(found, tmp_path):
+    named = [dataclasses.replace(each, child_frame="rig.yaml") for each in found.calibrations]
+    save_rig(found.to_dict(), named, tmp_path)
+    assert (tmp_path / "rig.yaml").is_file()
+    assert len([each for each in tmp_path.iterdir() if each.is_dir()]) == 2
+
+
 def test_a_person_sees_the_tree_and_whether_pairs_close(found):
     lines = as_lines(found)
     assert lines[0] == f"{found.verdict.value}: 3 sensors"

@@ -1,5 +1,7 @@
 """Robot descriptions: what is fixed to what."""
 
+import time
+
 import numpy as np
 import pytest
 from bag_making import TF, tf_message, write_messages
@@ -37,6 +39,19 @@ def test_frames_through_the_base(urdf):
     found = read_urdf(urdf).pose("lidar", "camera")
     np.testing.assert_allclose(found[:3, 3], [-0.5, 0, -1])
     np.testing.assert_allclose(se3.rotation_to_rpy(found[:3, :3]), [0, 0.1, 0], atol=1e-12)
+
+
+def test_a_chain_of_thousands_of_joints_takes_no_time(tmp_path):
+    links = "".join(f'<link name="l{k}"/>' for k in range(5001))
+    joints = "".join(
+        f'<joint name="j{k}" type="fixed"><origin xyz="0.1 0 0"/><parent link="l{k}"/>'
+        f'<child link="l{k + 1}"/></joint>'
+        for k in range(5000)
+    )
+    (tmp_path / "long.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    began_s = time.process_time()
+    assert read_urdf(tmp_path / "long.urdf").pose("l0", "l5000")[0, 3] == pytest.approx(500.0)
+    assert time.process_time() - began_s < 3.0  # 0.3; quadratic: 30
 
 
 @pytest.mark.parametrize(
