@@ -20,8 +20,7 @@ from hand_eye_calib.cli.console import (
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import usable_numbers
-from hand_eye_calib.results.tables import summary
+from hand_eye_calib.results.document import summary, usable_numbers
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import (
     axes_in_words,

@@ -5,7 +5,7 @@ process that writes them for a session of the node.
 import os
 import pickle
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,19 +34,21 @@ def write_report(
     """Write the report of a result, of the poses and options that gave it, and of where the data
     came from in plain values.
     """
-    with waiting_for(f"writing {REPORT}"):
-        from hand_eye_calib.report.report import render
+    from hand_eye_calib.report.report import render
 
-        path = save_text(directory / REPORT, render(calibration, snapshot, inputs))
-    note(f"wrote {path}")
+    _write(directory, lambda: render(calibration, snapshot, inputs))
 
 
 def write_rig_report(directory: Path, rig: "RigCalibration", names: Sequence[str]) -> None:
     """Write the report of a rig, whose sensors have these files, topics or frames."""
-    with waiting_for(f"writing {REPORT}"):
-        from hand_eye_calib.report.rig_page import render_rig
+    from hand_eye_calib.report.report import render_rig
 
-        path = save_text(directory / REPORT, render_rig(rig, names))
+    _write(directory, lambda: render_rig(rig, names))
+
+
+def _write(directory: Path, page: Callable[[], str]) -> None:
+    with waiting_for(f"writing {REPORT}"):
+        path = save_text(directory / REPORT, page())
     note(f"wrote {path}")
 
 

@@ -86,8 +86,8 @@ def _trend(result: Calibration, number: int) -> Drawn:
         "with its standard deviation. The band is three standard deviations of the common value. "
         "Squares do not belong to the others."
     )
-    title, svg = "Each recording against the common extrinsic", draw_trend(result, number)
-    return Drawn(f"vehicle-{number}", title, said, svg)
+    title = "Each recording against the common extrinsic"
+    return Drawn(f"vehicle-{number}", title, said, _draw_trend(result, f"trend{number}"))
 
 
 def _values(row: Plain) -> list[str]:
@@ -108,10 +108,8 @@ def _cells(row: Plain, is_linked: bool) -> list[Any]:
     return [printable(row["name"]), row["vehicle"], verdict, start, int(is_linked), values]
 
 
-def draw_trend(result: Calibration, number: int) -> str:
-    """SVG of how the recordings of a vehicle lie about their common extrinsic, axis by axis, over
-    time; ``number`` is that of the vehicle on the page.
-    """
+def _draw_trend(result: Calibration, name: str) -> str:
+    """SVG of a name: recordings about their common extrinsic, axis by axis, over time."""
     recordings = result.together.recordings if result.together else ()
     dates = [datetime.fromtimestamp(each.stamp_ns * 1e-9, UTC) for each in recordings]
     at = np.array(date2num(dates))
@@ -130,7 +128,7 @@ def draw_trend(result: Calibration, number: int) -> str:
             locator = AutoDateLocator(minticks=2, maxticks=4)
             panel.xaxis.set_major_locator(locator)
             panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
-        return as_svg(figure, f"trend{number}")
+        return as_svg(figure, name)
 
 
 def _draw_axis(

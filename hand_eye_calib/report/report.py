@@ -1,7 +1,9 @@
-"""``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence."""
+"""``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence; of
+a rig, where its sensors are.
+"""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,13 +20,13 @@ from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.report.figures import figures_of
+from hand_eye_calib.report.figures import figure_of_views, figures_of
 from hand_eye_calib.report.style import LOOK
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import usable_numbers
+from hand_eye_calib.results.document import summary, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
-from hand_eye_calib.results.tables import summary
 from hand_eye_calib.results.verdict import shown, target_of
+from hand_eye_calib.rig.result import RigCalibration
 from hand_eye_calib.text import (
     amount,
     angle,
@@ -137,6 +139,22 @@ def render(
         figures=figures_of(calibration, evidence),
         shown_first=_SHOWN_FIRST,
         **_data(calibration, snapshot, evidence, inputs),
+    )
+
+
+def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
+    """The report of a rig as HTML: where its sensors are, and whether results for two sensors at a
+    time close; ``inputs`` are where the trajectories came from.
+    """
+    return page(
+        "rig.html",
+        TONES[rig.verdict.value],
+        rig.verdict.value,
+        "",
+        rig=rig,
+        inputs=inputs,
+        poses=[each.to_dict()["T_parent_child"] for each in rig.calibrations],
+        figures=[figure_of_views(rig.calibrations)],
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance
+from hand_eye_calib.plain import data_frame
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, usable_numbers, values_of
 from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
@@ -21,7 +22,6 @@ from hand_eye_calib.results.status import (
     DofVerdict,
     SolveStatus,
 )
-from hand_eye_calib.results.tables import data_frame
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
 from hand_eye_calib.upstairs import upstairs
 

@@ -18,6 +18,7 @@ from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
+from hand_eye_calib.text import given_or_estimated
 
 # Format and version of a document. A change that an older reader cannot understand raises the
 # version.
@@ -118,6 +119,28 @@ def _printed(
 def _matrix_of(of: str, frame: str, matrix: FloatArray) -> dict[str, Any]:
     """A covariance of a document, and what it is of."""
     return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
+
+
+def summary(result: Result) -> dict[str, str]:
+    """How a result was solved, as names and values."""
+    rate, proof = result.clock_rate, {"yes": "", "no": "not "}
+    offset, method = result.time_offset_s, [f"{result.method} ({result.backend})"]
+    rows = {
+        "Method": "; ".join(filter(None, [*method, result.method_reason])),
+        "Reference": result.reference_reason or result.reference,
+        "Poses": f"{result.n_poses:,}",
+        "Motion pairs": f"{result.n_inliers:,} of {result.n_pairs:,} are inliers",
+        "Objective": f"{result.objective:.6g}",
+        "Time offset": given_or_estimated(offset, result.time_offset_sigma_s, "s"),
+        "Scale": given_or_estimated(result.scale, result.scale_sigma, ""),
+    }
+    if result.proved_global in proof:
+        rows["Objective"] += f", {proof[result.proved_global]}proved to be the global minimum"
+    if rate and rate.is_used:
+        rows["Time offset"] += f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
+    if result.noise:
+        rows["Noise"] = "; ".join(result.noise.in_words)
+    return rows
 
 
 # ------------------------------------------------------------------------ for robots

@@ -19,7 +19,7 @@ ENGINE = {
     "errors": set(),
     "arrays": set(),
     "stats": {"arrays"},
-    "plain": set(),
+    "plain": {"errors"},
     "version": set(),
     "upstairs": set(),
     "text": {"errors"},
@@ -64,7 +64,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "pyulog": "io/trajectory_files/foreign.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
-    "pandas": ("results/calibration.py", "results/tables.py", "session/together.py"),
+    "pandas": ("results/calibration.py", "plain.py", "session/together.py"),
     "jinja2": "report/",
 }
 
