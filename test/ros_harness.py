@@ -119,7 +119,7 @@ def stop_forks():
     multiprocessing.forkserver._forkserver._stop()
 
 
-def _run_node(arguments, log_file, environment):
+def _run_node(arguments, log_file, environment, before):
     """The node's process, from the fork to its end."""
     with log_file.open("wb") as log:
         for stream in (1, 2):
@@ -129,6 +129,7 @@ def _run_node(arguments, log_file, environment):
     os.chdir(log_file.parent)
     sys.stdout.reconfigure(write_through=True)
     sys.argv = ["hand_eye_calib", *arguments]
+    exec(before, {})
     sys.exit(main(arguments))
 
 
@@ -161,10 +162,10 @@ class _Forked:
 
 class NodeProcess:
     """The command ``calibrator`` in a process of its own, with its output in a file; ``before`` is
-    Python code that runs first, in an interpreter that is started for it.
+    Python code that runs first, ``fresh`` starts an interpreter for it.
     """
 
-    def __init__(self, domain, log_file, ros_arguments, before=""):
+    def __init__(self, domain, log_file, ros_arguments, before="", fresh=False):
         self._log_file = log_file
         if not any("report:=" in str(argument) for argument in ros_arguments):
             ros_arguments = [*ros_arguments, "-p report:=false"]  # it takes a processor for seconds
@@ -177,13 +178,12 @@ class NodeProcess:
             "PYTHONPATH": os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")])),
         }
         log_file.touch()
-        if not before:
-            self.process = _Forked(arguments, log_file, environment)
+        if not fresh:
+            self.process = _Forked(arguments, log_file, environment, before)
             return
-        run = "import runpy; runpy.run_module('hand_eye_calib', run_name='__main__')"
         with log_file.open("wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", f"{before}\n{run}", *arguments],
+                [sys.executable, "-m", "hand_eye_calib", *arguments],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=environment,

@@ -211,7 +211,7 @@ def degenerate_motions(seed):
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("method", PAPER_METHODS)
 @pytest.mark.parametrize("kind", degenerate_motions(0))
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(
     seed=seeds,
     truth=st.one_of(transforms, st.just(np.eye(4)), st.just(np.diag([1.0, -1.0, -1.0, 1.0]))),

@@ -26,9 +26,9 @@ def start_node(domain, tmp_path):
     """Function that starts the node with ROS arguments such as ``"-p method:=dnl"``."""
     running = []
 
-    def start(*ros_arguments, before=""):
+    def start(*ros_arguments, **options):
         log = tmp_path / f"node{len(running)}.log"
-        running.append(NodeProcess(domain, log, ros_arguments, before))
+        running.append(NodeProcess(domain, log, ros_arguments, **options))
         return running[-1]
 
     yield start

@@ -129,13 +129,6 @@ def noisy_drive(seed, n_poses=150, white=(0.004, 0.006), drift=(0.0, 0.0)):
     return disturbed(parent, 2 * seed + 5, *white), disturbed(np.array(poses), 2 * seed + 6, *white)
 
 
-@pytest.fixture(scope="module")
-def solved_drives():
-    """Drives with white noise, and the solution of each."""
-    drives = [noisy_drive(seed) for seed in range(24)]
-    return [(drive, estimator.solve(stamps(150), *drive)) for drive in drives]
-
-
 def drift_of(noise):
     return noise.translation_drift_m_per_pose, noise.rotation_drift_rad_per_pose
 
@@ -145,7 +138,7 @@ def drift_of(noise):
 )
 def test_the_noise_levels_are_recovered(white, drift):
     found = []
-    for seed in range(8):
+    for seed in range(5):
         parent, child = noisy_drive(seed, white=white, drift=drift)
         levels = estimator.solve(stamps(150), parent, child, systematic=()).noise
         white_found = levels.translation_white_m, levels.rotation_white_rad
@@ -176,7 +169,7 @@ def lasting(seed, n_poses, sigmas, tau_poses):
 @pytest.mark.parametrize("kind", ["body", "world"])
 def test_errors_that_last_are_found_and_told_apart(kind):
     squared, kinds = [], []
-    for seed in range(6):
+    for seed in range(4):
         parent, child = noisy_drive(seed, n_poses=600, white=(0.001, 0.001))
         errors = lasting(100 + seed, 600, [0.01, 0.01], 20)
         if kind == "world":
@@ -196,7 +189,7 @@ def test_errors_that_last_are_found_and_told_apart(kind):
         assert strongest.sigma == pytest.approx(0.01, rel=0.5)
         assert strongest.tau_s == pytest.approx(2.0, rel=0.8)
         squared.append(squared_distance(solution))
-    assert kinds.count(kind) >= 5
+    assert kinds.count(kind) >= 3
     assert 2.0 < np.median(squared) < 12.0
 
 
@@ -230,8 +223,9 @@ def squared_distance(solution):
     return xi @ np.linalg.solve(solution.cov_parent_child_in_child, xi)
 
 
-def test_errors_are_as_large_as_stated(solved_drives):
-    found = [squared_distance(solution) for _, solution in solved_drives]
+def test_errors_are_as_large_as_stated():
+    drives = [noisy_drive(seed) for seed in range(24)]
+    found = [squared_distance(estimator.solve(stamps(150), *drive)) for drive in drives]
     # Chi-squared with 6 degrees of freedom has mean 6 and variance 12: the mean of 24 draws has a
     # standard error of 0.7.
     assert 6.0 - 3 * 0.7 < np.mean(found) < 6.0 + 3 * 0.7
@@ -240,18 +234,18 @@ def test_errors_are_as_large_as_stated(solved_drives):
 @pytest.mark.parametrize("nuisance", VALUES)
 def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
     chosen, parameters = [], []
-    for seed in range(6):
+    for seed in range(4):
         streams = systematic(wandering_poses(300, seed), nuisance, VALUES[nuisance])
         solution = estimator.solve(stamps(300), *with_noise(streams, seed))
         chosen.append(solution.systematic)
         parameters.append(solution.parameters[parameters_of(nuisance)])
-    assert chosen.count(nuisance) >= 5
+    assert chosen.count(nuisance) >= 3
     np.testing.assert_allclose(np.median(parameters, axis=0), VALUES[nuisance], atol=3e-3)
 
 
 def test_a_lag_is_not_taken_for_a_lever():
     errors = []
-    for seed in range(6):
+    for seed in range(4):
         parent = wandering_poses(300, seed)
         noisy = with_noise((parent, late(child_of(parent), 0.02)), seed)
         answers = [
@@ -292,7 +286,7 @@ def test_poses_wrong_by_themselves_are_bridged():
 
 def test_heavy_tails_leave_the_answer_near():
     random, errors = np.random.default_rng(3), []
-    for seed in range(10):
+    for seed in range(6):
         parent = wandering_poses(200, seed)
         tails = np.sqrt(3 / random.chisquare(3, (2, 200, 1)))
         noise = se3.exp(random.normal(size=(2, 200, 6)) * tails * np.repeat([0.003, 0.004], 3))
@@ -304,7 +298,7 @@ def test_heavy_tails_leave_the_answer_near():
 @pytest.mark.parametrize("centre", CENTRES[1:])
 def test_a_camera_that_sees_a_target_swings_about_it(centre):
     distances = []
-    for seed in range(10):
+    for seed in range(6):
         parent = wandering_poses(200, seed)
         child = child_of(parent, T_cw_pw=se3.exp(np.array([1.0, -1.0, 0.5, 0.5, 0.2, -2.0])))
         parent = se3.exp(np.array([-1.0, 0.4, 0.8, 0.1, 0.7, -0.4])) @ parent

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from bag_making import JAZZY, NOETIC, ODOMETRY, POSE_STAMPED, TF, header
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_eye_calib.errors import printable
@@ -70,6 +70,7 @@ alike = st.tuples(stamps_ns, st.sampled_from(["a", "bc", "de"]), st.sampled_from
 
 @pytest.mark.parametrize("message_type", POSE_TYPES)
 @pytest.mark.parametrize("encoding", ENCODINGS)
+@settings(max_examples=30)
 @given(drawn=st.lists(alike, min_size=1, max_size=8) | st.lists(poses, min_size=1, max_size=2))
 def test_poses_at_once_whether_their_frames_are_alike_or_not(encoding, message_type, drawn):
     """The length of the frames' names shifts what follows: alignment is where readers go wrong."""
