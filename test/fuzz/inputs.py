@@ -97,21 +97,6 @@ def trajectory(chaos, folder):
     return command("calibrate", *files, *options, *SOLVE, "--json")
 
 
-def config(chaos, folder):
-    """Calibrate with options from a file."""
-    (folder / "file.yaml").write_bytes(text_inputs.yaml_text(chaos, "config"))
-    write_trajectory(folder / "parent", text_inputs.PARENT)
-    write_trajectory(folder / "child", text_inputs.CHILD)
-    files = (folder / "parent", folder / "child")
-    return command("calibrate", *files, "--config", folder / "file.yaml", *SOLVE, "--json")
-
-
-def info(chaos, folder):
-    """Show a result."""
-    (folder / "extrinsic.yaml").write_bytes(text_inputs.yaml_text(chaos, "info"))
-    return min(command("info", folder), command("info", folder, "--json"))
-
-
 def journal(chaos, folder):
     """Resume a session."""
     for stream in ("parent", "child"):
@@ -135,8 +120,6 @@ FORMATS = {
     "rosbag1": lambda *case: bag(*case, "bag.bag"),
     "sqlite3": lambda *case: bag(*case, "bag.db3", "a%31#?.db3"),
     "trajectory": trajectory,
-    "config": config,
-    "info": info,
     "journal": journal,
 }
 
@@ -173,8 +156,7 @@ def exercise(name, seed, folder):
         code = FORMATS[name](Chaos(f"{name} {seed}"), case / "inside")
     changed = {path for path in snapshot(case) if "/inside/" not in path} - before.keys()
     changed |= {path for path in before if snapshot(case).get(path) != before[path]}
-    inputs = ("bag", "a%31#?.db3", "parent", "child", "times", "file.yaml", "extrinsic.yaml",
-              "fleet.yaml", "parent.tum", "child.tum")  # fmt: skip
+    inputs = ("bag", "a%31#?.db3", "parent", "child", "times", "parent.tum", "child.tum")
     changed |= {path.name for path in (case / "inside").iterdir()
                 if path.stem != "bag" and path.name not in (*inputs, "out")}  # fmt: skip
     if changed:

@@ -1,13 +1,10 @@
-"""Structured text, YAML and journals: the grammar is right, what it says may be anything."""
+"""Structured text and journals: the grammar is right, what it says may be anything."""
 
 import json
 
 import numpy as np
-import yaml
 from motions import as_trajectory, child_of, disturbed, wandering_poses
-from result_making import calibration
 
-from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 
 POSES = wandering_poses(60)
@@ -50,48 +47,6 @@ def trajectory(chaos, format):
     ends = "\r\n" if chaos.hits() else "\n"
     data = ends.join(lines).encode("utf-8", "surrogatepass")
     return chaos.data(data), "\n".join(chaos.items(times)).encode()
-
-
-# ---- YAML
-
-ODD_SCALARS = (
-    *("2024-13-45", "9" * 5000, "!!float abc", "!!int ''", "~", ".nan", "-.inf", "0o17", "1:60:60"),
-    *("0x" + "f" * 100, "!!binary aGk=", "!!set {a}", "!!python/name:os.system", "*nowhere", "&a"),
-    *("'", '"\\x00"', '"\\e[2J"', "? ", "|", ">-", "@", "%", "yes", "1e5", "- - -", "<<", "[1, 2"),
-    *("!!timestamp x", "!!omap [a: 1]", "[" * 200, "{" * 200, "{a: 1, a: 2}", "]", "\t", "!!str"),
-    *("!<x>", "...", "---", "😀", "\x07"),
-)
-
-
-def altered(chaos, document):
-    """A document with some values replaced, left out or added."""
-    if chaos.hits(0.5):
-        return chaos.choice(
-            [None, 5, "x", [], {}, [1], {"a": 1}, 1e300, -1, True, [[]], "\x1b", 2**62]
-        )
-    if isinstance(document, dict):
-        items = chaos.items([(key, altered(chaos, value)) for key, value in document.items()])
-        return dict(items)
-    if isinstance(document, list):
-        return chaos.items([altered(chaos, value) for value in document])
-    return chaos.real(document) if isinstance(document, float) else document
-
-
-DOCUMENTS = {
-    "config": CalibratorConfig().to_options(),
-    "info": calibration().to_dict(),
-}
-KEYS = ("bags", "options", "method", "calibrator", "format", "prior.x", "'/**'", "5", "? [a]")
-
-
-def yaml_text(chaos, kind):
-    """A YAML file meant as one of DOCUMENTS."""
-    if chaos.random.random() < 0.25:
-        lines = [f"{chaos.choice(KEYS)}: {chaos.choice(ODD_SCALARS)}" for _ in range(3)]
-        return chaos.data("\n".join(lines).encode("utf-8", "surrogatepass"))
-    flow, document = chaos.choice([True, False, None]), altered(chaos, DOCUMENTS[kind])
-    text = yaml.safe_dump(document, default_flow_style=flow, allow_unicode=True)
-    return chaos.data(text.encode())
 
 
 # ---- journals

@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses, write_pair
 
-from hand_eye_calib.assessment.covariance import UNKNOWN_TRANSLATION, Assessment
-from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.text import parse_prior
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -168,15 +165,3 @@ def test_the_command_refuses_a_contradiction(tmp_path, capsys):
     assert load_result(tmp_path / "out").status is SolveStatus.CONTRADICTED
     files = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert files == ["extrinsic.yaml", "report.html"]
-
-
-def test_what_nobody_knows_keeps_its_variance():
-    covariance = np.diag([1e-4, 1e-4, UNKNOWN_TRANSLATION**2, 1e-6, 1e-6, 1e-6])
-    dofs = tuple(
-        DofObservability(n, DofVerdict.UNOBSERVABLE if n == "z" else DofVerdict.OBSERVED, 0.0)
-        for n in AXES
-    )
-    at = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 7.0])
-    fused = fuse(at, Assessment(covariance, dofs), {"x": (0.0, 0.01)})
-    assert fused.T_parent_child[2, 3] == pytest.approx(0.0, abs=1e-9)
-    assert fused.assessment.observability[2].verdict is DofVerdict.UNOBSERVABLE
