@@ -4,7 +4,6 @@ import json
 import re
 from pathlib import Path
 
-import pytest
 import yaml
 
 from hand_eye_calib.watch.board import AXES
@@ -13,26 +12,17 @@ CONFIG = Path(__file__).resolve().parents[2] / "config"
 NODE_PAGE = (CONFIG.parent / "docs" / "node.md").read_text(encoding="utf-8")
 
 
-@pytest.fixture
-def displays():
-    rviz = yaml.safe_load((CONFIG / "calibrator.rviz").read_text())
-    return {each["Name"]: each for each in rviz["Visualization Manager"]["Displays"]}
-
-
-@pytest.fixture
-def layout():
-    return json.loads((CONFIG / "foxglove_layout.json").read_text())
-
-
-def test_rviz_shows_the_latched_extrinsic_with_its_covariance(displays):
-    extrinsic = displays["Extrinsic"]
+def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
+    rviz = yaml.safe_load((CONFIG / "calibrator.rviz").read_text())["Visualization Manager"]
+    (extrinsic,) = (each for each in rviz["Displays"] if each["Name"] == "Extrinsic")
     assert extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
     assert extrinsic["Topic"]["Durability Policy"] == "Transient Local"
     assert extrinsic["Covariance"]["Position"]["Value"] is True
     assert "`~/extrinsic_with_covariance`" in NODE_PAGE
 
 
-def test_foxglove_shows_what_the_node_publishes_and_serves(layout):
+def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
+    layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
     panels = layout["configById"]
     services = [each["serviceName"] for each in panels.values() if "serviceName" in each]
     assert sorted(services) == [f"/calibrator/{name}" for name in ("reset", "save", "solve")]
@@ -43,11 +33,9 @@ def test_foxglove_shows_what_the_node_publishes_and_serves(layout):
     keys = set(re.findall(r'key=="([a-z.]+)"', " ".join(values)))
     assert keys == {*(f"sigma.{axis}" for axis in AXES), "target.x", "target.roll"}
 
-
-def test_every_panel_of_the_foxglove_layout_is_placed_once(layout):
     def placed(part):
         if isinstance(part, str):
             return [part]
         return [*placed(part["first"]), *placed(part["second"])]
 
-    assert sorted(placed(layout["layout"])) == sorted(layout["configById"])
+    assert sorted(placed(layout["layout"])) == sorted(panels)
