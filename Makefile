@@ -2,7 +2,7 @@
 #   make demo          simulate a drive, calibrate it offline and on the live node, compare with the truth
 #   make test          the whole test suite
 #   make test-oldest   the same without slow tests, on the oldest supported versions
-#   make fuzz          5,400 structured files, damaged on purpose (INPUTS=500)
+#   make fuzz          5,400 files, damaged on purpose (INPUTS=500)
 #   make lint          style and types
 #   make coverage      the test suite, and the lines that no test runs
 #   make paper DATA=x  every figure and table of the paper from its published data in x, to reproduced/
