@@ -138,7 +138,7 @@ def test_without_a_library_of_pip_one_line_says_what_is_missing(library, command
     program = (
         f"import sys; sys.modules[{library!r}] = None\n"
         "from hand_eye_calib.cli.main import main\n"
-        f"print([main(command) for command in {commands}], file=sys.stderr)"
+        f"print([int(main(command)) for command in {commands}], file=sys.stderr)"
     )
     done = run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | {"PYTHONPATH": ROOT})
     *_, line, codes = done.stderr.splitlines()
