@@ -194,7 +194,7 @@ def journal_in(path: Path | str) -> Path | None:
 def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
     """Read the journal of a session of the node; the options go before those of the session."""
     from hand_eye_calib.io.journal import read_journal
-    from hand_eye_calib.live.journal import give
+    from hand_eye_calib.live.session import give
 
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)

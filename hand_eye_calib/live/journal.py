@@ -6,12 +6,11 @@ import fcntl
 import os
 import queue
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io.journal import (
     About,
     Journal,
@@ -28,37 +27,8 @@ FLUSH_PERIOD_S = 0.25
 # Batches that may wait for a disk that does not answer: a minute.
 _MOST_WAITING = 240
 
-# The engines by the child sensor of each; all of them have the same parent.
-Engines = Mapping[str, Calibrator]
 # Stream, stamp (ns), position and quaternion.
 _Pose = tuple[str, int, Sequence[float], Sequence[float]]
-
-
-def takers(stream: str, engines: Engines) -> list[tuple[str, Calibrator]]:
-    """Who takes a message of a stream, and as which: the parent's counts for all child sensors."""
-    if stream == "parent":
-        return [(stream, each) for each in engines.values()]
-    return [("child", engines[stream])] if stream in engines else []
-
-
-def give(journal: Journal, directory: Path, engines: Engines) -> None:
-    """Give engines the session of a directory.
-
-    Raises
-    ------
-    InputError
-        If they do not take it.
-    """
-    try:
-        for stream, about in journal.about.items():
-            for own_stream, engine in takers(stream, engines) if about.get("frame") else ():
-                engine.set_frame(own_stream, about["frame"])
-        columns = (journal.streams, journal.stamps_ns, journal.poses)
-        for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
-            for own_stream, engine in takers(stream, engines):
-                engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
-    except InputError as error:
-        raise InputError(f"cannot use the session journal {directory}: {error}") from None
 
 
 def lock_directory(directory: Path) -> int | None:
@@ -90,7 +60,8 @@ def lock_directory(directory: Path) -> int | None:
 
 class SessionJournal:
     """Takes poses in the executor's thread, writes them in its own, which writes to the log too.
-    What cannot be written ends the journal until the next session; ``error`` says why.
+    What cannot be written ends the journal until the next session; ``error`` says why. Poses that
+    the engine has taken are appended to ``poses``.
 
     Parameters
     ----------
@@ -117,22 +88,16 @@ class SessionJournal:
         self.directory, self.error, self._log = directory, "", log
         self._lock = lock_directory(directory.parent)
         self._about = about
-        self._poses: list[_Pose] = []
+        self.poses: list[_Pose] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
         self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
         self._jobs.put(partial(self._open, about(), resumed))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
-    def add_pose(
-        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
-    ) -> None:
-        """Note a pose that the engine has taken."""
-        self._poses.append((stream, stamp_ns, position, quat_xyzw))
-
     def flush(self) -> None:
         """Hand what is new to the thread; to be called often."""
-        poses, self._poses = self._poses, []
+        poses, self.poses = self.poses, []
         if self._jobs.qsize() > _MOST_WAITING and not self.error:
             self._give_up("the disk does not answer")
         elif not self.error:

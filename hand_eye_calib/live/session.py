@@ -1,6 +1,6 @@
 """The live session: its engines, its number, and its journal on disk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -8,15 +8,46 @@ from typing import Any
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
-from hand_eye_calib.live.journal import SessionJournal, give, takers
+from hand_eye_calib.live.journal import SessionJournal
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import JournalState, Level
 
 # How long (s) a disk, or a solve under way, may each hold up the end of the program.
 GRACE_S = 0.4
+
+
+# The engines by the child sensor of each; all of them have the same parent.
+Engines = Mapping[str, Calibrator]
+
+
+def takers(stream: str, engines: Engines) -> list[tuple[str, Calibrator]]:
+    """Who takes a message of a stream, and as which: the parent's counts for all child sensors."""
+    if stream == "parent":
+        return [(stream, each) for each in engines.values()]
+    return [("child", engines[stream])] if stream in engines else []
+
+
+def give(journal: Journal, directory: Path, engines: Engines) -> None:
+    """Give engines the session of a directory.
+
+    Raises
+    ------
+    InputError
+        If they do not take it.
+    """
+    try:
+        for stream, about in journal.about.items():
+            for own_stream, engine in takers(stream, engines) if about.get("frame") else ():
+                engine.set_frame(own_stream, about["frame"])
+        columns = (journal.streams, journal.stamps_ns, journal.poses)
+        for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
+            for own_stream, engine in takers(stream, engines):
+                engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
+    except InputError as error:
+        raise InputError(f"cannot use the session journal {directory}: {error}") from None
 
 
 class LiveSession:
@@ -68,7 +99,7 @@ class LiveSession:
         for _, other in others:
             other.add_pose(own_stream, stamp_ns, position, quat_xyzw)
         if self._journal is not None:
-            self._journal.add_pose(stream, stamp_ns, position, quat_xyzw)
+            self._journal.poses.append((stream, stamp_ns, position, quat_xyzw))
         self.has_new_poses |= self._is_solved and stream in STREAMS
         return True
 

@@ -12,7 +12,8 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
-from hand_eye_calib.live.journal import give, lock_directory, takers
+from hand_eye_calib.live.journal import lock_directory
+from hand_eye_calib.live.session import give, takers
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}
