@@ -136,8 +136,8 @@ class CalibratorConfig(OptionSet):
     reference: str = option(
         "auto",
         "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
-        "it), C<n> (each with the first of its segment of n), or auto (the one with the answer "
-        "nearest to adaptive's).",
+        "it), C<n> (each with the first of its segment of n), or auto (the one with the "
+        "estimate nearest to adaptive's).",
         parse=lambda name, text: text == "auto" or parse_reference(name, text),
     )
     backend: str = option(

@@ -32,7 +32,7 @@ class ReferenceChoice:
         """The reason in one sentence."""
         nearest, farthest = (choose(self.distances.values()) for choose in (min, max))
         return (
-            f"{self.reference} of {', '.join(self.distances)}: its answer is nearest to the "
+            f"{self.reference} of {', '.join(self.distances)}: its estimate is nearest to the "
             f"adaptive estimator's, {nearest:.1f} standard deviations off; the farthest is "
             f"{farthest:.1f} off"
         )

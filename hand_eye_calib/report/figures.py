@@ -37,7 +37,7 @@ _WHAT_COINCIDES = {
     "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
     "however they are mounted: the two curves must coincide, up to the bias of a gyroscope.",
     "speed": "Two points of one rigid body have the same speed while it does not rotate: the two "
-    "curves must have the same course.",
+    "curves must rise and fall together.",
 }
 
 

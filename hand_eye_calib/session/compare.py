@@ -86,7 +86,7 @@ def _who_moved(
         return tuple(names[index] for index in found.apart), f"moved: {found.sentence(names)}"
     apart = [each for each in differences if each.verdict == Change.MOVED]
     pairs = listing([f"{each.first} and {each.second}" for each in apart])
-    return (), f"moved: {pairs} differ; which of them has moved, they do not tell"
+    return (), f"moved: {pairs} differ; they do not show which of them has moved"
 
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:

@@ -110,7 +110,7 @@ def test_an_axis_is_the_same_by_its_own_target():
     [
         ("010", ("drive 2",), "moved: drive 2 differs from the others: the rotation about y by "),
         ("0011", ("drive 3", "drive 4"), "moved: The mount has moved before drive 3: "),
-        ("01", (), "moved: drive 1 and drive 2 differ; which of them has moved, they do not tell"),
+        ("01", (), "moved: drive 1 and drive 2 differ; they do not show which of them has moved"),
     ],
 )
 def test_which_one_moved(have_moved, named, sentence):

@@ -69,7 +69,7 @@ def test_motion_or_start_tell_the_order(tmp_path, truth, said):
 
 def test_an_order_that_nothing_tells_is_said(tmp_path):
     truth = as_trajectory(se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200))
-    said = "nothing tells the order of the quaternion; read with the scalar last"
+    said = "nothing names the order of the quaternion; read with the scalar last"
     for name, separator, is_said in (("a.csv", ",", 1), ("a.txt", " ", 0)):
         trajectory, guesses = read(write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator))
         np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)

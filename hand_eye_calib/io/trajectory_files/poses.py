@@ -245,7 +245,7 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
         return ways["first"]
     if table.format != "tum" and fitting != ["last"] and "last" not in level:
         table.guess(
-            "no columns are named, and nothing tells the order of the quaternion; read with the "
+            "no columns are named, and nothing names the order of the quaternion; read with the "
             "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
         )
     return quats
