@@ -43,7 +43,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
         images = target_images.images_in(child_path)
         _check_counts(arguments, len(parent), len(images))
         for image in with_progress(images, len(images), "finding the target"):
-            finder.look(target_images.read_image(image))
+            finder.look(target_images.image_in(image.read_bytes(), image))
         seen = finder.found()
         n_child = len(seen.images)
         note(str(seen))

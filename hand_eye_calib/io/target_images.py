@@ -131,31 +131,29 @@ def images_in(folder: Path) -> list[Path]:
     )
 
 
-def read_image(path: Path) -> Any:
-    """An image in grey."""
-    image = _opencv().imread(str(path), _opencv().IMREAD_GRAYSCALE)
+def image_in(data: Any, where: object) -> Any:
+    """The image in the bytes of an image file, in grey."""
+    cv2 = _opencv()
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise InputError(f"{path} is not an image that can be read")
+        raise InputError(f"{where} is not an image that can be read")
     return image
 
 
 def grey_of(message: Any) -> Any:
     """The image of a sensor_msgs/Image or CompressedImage in grey; an InputError if it has none."""
-    cv2, data = _opencv(), np.asarray(message.data, dtype=np.uint8)
+    data = np.asarray(message.data, dtype=np.uint8)
     if not hasattr(message, "encoding"):
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise InputError("a compressed image cannot be read")
-        return image
+        return image_in(data, "a compressed image")
     if message.encoding not in _TO_GREY:
         known = ", ".join(_TO_GREY)
         raise InputError(f"images are encoded as {message.encoding[:40]!r}; expected {known}")
     n_channels, conversion = message.step // message.width, _TO_GREY[message.encoding]
     rows = data.reshape(message.height, message.step)[:, : message.width * n_channels]
     image = rows.reshape(message.height, message.width, n_channels)
-    return (
-        cv2.cvtColor(image, getattr(cv2, f"COLOR_{conversion}")) if conversion else image[:, :, 0]
-    )
+    if not conversion:
+        return image[:, :, 0]
+    return _opencv().cvtColor(image, getattr(_opencv(), f"COLOR_{conversion}"))
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
 from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
-from hand_eye_calib.io.transforms import TfSource
 
 SECOND = 10**9
 POSES = wandering_poses(120)
@@ -218,21 +217,6 @@ def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
     ]
     path = write_messages(tmp_path / "old.bag", messages * 2, "rosbag1")
     assert_same_motion(hec.read_trajectory(path, tf="odom:base"), PARENT.stamps_ns, PARENT.poses)
-
-
-def test_both_sensors_from_transforms(tmp_path):
-    path = write_messages(
-        tmp_path / "bag", transforms([("lidar", "map", PARENT), ("camera", "odom", CHILD)])
-    )
-    with PoseBag(path) as bag:
-        sources = bag.select(TfSource("map", "lidar"), TfSource("odom", "camera"))
-        poses = poses_of(bag, *sources)
-        assert bag.warnings == []
-    assert [pose.bag_ns for pose in poses] == sorted(pose.bag_ns for pose in poses)
-    assert {pose[0:1] + pose[2:4] for pose in poses} == {
-        ("parent", "map", "lidar"),
-        ("child", "odom", "camera"),
-    }
 
 
 @pytest.mark.parametrize(

@@ -157,12 +157,9 @@ class PoseBag:
         self, parent: Source | None = None, child: Source | None = None
     ) -> tuple[Source, Source]:
         """Choose the sources of the parent's and the child's poses; an InputError if one that is
-        named cannot be used, both are the same, or there is a choice to make.
-
-        What is not named is chosen if there is only one way to do it: with neither named, the bag
-        has exactly two topics of poses. The parent is the one whose name has the word parent, base
-        or lidar, or the first in alphabetical order. Topics of paths count if there are not enough
-        others.
+        named cannot be used, both are the same, or there is a choice to make. With neither named,
+        the bag has exactly two topics of poses, or of paths if there are no others; the parent is
+        the one whose name has the word parent, base or lidar, or the first by name.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
@@ -240,31 +237,30 @@ class PoseBag:
             return sources.PathReading(stream, topic)
         if type_ == messages.POINTS_TYPE:
             return sources.ScanReading(stream, topic, self.paths[0], self.files)
-        parts = zip(self._parts_of(topic), ("positions", "rotations"), strict=True)
+        fixes, turns = self._parts_of(topic)
         return sources.JoinedReading(
-            *(
-                sources.TopicReading(stream, part, self._type_of(part), wanted)
-                for part, wanted in parts
-            )
+            sources.TopicReading(stream, fixes, self._type_of(fixes), "positions"),
+            sources.TopicReading(stream, turns, self._type_of(turns), "rotations"),
         )
 
     def _images(self, stream: str, topic: str, text: str) -> Reading:
         """Reads images of a target, with the intrinsics of a file or of the camera_info beside."""
-        target, _, file = text.partition("@")
+        name, _, file = text.partition("@")
+        target = Target.parse(name)
         if (type_ := self._type_of(topic)) not in messages.IMAGE_TYPES:
-            raise InputError(f"{topic} is of type {type_}, which has no images of {target}")
+            raise InputError(f"{topic} is of type {type_}, which has no images of a target")
         if file:
-            return sources.ImageReading(stream, topic, Target.parse(target), read_camera(file))
+            return sources.ImageReading(stream, topic, target, read_camera(file))
         beside = (str(folder / "camera_info") for folder in PurePosixPath(topic).parents)
         info = next((each for each in beside if each in self.topics), "")
         run = next(self._runs([info]), None)
         if run is None:
             raise InputError(
                 f"no camera_info beside {topic} in {self}; name a file of the intrinsics: with "
-                f"--camera, or {topic}?{target}@FILE"
+                f"--camera, or {topic}?{name}@FILE"
             )
         camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
-        return sources.ImageReading(stream, topic, Target.parse(target), camera)
+        return sources.ImageReading(stream, topic, target, camera)
 
     def trajectory(self, source: Source, measures: str = "auto") -> tuple[Trajectory, list[str]]:
         """The trajectory of one source in the order of stamps, of those with equal stamps the

@@ -57,6 +57,8 @@ class Tuning:
 
 _TUNING = Tuning()
 
+_KEPT = ("poses", "stamps_ns", "bag_ns", "frame", "n_failed")
+
 
 class Scan(NamedTuple):
     """Points (N, 3) of one turn of a lidar, m, in its own frame; their times (N,) from 0 to 1, the
@@ -106,34 +108,22 @@ def scan_of(message: Any) -> Scan:
     return Scan(points, (times - times.min()) / span, stamp_ns, frame)
 
 
-class Odometry(NamedTuple):
-    """Poses (N, 7) x y z qx qy qz qw of a lidar in the frame of its first scan, each at the end of
-    its scan; their stamps and bag times (N,), its frame, and how many scans could not be
-    registered.
-    """
-
-    poses: np.ndarray
-    stamps_ns: np.ndarray
-    bag_ns: np.ndarray
-    frame: np.ndarray
-    n_failed: np.ndarray
-
-
 class ScanOdometry:
     """Registers the scans on a topic of a bag one after the other; what is found is kept beside the
     bag for the next time, in ``place``. ``kept`` is what was kept for files of the same sizes and
-    times.
+    times: poses (N, 7) in the frame of the first scan, each at the end of its scan, stamps and bag
+    times (N,), the lidar's frame, and how many scans could not be registered.
     """
 
     def __init__(self, topic: str, bag: Path, files: Sequence[Path]) -> None:
         self._topic, states = topic, [file.stat() for file in files]
         self._state = np.array([[each.st_size, each.st_mtime_ns] for each in states])
         self.place = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
-        self.kept: Odometry | None = None
+        self.kept: dict[str, Any] = {}
         # The errors are of many kinds: it is not there, cut off, or of an older version.
         with suppress(Exception), np.load(self.place, allow_pickle=False) as kept:
             if np.array_equal(kept["files"], self._state):
-                self.kept = Odometry(*(kept[name] for name in Odometry._fields))
+                self.kept = {name: kept[name] for name in _KEPT}
                 return
         self._gicp = required(
             "small_gicp", "odometry from the points of a lidar", "hand_eye_calib[lidar]"
@@ -151,21 +141,21 @@ class ScanOdometry:
             self._found.append((self._pose, scan.stamp_ns, bag_ns))
             self._frame = scan.frame
 
-    def odometry(self) -> Odometry:
-        """What was found; an InputError if most scans could not be registered."""
-        if self.kept is not None:
-            return self.kept
-        if 2 * self._n_failed >= len(self._found):
-            raise InputError(
-                f"{self._topic}: {self._n_failed} of {len(self._found)} scans could not be "
-                "registered; use the odometry of a lidar SLAM"
-            )
-        poses, stamps_ns, bag_ns = (np.array(each) for each in zip(*self._found, strict=True))
-        rows = np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
-        found = rows, stamps_ns, bag_ns, np.array(self._frame), np.array(self._n_failed)
-        with suppress(OSError):  # the folder may be read-only
-            np.savez(self.place, files=self._state, **Odometry(*found)._asdict())
-        return Odometry(*found)
+    def odometry(self) -> dict[str, Any]:
+        """What was found, as it is kept; an InputError if most scans could not be registered."""
+        if not self.kept:
+            if 2 * self._n_failed >= len(self._found):
+                raise InputError(
+                    f"{self._topic}: {self._n_failed} of {len(self._found)} scans could not be "
+                    "registered; use the odometry of a lidar SLAM"
+                )
+            Ts, *times = (np.array(each) for each in zip(*self._found, strict=True))
+            rows, about = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)], (self._frame, self._n_failed)
+            found = rows, *times, *map(np.array, about)
+            self.kept = dict(zip(_KEPT, found, strict=True))
+            with suppress(OSError):  # the folder may be read-only
+                np.savez(self.place, files=self._state, **self.kept)
+        return self.kept
 
     def _register(self, scan: Scan) -> None:
         if not self._keys:

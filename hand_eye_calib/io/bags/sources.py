@@ -155,12 +155,11 @@ class ScanReading(Reading):
             self._lidar.add(scan_of(message), bag_ns)
 
     def table(self) -> PoseTable:
-        found = self._lidar.odometry()
-        about = f"{self._topic}: odometry from {len(found.poses)} scans"
-        lost = f", {found.n_failed} of which could not be registered" if found.n_failed else ""
-        self.notes.append(f"{about}{lost}; it is kept in {self._lidar.place}")
-        table = PoseTable.of(found.stamps_ns, found.poses, "scans", str(found.frame))
-        return table.recorded(self.stream, found.bag_ns)
+        poses, stamps_ns, bag_ns, frame, n_failed = self._lidar.odometry().values()
+        lost = f", {n_failed} of which could not be registered" if n_failed else ""
+        place = f"it is kept in {self._lidar.place}"
+        self.notes.append(f"{self._topic}: odometry from {len(poses)} scans{lost}; {place}")
+        return PoseTable.of(stamps_ns, poses, "scans", str(frame)).recorded(self.stream, bag_ns)
 
 
 class ImageReading(Reading):

@@ -277,16 +277,12 @@ def rosbags(version: int) -> Any:
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Messages in blocks; those compressed one by one are unpacked. A ValueError at the first that
-    is not bytes with a time.
-    """
+    """Messages in blocks; those compressed one by one are unpacked."""
     rows, size = list[Message](), 0
     for kind, bag_ns, data in messages:
-        if type(data) is not bytes or type(bag_ns) is not int or not 0 <= bag_ns < 1 << 63:
-            raise ValueError(f"a message on {kind.topic} is not bytes with a time")
         if data.startswith(_ZSTD_MAGIC):  # as plain CDR never does
             data = bytes(_zstd().decompress(data))
-        rows.append((kind, bag_ns, data))
+        rows.append((kind, int(bag_ns), data))
         size += len(data)
         if size > BLOCK_BYTES:
             yield rows
