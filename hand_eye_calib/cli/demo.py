@@ -22,8 +22,8 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
+    from hand_eye_calib.arrays import FloatArray
     from hand_eye_calib.results.calibration import Calibration
-    from hand_eye_calib.ros.player import LiveExtrinsic
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.cli.present import exit_code
     from hand_eye_calib.cli.reporting import write_report
     from hand_eye_calib.io.bags import PoseBag, write_bag
-    from hand_eye_calib.ros.player import Player
+    from hand_eye_calib.ros.player import play
     from hand_eye_calib.simulation.drive import simulate_drive
 
     with waiting_for("simulating"):
@@ -73,10 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
     # From 102 on the ports overlap with those that Linux gives to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     node = _node(arguments.out / "node.log")
-    with waiting_for("playing"), node as check, Player(TOPICS, check) as player:
-        with PoseBag(bag_path) as bag:
-            player.play(bag.poses(TOPICS["parent"], TOPICS["child"]), PLAY_SPEED)
-        online = player.wait_for_extrinsic(offline.stamp_ns)
+    with waiting_for("playing"), PoseBag(bag_path) as bag, node as check:
+        poses = bag.poses(TOPICS["parent"], TOPICS["child"])
+        online = play(poses, TOPICS, PLAY_SPEED, offline.stamp_ns, check)
     note("3/4 calibrated live; the report follows")
     print_result("\n".join(_lines(drive, offline, online)))
     write_report(arguments.out, offline, recording.snapshot, recording.inputs)
@@ -114,7 +113,7 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
             process.kill()
 
 
-def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "LiveExtrinsic") -> Iterator[str]:
+def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "FloatArray") -> Iterator[str]:
     """The verdict, each result beside the truth, and how far it is off."""
     from hand_eye_calib.assessment.metrics import absolute_errors
     from hand_eye_calib.geometry import se3
@@ -122,13 +121,13 @@ def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "LiveExtrinsic
     yield offline.headline
     heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))
     yield f"{f'Pose of {offline.child_frame} in {offline.parent_frame}':<26}{heads}  deg"
-    for title, each in (("truth", drive), ("replay of the bag", offline), ("live node", live)):
-        T = each.T_parent_child
-        metres, radians = absolute_errors(T, drive.T_parent_child)
+    truth, replayed = drive.T_parent_child, offline.T_parent_child
+    for title, T in (("truth", truth), ("replay of the bag", replayed), ("live node", live)):
+        metres, radians = absolute_errors(T, truth)
         position = "".join(f"{value:10.4f}" for value in T[:3, 3])
         angles = se3.rotation_to_rpy(T[:3, :3])
         degrees = "".join(f"{math.degrees(value):10.3f}" for value in angles)
-        off = f"off by {length(metres)} and {angle(radians)}" * (each is not drive)
+        off = f"off by {length(metres)} and {angle(radians)}" * (T is not truth)
         yield f"  {title:<24}{position}{'':10}{degrees}  {off}".rstrip()
-    metres, radians = absolute_errors(live.T_parent_child, offline.T_parent_child)
+    metres, radians = absolute_errors(live, replayed)
     yield f"Offline and live differ by {metres:.1e} m and {math.degrees(radians):.1e} deg"
