@@ -34,6 +34,7 @@ from hand_eye_calib.io.trajectory_files.table import (
     UNNAMED,
     Table,
     named_columns,
+    table_of_object,
 )
 from hand_eye_calib.text import told_apart
 
@@ -187,12 +188,7 @@ def read_trajectory(
         repair=repair,
         measures=measures,
     )
-    if path is not None:
-        table = read_table(path, options)
-    else:
-        from hand_eye_calib.io.trajectory_files.objects import table_of_object
-
-        table = table_of_object(source, times)
+    table = read_table(path, options) if path else table_of_object(source, times)
     trajectory, repairs, guesses = _read(table, options)
     for text in [*guesses, *repairs]:
         warnings.warn(text, UserWarning, stacklevel=2)
