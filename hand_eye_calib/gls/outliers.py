@@ -103,7 +103,8 @@ def _chi_squares(
     """Chi-square (n,) of smoothed values (n, 6); their covariance is prior minus posterior, or plus
     if the value was excluded.
     """
-    spread = np.where(left_out[:, None, None], prior + posterior, prior - posterior)
+    spread = prior - posterior
+    spread[left_out] = prior[left_out] + posterior[left_out]
     spread += TUNING.raised_covariance * prior + TUNING.least_variance * np.eye(6)
     return np.asarray((values * np.linalg.solve(spread, values[:, :, None])[:, :, 0]).sum(axis=1))
 

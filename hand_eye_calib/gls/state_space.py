@@ -98,10 +98,11 @@ class StateSpace:
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
-        states = np.zeros((len(columns) + 1, self.behind.shape[2], columns.shape[2]))
-        states[1:, :WHITE] = columns
-        states[1:, WHITE:] = transposed(self.ahead) @ columns
-        states[:-1] -= transposed(self.behind) @ columns
+        states = np.empty((len(columns) + 1, self.behind.shape[2], columns.shape[2]))
+        np.matmul(-transposed(self.behind), columns, out=states[:-1])
+        states[-1] = 0.0
+        states[1:, :WHITE] += columns
+        states[1:, WHITE:] += transposed(self.ahead) @ columns
         return states
 
 
