@@ -8,11 +8,12 @@ from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import solve_poses
-from hand_eye_calib.engine.run import Progress, run
+from hand_eye_calib.engine.run import run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.rig.result import RigCalibration
 
 # Options that are of one pair of sensors, by their beginnings.
@@ -25,7 +26,6 @@ def calibrate_rig(
     *,
     time_offset: str | None = None,
     scale: str | None = None,
-    progress: Progress | None = None,
 ) -> RigCalibration:
     """Estimate the poses of all sensors of a rig in the frame of the first one.
 
@@ -41,19 +41,13 @@ def calibrate_rig(
     options : mapping of str to value, optional
         By their public names, such as method, max_gap or target.translation; see
         :class:`~hand_eye_calib.config.CalibratorConfig`.
-    time_offset : "estimate", optional
-        Of every sensor against the first one.
-    scale : {"none", "auto", "estimate"}, optional
-        The same.
-    progress : callable, optional
-        Called with the share that is done, 0 to 1, and the step that begins.
+    time_offset, scale : str, optional
+        "estimate", for the scale also "auto" or "none": of every sensor against the first one.
 
     Raises
     ------
-    ConfigError
-        If an option has a value that is not allowed.
-    InputError
-        If there are fewer than three trajectories.
+    ConfigError, InputError
+        If an option is not allowed, or there are fewer than three trajectories.
     NotEnoughDataError
         If too few instants have poses of two sensors.
 
@@ -66,26 +60,26 @@ def calibrate_rig(
     named = {"time_offset": time_offset, "scale": scale}
     options = dict(options or {}) | {name: each for name, each in named.items() if each is not None}
     _refuse(trajectories, options)
-    tell = progress or (lambda share, step: None)
-    sensors = tuple(trajectories)
     first, *rest = [replace(each, sensor_frame=name) for name, each in trajectories.items()]
     star, moved = [], []
-    for index, other in enumerate(rest):
-        tell(0.6 * index / (len(sensors) - 1), f"{other.sensor_frame} in {sensors[0]}")
+    for other in rest:
         snapshot = whole_snapshot(first, other, options)
         answer = run(snapshot).calibration
         star.append(answer)
         moved.append(other.scaled(answer.scale).shifted(answer.time_offset_s))
-    chain = []
-    for index, (answer, before, after) in enumerate(zip(star, moved, moved[1:], strict=False)):
-        tell(0.6 + 0.4 * index / (len(star) - 1), "closure of pairs")
-        pairs = synchronise(before, after, snapshot.config.max_gap)
-        of_pair = {"method": answer.method, "max_pairs": max(len(pairs), 10)}
-        found = solve_poses(pairs, CalibratorConfig.from_options(of_pair)).calibration()
-        ends = before.sensor_frame, after.sensor_frame
-        chain.append(replace(found, parent_frame=ends[0], child_frame=ends[1]))
-    tell(1.0, "done")
-    return RigCalibration.of(sensors, star, chain)
+    couples = zip(star, moved, moved[1:], strict=False)
+    chain = [_between(*each, snapshot.config.max_gap) for each in couples]
+    return RigCalibration.of(tuple(trajectories), star, chain)
+
+
+def _between(
+    answer: Calibration, before: Trajectory, after: Trajectory, max_gap_s: float
+) -> Calibration:
+    """Of two neighbours on one clock and in one unit, with the method of an answer."""
+    pairs = synchronise(before, after, max_gap_s)
+    config = CalibratorConfig(method=answer.method, max_pairs=max(len(pairs), 10))
+    found = solve_poses(pairs, config).calibration()
+    return replace(found, parent_frame=before.sensor_frame, child_frame=after.sensor_frame)
 
 
 def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:

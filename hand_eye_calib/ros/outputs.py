@@ -9,6 +9,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from hand_eye_calib.live.session import GRACE_S
 from hand_eye_calib.live.state import NodeState
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import Calibration
@@ -22,8 +23,8 @@ from hand_eye_calib.ros.conversions import (
 from hand_eye_calib.text import in_words
 
 PROGRESS_TOPIC = "progress"
-# How long the end of the node waits for those who listen.
-_LAST_WORD = Duration(seconds=0.2)
+# The end of the node waits for those who listen, as it does for a disk.
+_LAST_WORD = Duration(seconds=GRACE_S)
 
 # Parts of the state that the names of values on /diagnostics leave out.
 _UNNAMED = ("progress", "axes", "result", "differences")
