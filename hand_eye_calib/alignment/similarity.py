@@ -222,7 +222,7 @@ def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, Sim
     if not fit.explains_translation:
         raise NotEnoughDataError(
             "the scale cannot be estimated: even with a scale, "
-            f"{fit.unexplained_translation:.0%} of the motion stays unexplained "
+            f"{min(fit.unexplained_translation, 1.0):.0%} of the motion stays unexplained "
             f"(at most {_MAX_UNEXPLAINED_TRANSLATION:.0%} is allowed); "
             "check the streams, or give scale"
         )
