@@ -20,20 +20,15 @@ from hand_eye_calib.cli.console import (
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import summary, usable_numbers
+from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
+from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown
-from hand_eye_calib.text import (
-    axes_in_words,
-    listing,
-    printed_angle,
-    with_sigma,
-)
+from hand_eye_calib.text import axes_in_words, listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
 
 _WIDTH = 100
-_ROTATIONS = ("roll", "pitch", "yaw")
 
 
 def deliver(
@@ -186,21 +181,17 @@ def transform_lines(
     transform: Mapping[str, Any], out_of_reach: Sequence[str] = (), with_quaternion: bool = False
 ) -> Iterator[str]:
     """A row for each axis: the translation along it and an angle, with one standard deviation."""
-    left = ["", "x, y and z are not estimated", ""]
-    right = ["", "roll, pitch and yaw are not estimated", ""]
-    if not {*out_of_reach} & {*"xyz"}:
-        sigmas = transform["sigma_total_translation"]
-        rows = zip("xyz", transform["translation"], sigmas, strict=True)
-        left = [f"{name} {with_sigma(value, sigma, 3):>22} m" for name, value, sigma in rows]
-    if not {*out_of_reach} & {*_ROTATIONS}:
-        rows = zip(_ROTATIONS, transform["rpy_deg"], transform["sigma_total_rpy_deg"], strict=True)
-        right = [f"{name:<5} {printed_angle(value, sigma):>20} deg" for name, value, sigma in rows]
-    for metres, degrees in zip(left, right, strict=True):
+    numbers, columns = printed_numbers(transform, out_of_reach), []
+    for axes, width in ((TRANSLATIONS, 1), (ROTATIONS, 5)):
+        told = numbers.get(listing(axes))
+        rows = ["", f"{listing(axes)} are {told}", ""]
+        columns.append(rows if told else [f"{each:<{width}} {numbers[each]:>24}" for each in axes])
+    for metres, degrees in zip(*columns, strict=True):
         yield f"  {metres:<30}  {degrees}".rstrip()
     if with_quaternion:
         named = zip("xyzw", transform["quat_xyzw"] or (), strict=False)
-        told = " ".join(f"{name} {value:.6f}" for name, value in named)
-        yield f"  quaternion {told or 'unknown'}"
+        quaternion = " ".join(f"{name} {value:.6f}" for name, value in named)
+        yield f"  quaternion {quaternion or 'unknown'}"
 
 
 # --------------------------------------------------------------------- details

@@ -67,11 +67,9 @@ def said_of_views(*calibrations: Calibration) -> str:
     """What the three views show, in words."""
     sigmas = np.array([each.sigmas_with_floor[:3] for each in calibrations])
     known = np.isfinite(sigmas)
-    larger = _enlarged(calibrations)
     text = "Axes of all sensors: x red, y green, z blue."
     if known.any():
-        text += f" Ellipse: {LOOK.sigmas:g} standard deviations of the position"
-        text += f", drawn {larger:,.0f} times as large." if larger > 1 else "."
+        text += f" Ellipse: {LOOK.sigmas:g} standard deviations of the position."
     if not known.all():
         unknown = [axis for axis, each in zip("xyz", known.T, strict=True) if not each.all()]
         text += f" Unknown along {listing(unknown)}: the dashed line."
@@ -82,7 +80,8 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
     """Draw three views into three panels: of the parent sensor, and of the child sensors of one or
     several results in its frame.
     """
-    axis_m = LOOK.axis * _extent(calibrations)
+    distances = [float(np.linalg.norm(each.translation)) for each in calibrations]
+    axis_m = LOOK.axis * max(*distances, LOOK.least_m)
     for panel, (axes, title) in zip(panels, _VIEWS.items(), strict=True):
         seen = ["xyz".index(axis) for axis in axes]
         _draw_sensor(panel, np.eye(4)[seen], calibrations[0].parent_frame, PARENT, axis_m, 6)
@@ -96,9 +95,7 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
                 R = T[seen, :3]
                 covariance = R @ calibration.covariance_with_floor[:3, :3] @ R.T
                 values, vectors = np.linalg.eigh(covariance)
-                wide, high = (
-                    2 * LOOK.sigmas * _enlarged(calibrations) * np.sqrt(np.maximum(values, 0.0))
-                )
+                wide, high = 2 * LOOK.sigmas * np.sqrt(np.maximum(values, 0.0))
                 turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
                 ellipse = Ellipse((at[0], at[1]), wide, high, angle=turned, color=CHILD, alpha=0.3)
                 panel.add_patch(ellipse)
@@ -122,17 +119,3 @@ def _draw_sensor(
     panel.annotate(
         plain_label(name), (at[0], at[1]), (5, below), textcoords="offset points", color=INK
     )
-
-
-def _extent(calibrations: Sequence[Calibration]) -> float:
-    distances = [float(np.linalg.norm(each.translation)) for each in calibrations]
-    return max(*distances, LOOK.least_m)
-
-
-def _enlarged(calibrations: Sequence[Calibration]) -> float:
-    """How many times as large the ellipses are drawn, to be seen: 1, 2, 5, 10 ..."""
-    sigmas = np.array([each.sigmas_with_floor[:3] for each in calibrations])
-    widest = LOOK.sigmas * float(np.max(sigmas[np.isfinite(sigmas)], initial=0.0))
-    wanted = LOOK.seen * _extent(calibrations) / max(widest, 1e-9)
-    steps = [step * 10**power for power in range(6) for step in (1, 2, 5)]
-    return float(next((step for step in steps if step >= wanted), steps[-1]))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import figure_of_views, figures_of
 from hand_eye_calib.report.style import LOOK
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import summary, usable_numbers
+from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.rig.result import RigCalibration
@@ -36,8 +37,6 @@ from hand_eye_calib.text import (
     in_words,
     length,
     listing,
-    printed_angle,
-    with_sigma,
 )
 from hand_eye_calib.version import package_version
 
@@ -86,7 +85,6 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
     )
     environment.filters |= {"number": fixed, "printable": printable}
     environment.globals |= {"amount": amount, "counted": counted, "axis_names": _AXIS_NAMES}
-    environment.globals |= {"with_sigma": with_sigma, "printed_angle": printed_angle}
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
     return environment.get_template(template).render(
         **values, marks=MARKS, said=f"{said[:1].upper()}{said[1:]}"
@@ -127,9 +125,8 @@ def render(
         child=child,
         rotating=child if evidence and evidence.has_positions_of_parent else parent,
         kind="Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose",
-        directions=[
-            _direction(document[key], unknown) for key in ("T_parent_child", "T_child_parent")
-        ],
+        directions=[document[key] for key in ("T_parent_child", "T_child_parent")],
+        numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
         axes=list(_axes(calibration)),
         advice=advice,
         command=command,
@@ -153,7 +150,9 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
         "",
         rig=rig,
         inputs=inputs,
-        poses=[each.to_dict()["T_parent_child"] for each in rig.calibrations],
+        poses=[
+            printed_numbers(each.to_dict()["T_parent_child"], (), "±") for each in rig.calibrations
+        ],
         figures=[figure_of_views(rig.calibrations)],
     )
 
@@ -186,27 +185,6 @@ def _targets(calibration: Calibration) -> str:
     return listing(
         [length(calibration.target_translation), angle(calibration.target_rotation), *single]
     )
-
-
-def _direction(transform: Plain, unknown: set[str]) -> dict[str, Any]:
-    """A transform as rows: each printed number with its standard deviation."""
-    rows = []
-    for axes, names, values, sigmas, unit in (
-        (TRANSLATIONS, "xyz", "translation", "sigma_total_translation", " m"),
-        (ROTATIONS, ROTATIONS, "rpy_deg", "sigma_total_rpy_deg", "°"),
-    ):
-        if unknown & {*axes}:
-            rows.append({"name": ", ".join(axes), "value": "not shown by these streams"})
-            continue
-        for name, value, sigma in zip(names, transform[values], transform[sigmas], strict=True):
-            text = with_sigma(value, sigma, 3) if unit == " m" else printed_angle(value, sigma)
-            text = text.replace("+/-", "±")
-            rows.append({"name": name, "value": text + (text != "unknown") * unit})
-    return {
-        "maps": printable(transform["maps"]),
-        "rows": rows,
-        "quat_xyzw": transform["quat_xyzw"],
-    }
 
 
 def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:

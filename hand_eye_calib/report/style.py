@@ -38,8 +38,8 @@ class Look(NamedTuple):
 
     width : of a figure, inches; a page shows them at about 96 pixels an inch.
     sigmas : standard deviations that an ellipse or a band reaches to.
-    axis, seen : length of a sensor's axes, and of the smallest ellipse that can be seen, in shares
-        of the distance between the sensors. least_m : the least such distance, m.
+    axis : length of a sensor's axes in shares of the distance between the sensors, of which
+        least_m is the least, m.
     distance_m : of the object whose error is told, m.
     bar_decades, bar_above : powers of ten that a bar reaches over, and over its target.
     points : most points drawn of a line, and of dots that each stand alone.
@@ -49,7 +49,6 @@ class Look(NamedTuple):
     width: float = 8.6
     sigmas: float = 3.0
     axis: float = 0.22
-    seen: float = 0.06
     least_m: float = 0.05
     distance_m: float = 10.0
     bar_decades: float = 4.0

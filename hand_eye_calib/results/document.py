@@ -2,7 +2,7 @@
 programs read.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING
 from typing import Any, cast, get_type_hints
 
@@ -18,7 +18,7 @@ from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
-from hand_eye_calib.text import given_or_estimated
+from hand_eye_calib.text import given_or_estimated, listing, printed_angle, with_sigma
 
 # Format and version of a document. A change that an older reader cannot understand raises the
 # version.
@@ -141,6 +141,27 @@ def summary(result: Result) -> dict[str, str]:
     if result.noise:
         rows["Noise"] = "; ".join(result.noise.in_words)
     return rows
+
+
+def printed_numbers(
+    transform: Mapping[str, Any], out_of_reach: Collection[str], sign: str = "+/-"
+) -> dict[str, str]:
+    """The printed numbers of a transform of a document by axis: x, y, z (m), roll, pitch and yaw
+    (deg), each with its standard deviation, the common-mode uncertainty included. Axes that are out
+    of reach of the streams stand together.
+    """
+    found = {}
+    for axes, values, sigmas, unit in (
+        (TRANSLATIONS, "translation", "sigma_total_translation", "m"),
+        (ROTATIONS, "rpy_deg", "sigma_total_rpy_deg", "deg"),
+    ):
+        if {*axes} & {*out_of_reach}:
+            found[listing(axes)] = "not estimated"
+            continue
+        for axis, value, sigma in zip(axes, transform[values], transform[sigmas], strict=True):
+            text = with_sigma(value, sigma, 3) if unit == "m" else printed_angle(value, sigma)
+            found[axis] = text if text == "unknown" else f"{text.replace('+/-', sign)} {unit}"
+    return found
 
 
 # ------------------------------------------------------------------------ for robots

@@ -207,10 +207,10 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
         f"figure-{figure}" for figure in shown
     ]
     assert len(page.all("svg")) == len(shown)
-    word, unknown = ("Orientation", "x, y, z") if name == "rates" else ("Position", "roll")
+    word, unknown = ("Orientation", "x, y and z") if name == "rates" else ("Position", "roll")
     assert f"{word} of antenna in lidar" in page.text
     assert f"{word} of lidar in antenna" in page.text
-    assert f"{unknown}" in page.text[page.text.index("not shown by") - 20 :]
+    assert f"{unknown}" in page.text[page.text.index("not estimated") - 20 :]
     bars = [a for a in page.all("div") if a.get("class") == "bar"]
     assert len(bars) == 3
     assert "MEASURE_" in page.text

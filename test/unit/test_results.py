@@ -131,7 +131,7 @@ def test_a_file_with_an_unknown_axis_is_read_by_the_commands(tmp_path, capsys, w
     told = capsys.readouterr()
     assert (code, told.err) == (0 if words[0] == "info" else 3, "")
     if "--json" not in words:
-        assert re.search(r"z +unknown m", told.out)
+        assert re.search(r"z +unknown", told.out)
     elif words[0] == "info":
         assert json.loads(told.out)["T_parent_child"]["translation"][2] is None
     else:
