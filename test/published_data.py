@@ -8,10 +8,8 @@ test that needs them is skipped, and says so, where they are absent.
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from hand_eye_calib.geometry import se3
 from reproduction import published
 
 # Cases and references of DNL in which Ipopt ended in a false minimum, with a rotation 170 to 178
@@ -55,13 +53,3 @@ def kitti_long():
 def simulated(datasets=published.SIMULATED, levels=None):
     """The simulated cases, 38 for every data set and level (Välimäki et al. 2023, section 4)."""
     return published.load_simulated(data_folder() / "valimaki2023", datasets, levels)
-
-
-def translation_error_m(T_parent_child, truth):
-    """e_at of the paper: distance between the translations, metres."""
-    return float(np.linalg.norm(T_parent_child[:3, 3] - truth[:3, 3]))
-
-
-def rotation_error_deg(T_parent_child, truth):
-    """e_aR of the paper: angle between the rotations, degrees."""
-    return float(np.degrees(se3.rotation_angle(T_parent_child[:3, :3].T @ truth[:3, :3])))

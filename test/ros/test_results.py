@@ -5,10 +5,11 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from motions import disturbed
 from nav_msgs.msg import Odometry
-from published_data import kitti_short, rotation_error_deg, translation_error_m
+from published_data import kitti_short
 from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix
 from std_msgs.msg import String
 
+from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
@@ -110,9 +111,8 @@ def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer)
         f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
         in answer.message
     )
-    both = matrix(extrinsic), case.T_parent_child
-    errors = translation_error_m(*both), rotation_error_deg(*both)
-    assert errors == pytest.approx((0.20, 0.23), abs=0.01)
+    metres, radians = absolute_errors(matrix(extrinsic), case.T_parent_child)
+    assert (metres, np.degrees(radians)) == pytest.approx((0.20, 0.23), abs=0.01)
 
 
 def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, peer):

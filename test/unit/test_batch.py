@@ -26,7 +26,7 @@ from hand_eye_calib.cli.batch import run as batch_run
 from hand_eye_calib.cli.batch import work as batch_work
 from hand_eye_calib.cli.batch.run import write_rows
 from hand_eye_calib.cli.batch.work import Outcome, Task, matching, outcomes, tasks_of, work
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.bags import write_bag
@@ -343,16 +343,6 @@ def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
 )
 def test_urls_are_shown_without_what_gives_access(url, shown):
     assert remote.public(url) == shown
-
-
-def test_a_store_out_of_reach_is_one_line():
-    pytest.importorskip("fsspec", reason="fsspec is not installed: '.[fleet]'")
-    with (
-        pytest.raises(InputError, match="cannot read memory://nowhere: ") as caught,
-        remote.local_copies(["memory://nowhere"]),
-    ):
-        pass
-    assert "\n" not in str(caught.value)
 
 
 # ---- what the recordings of a vehicle say together

@@ -13,7 +13,6 @@ from hand_eye_calib.results.status import AXES
 from reproduction.coverage import __main__ as study
 from reproduction.coverage import classes, motions
 from reproduction.coverage.bound import ideal_estimate
-from reproduction.coverage.measures import Row, pooled
 from reproduction.coverage.scores import misclosure, truth_cases
 from reproduction.coverage.sensor_errors import (
     GaussMarkov,
@@ -89,17 +88,6 @@ def test_recordings_of_a_class_repeat_and_differ():
     X, parent, child = recording.T_parent_child, recording.parent.poses, recording.child.poses
     A, B = (se3.inverse(poses[0]) @ poses[-1] for poses in (parent, child))
     np.testing.assert_allclose(A @ X, X @ B, atol=1e-6)
-
-
-def test_pooled_error_is_the_geometric_mean_over_the_classes():
-    draws = np.random.default_rng(0).chisquare(6, 12)
-    a, b = (
-        Row("simulated", name, "dnlo", {"bound": dict(zip("abcdefghijkl", values, strict=True))})
-        for name, values in (("a", 4.0 * draws), ("b", draws))
-    )
-    assert a.value("bound") == pytest.approx(2.0 * b.value("bound"))
-    together = pooled("simulated", "all", "dnlo", [a, b]).value("bound")
-    assert together == pytest.approx(np.sqrt(a.value("bound") * b.value("bound")))
 
 
 def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():

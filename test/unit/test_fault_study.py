@@ -20,12 +20,6 @@ def test_there_are_more_than_a_hundred_clean_recordings_of_more_than_ten_kinds()
     assert {case.method for case in cases} == {"auto"}
 
 
-def test_each_fault_has_three_drives_and_both_methods():
-    of_smoothing = [case for case in faults.cases(None) if case.fault == "S5"]
-    assert len(of_smoothing) == 3 * 3 * 2
-    assert len({case.key for case in faults.cases(None)}) == len(faults.cases(None))
-
-
 def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
     text = faults.report(
         [
@@ -45,13 +39,6 @@ def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
     assert "1 of them are more than 3 standard deviations off and called USE:\n- S5 0" in text
     assert "Wrong findings in 1 of 2 clean recordings" in text
     assert "| hand_mixture_30s | 1 | scale 1 |" in text
-
-
-def test_a_clean_recording_has_its_truth():
-    clean = clean_recordings.recording("hilly_noisy 50", None)
-    assert clean.T_parent_child.shape == (4, 4)
-    with pytest.raises(KeyError):
-        clean_recordings.recording("no such 50", None)
 
 
 @pytest.mark.parametrize("fault", LATER, ids=lambda fault: fault.code)

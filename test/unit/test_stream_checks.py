@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import re
 import tracemalloc
 
@@ -266,14 +265,6 @@ class TestCommand:
         out, err = capsys.readouterr()
         assert "calibrate with --method dnlo" in out
         assert err == ""
-
-    def test_json(self, files, capsys):
-        parent, child = drive()
-        assert main(["check", *files(parent, child.scaled(1000.0)), "--json"]) == 1
-        document = json.loads(capsys.readouterr().out)
-        assert document["findings"][0]["code"] == "units"
-        assert document["findings"][0]["options"] == {"scale": 0.001}
-        assert document["streams"]["child"]["poses"] == 500
 
 
 class TestSlowStreams:
