@@ -163,7 +163,7 @@ def foxglove(kind, k):
     return timed | parts[kind]
 
 
-def in_json(path, kind):
+def in_json(path, kind, changed=(b"", b"")):
     """An mcap file of the library's own writer, with the timestamps of Foxglove's JSON."""
     with path.open("wb") as file:
         writer = Writer(file)
@@ -171,7 +171,8 @@ def in_json(path, kind):
         schema = writer.register_schema(f"foxglove.{kind}", "jsonschema", b"{}")
         channel = writer.register_channel("/pose", "json", schema)
         for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
-            writer.add_message(channel, stamp_ns, json.dumps(foxglove(kind, k)).encode(), stamp_ns)
+            data = json.dumps(foxglove(kind, k)).encode().replace(*changed)
+            writer.add_message(channel, stamp_ns, data, stamp_ns)
         writer.finish()
 
 
@@ -207,6 +208,13 @@ def test_messages_of_foxglove(tmp_path, kind, write):
         np.testing.assert_allclose(found.poses[:, :3, 3], P - P[0], atol=1e-5)
     else:
         np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+
+
+def test_json_without_what_its_type_has_is_named(tmp_path):
+    path = tmp_path / "poses.mcap"
+    in_json(path, "FrameTransforms", (b"rotation", b"turn"))
+    with PoseBag(path) as bag, pytest.raises(InputError, match="/pose: .* not a readable foxglove"):
+        bag.trajectory(TfSource.parse("map:base"))
 
 
 def test_fields_of_a_place_are_positions(bag):

@@ -12,7 +12,6 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import chain
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -287,7 +286,12 @@ class Run(NamedTuple):
 
     def transforms(self) -> Iterator[PoseFields]:
         """The transforms of all messages, which are of one of TF_TYPES."""
-        return chain.from_iterable(map(transforms_in, self.decoded()))
+        for message in self.decoded():
+            try:
+                found = [*transforms_in(message)]
+            except (AttributeError, TypeError) as error:  # JSON may have anything
+                raise self.unreadable(error) from error
+            yield from found
 
     def unreadable(self, error: Exception) -> InputError:
         """What to raise for a message that is not of its type."""
