@@ -19,7 +19,6 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.assessment.lever_arm import (
     HIDDEN_SHARE,
     MIN_SHARE,
-    MIN_SHARE_WITH_TILT,
     ROUNDING_ANGLE,
     LeverArms,
     weighted_products,
@@ -36,9 +35,8 @@ from hand_eye_calib.stats import CHI2
 # (B, K) mask of the pairs to leave out to the answers (B, 4, 4) without them.
 SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 
-# Blocks of the jackknife.
-_BLOCKS = 10
-_MIN_BLOCKS, _MIN_PAIRS_PER_BLOCK = 4, 3
+# Blocks of the jackknife; fewest of them, and of the pairs in each.
+_BLOCKS, _FEWEST = 10, (4, 3)
 
 # An unseen direction with at least this length in its rotation is not one of translation alone.
 _SHARE_OF_ROTATION = 0.5
@@ -47,20 +45,17 @@ _SHARE_OF_ROTATION = 0.5
 # large machine. An unknown direction is never exactly an axis of the parent sensor, so that part of
 # its variance shows in the other axes; more than this would hide what is known of them. The
 # verdicts say what is unknown.
-UNKNOWN_TRANSLATION = 3.0
-UNKNOWN_ROTATION = np.pi
-UNKNOWN_SIGMAS = np.r_[np.full(3, UNKNOWN_TRANSLATION), np.full(3, UNKNOWN_ROTATION)]
+UNKNOWN_SIGMAS = np.repeat([3.0, np.pi], 3)
 
-# Smallest variance (m^2 or rad^2) to divide by.
-_ROUNDING_VARIANCE = 1e-24
+# Smallest variance (m^2 or rad^2) to divide by: noise-free data has none.
+ROUNDING_VARIANCE = 1e-24
 
 # Information below this share of the largest is rounding.
 _RANK_TOLERANCE = 1e-12
 
 # Standard deviations (m, rad) above which an axis is weak, and above which it is unobservable: so
 # little is known that nobody can use the value.
-WEAK_TRANSLATION, UNOBSERVABLE_TRANSLATION = 0.05, 0.3
-WEAK_ROTATION, UNOBSERVABLE_ROTATION = float(np.radians(1.0)), 0.3
+WEAK, UNOBSERVABLE = (0.05, float(np.radians(1.0))), 0.3
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,8 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         solution.jumps,
         solution.rotation_variance,
         # Rotations below the noise of single poses cannot be told from none.
-        MIN_SHARE if solution.is_drowned else MIN_SHARE_WITH_TILT,
+        # Otherwise they can, and the tilt of the axis is stated: half as much is enough.
+        MIN_SHARE if solution.is_drowned else MIN_SHARE / 2,
     )
     unseen = basis([*solution.unseen.T, *hidden])
     return combined(solution.T_parent_child, covariance, None, unseen)
@@ -158,7 +154,7 @@ def _widened(
     covariance: FloatArray, solution: AdaptiveSolution | LeverArmSolution, part: slice
 ) -> FloatArray:
     """The model's covariance of a part of xi, widened by blocks and halves."""
-    if len(solution.jumps) < _BLOCKS * _MIN_PAIRS_PER_BLOCK:
+    if len(solution.jumps) < _BLOCKS * _FEWEST[1]:
         return covariance
     steps = answers_without(solution.part_products, _BLOCKS)[:, part]
     spread = np.linalg.pinv(covariance, hermitian=True) @ _spread_of_blocks(steps)
@@ -215,8 +211,11 @@ def combined(
     """
     known, scaled = np.eye(6) - unknown @ unknown.T, UNKNOWN_SIGMAS[:, None] * unknown
     raised = model if resampled is None else _raised(model, resampled)
-    covariance = known @ raised @ known + scaled @ scaled.T
-    return Assessment(covariance, _verdicts(T_parent_child[:3, :3], covariance, unknown))
+    covariance, rotation = known @ raised @ known + scaled @ scaled.T, T_parent_child[:3, :3]
+    sigmas = sigmas_in_parent(rotation, covariance)
+    shares = ((np.kron(np.eye(2), rotation) @ unknown) ** 2).sum(axis=1)
+    sigmas = np.where(shares > HIDDEN_SHARE, np.inf, sigmas)
+    return Assessment(covariance, tuple(map(judged, AXES, sigmas.tolist())))
 
 
 def without_axes(
@@ -298,8 +297,8 @@ def jackknife_covariance(
     Tibshirani, *An introduction to the bootstrap*, 1993, eq. 11.5), with xi_b the tangent vector
     from the full answer.
     """
-    n_blocks = min(_BLOCKS, n_pairs // _MIN_PAIRS_PER_BLOCK)
-    if n_blocks < _MIN_BLOCKS:
+    n_blocks = min(_BLOCKS, n_pairs // _FEWEST[1])
+    if n_blocks < _FEWEST[0]:
         return None
     block_of_pair = np.arange(n_pairs) * n_blocks // n_pairs
     left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
@@ -341,22 +340,10 @@ def _raised(first: FloatArray, second: FloatArray) -> FloatArray:
     # In the coordinates where the first is the identity, the eigenvalues of the second are the
     # ratios.
     variances, axes = np.linalg.eigh(first)
-    root = axes * np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE))
+    root = axes * np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
     values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, second).T))
     raised = root @ vectors
     return (raised * np.maximum(values, 1.0)) @ raised.T
-
-
-def _verdicts(
-    rotation_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
-) -> tuple[DofObservability, ...]:
-    """Verdicts for the axes of the parent sensor's frame."""
-    sigmas = sigmas_in_parent(rotation_parent_child, covariance)
-    unknown_shares = ((np.kron(np.eye(2), rotation_parent_child) @ unknown) ** 2).sum(axis=1)
-    return tuple(
-        judged(name, float("inf") if share > HIDDEN_SHARE else sigma)
-        for name, sigma, share in zip(AXES, sigmas.tolist(), unknown_shares, strict=True)
-    )
 
 
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -367,12 +354,8 @@ def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) 
 
 def judged(axis: str, sigma: float) -> DofObservability:
     """Observed, weak or unobservable, by the standard deviation (m or rad)."""
-    weak, unobservable = (
-        (WEAK_ROTATION, UNOBSERVABLE_ROTATION)
-        if axis in ROTATIONS
-        else (WEAK_TRANSLATION, UNOBSERVABLE_TRANSLATION)
-    )
-    if sigma > unobservable:
+    if sigma > UNOBSERVABLE:
         return DofObservability(axis, DofVerdict.UNOBSERVABLE, float("inf"))
-    verdict = DofVerdict.WEAK if sigma > weak else DofVerdict.OBSERVED
+    is_weak = sigma > WEAK[axis in ROTATIONS]
+    verdict = DofVerdict.WEAK if is_weak else DofVerdict.OBSERVED
     return DofObservability(axis, verdict, sigma)

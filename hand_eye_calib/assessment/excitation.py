@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import WEAK_ROTATION, WEAK_TRANSLATION
+from hand_eye_calib.assessment.covariance import WEAK
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -28,15 +28,14 @@ _QUANTILE = 0.95
 MIN_ROTATION = float(np.radians(5.0))
 
 # A sensor moves if it does so faster than this over a second (m/s, rad/s).
-_MIN_SPEED, _MIN_RATE = 0.05, float(np.radians(1.0))
+_MOVES = 0.05, float(np.radians(1.0))
 _STEP_NS = 1_000_000_000
 
 # Wheels and tracks move a sensor along one axis of its own: at least this share of its squared
-# directions. Directions of the shorter steps, below this share of the median, are noise. (Road
-# vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to 0.85.)
+# directions; it is x from this cosine on. Directions of the shorter steps, below this share of the
+# median, are noise. (Road vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to
+# 0.85.)
 _ALONG_ONE_AXIS, _LONG_STEP = 0.9, 0.3
-# Cosine from which on that axis is x.
-_ALONG_X = 0.9
 # What turns a vehicle about its x, y and z.
 _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
 
@@ -76,7 +75,7 @@ class Excitation:
     def has_vehicle_axes(self) -> bool:
         """Whether x is along the motion and z is what it turns about, as REP 103 has it."""
         turns_about_z = self.rotation[2] >= max(self.rotation.max(), MIN_ROTATION)
-        return bool(self.drives and turns_about_z and abs(self.forward[0]) > _ALONG_X)
+        return bool(self.drives and turns_about_z and abs(self.forward[0]) > _ALONG_ONE_AXIS)
 
     def hidden_axes(self) -> tuple[str, ...]:
         """Axes x, y, z along which the motion cannot show the translation, whatever the noise."""
@@ -140,7 +139,7 @@ def seconds_of_motion(pose_pairs: PosePairs) -> float:
     poses = pose_pairs.Ts_pw_p[rows]
     speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / seconds
     rotations = np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
-    moves = (speeds > _MIN_SPEED) | (se3.rotation_angle(rotations) / seconds > _MIN_RATE)
+    moves = (speeds > _MOVES[0]) | (se3.rotation_angle(rotations) / seconds > _MOVES[1])
     return float(seconds[moves].sum())
 
 
@@ -173,7 +172,7 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     if not weak:
         return ""
     told = [f"{axes_in_words([dof.name])} (+/- {amount(dof.name, dof.sigma)})" for dof in weak]
-    limits = f"{length(WEAK_TRANSLATION)} or {angle(WEAK_ROTATION)}"
+    limits = f"{length(WEAK[0])} or {angle(WEAK[1])}"
     return (
         f"{listing(told)} still more uncertain than {limits}: continue; "
         f"{helpful_motion([dof.name for dof in weak], seen)}"

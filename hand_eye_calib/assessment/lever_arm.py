@@ -21,10 +21,6 @@ _MIN_SIGNAL_TO_NOISE = 3.0
 # rotation are common. They are systematic, so that the residuals do not show them.
 MIN_SHARE = 0.04
 
-# A noise model tells small rotations from its own errors, and the tilt of the axis is stated: half
-# as much is enough then (1.1 deg).
-MIN_SHARE_WITH_TILT = 0.02
-
 # Rotation errors are never taken to be smaller than this (rad): rounding, not motion.
 ROUNDING_ANGLE = 1e-6
 

@@ -52,20 +52,16 @@ SHIFT_M, SHIFT_RAD = 0.03, float(np.radians(1.0))
 # Scatter between recordings of one rig, per axis (m, rad): of flights and hand-held recordings, and
 # of vehicles. A vehicle turns about one axis, and knows the translation along it so many times
 # worse than along the others.
-_SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
-_SCATTER_OF_VEHICLE = np.repeat([0.020, np.radians(0.10)], 3)
+_SCATTERS = np.repeat([[0.008, np.radians(0.12)], [0.020, np.radians(0.10)]], 3, axis=1)
 _VEHICLE = 4.0
 
 # Standard deviations (m, rad) that stand for "nothing known", and from which on one does.
 UNKNOWN = np.sqrt(np.r_[np.full(3, 100.0), np.full(3, 10.0)])
 UNKNOWN_FROM = 0.1 * UNKNOWN
 
-# Log odds beyond these are certain.
-_CERTAIN = 50.0
-
-# Motions over this time (s) are compared, so many a second at most; what they show is added up over
-# seconds (ns).
-_LAG_S, _MOTIONS_PER_S, _BLOCK_NS = 1.0, 20.0, 1_000_000_000
+# Motions over this time (ns) are compared, so many of them in it at most, and what they show is
+# added up over it.
+_BLOCK_NS, _MOTIONS_PER_BLOCK = 1_000_000_000, 20
 
 _ROUNDS = 4
 _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
@@ -190,8 +186,9 @@ def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
     tells a vehicle from what is held in hand.
     """
     variances = np.linalg.eigvalsh(covariance[:3, :3])
+    in_hand, of_vehicle = _SCATTERS
     is_vehicle = variances[2] > _VEHICLE**2 * variances[1]
-    return np.diag((_SCATTER_OF_VEHICLE if is_vehicle else _SCATTER_IN_HAND) ** 2)
+    return np.diag((of_vehicle if is_vehicle else in_hand) ** 2)
 
 
 def shift_covariance(metres: float = SHIFT_M, radians: float = SHIFT_RAD) -> FloatArray:
@@ -326,15 +323,16 @@ def _by_second(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Starts (N,) of the seconds of a recording, H (N, 6, 6) and S (N, 6) of each."""
     stamps_ns = pose_pairs.stamps_ns
-    duration_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
-    lag_s = max(_LAG_S, median(np.diff(stamps_ns)) * 1e-9)
-    pairs = pairs_over(pose_pairs, lag_s, max(int(duration_s * _MOTIONS_PER_S), 2))
+    duration_ns = int(stamps_ns[-1] - stamps_ns[0])
+    lag_s = max(_BLOCK_NS, median(np.diff(stamps_ns))) * 1e-9
+    most = max(duration_ns * _MOTIONS_PER_BLOCK // _BLOCK_NS, 2)
+    pairs = pairs_over(pose_pairs, lag_s, most)
     residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
     covariance, weights = noise_covariance(residuals)
     whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(covariance) * weights[:, None, None]
     middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
     blocks = (middles_ns - stamps_ns[0]) // _BLOCK_NS
-    n_blocks = int((stamps_ns[-1] - stamps_ns[0]) // _BLOCK_NS) + 1
+    n_blocks = duration_ns // _BLOCK_NS + 1
     H, S = np.zeros((n_blocks, 6, 6)), np.zeros((n_blocks, 6))
     np.add.at(H, blocks, whitened @ jacobians)
     np.add.at(S, blocks, -np.einsum("kij,kj->ki", whitened, residuals))
@@ -421,4 +419,4 @@ def _probability(log_ratios: FloatArray) -> float:
     """Probability of a shift at one of several times, from its logarithmic likelihood ratios."""
     most = log_ratios.max()
     log_odds = most + np.log(np.exp(log_ratios - most).mean() * _MOVES / (1.0 - _MOVES))
-    return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_CERTAIN, _CERTAIN))))
+    return float(np.exp(-np.logaddexp(0.0, -log_odds)))

@@ -14,9 +14,8 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import (
-    UNKNOWN_ROTATION,
+    ROUNDING_VARIANCE,
     UNKNOWN_SIGMAS,
-    UNKNOWN_TRANSLATION,
     Assessment,
     judged,
     sigmas_in_parent,
@@ -32,18 +31,11 @@ Prior: TypeAlias = Mapping[str, tuple[float, float]]
 # unknown.
 _UNKNOWN_SHARE = 0.25
 
-# An axis is mostly from the prior if the prior at least halves its variance.
-_MOSTLY_PRIOR = 0.5
-
 _MAX_STEPS, _STEP_TOLERANCE = 20, 1e-12
-_DIFFERENCE = 1e-6
 
-# Smallest variance to divide by (m^2 or rad^2): noise-free data has none.
-_ROUNDING_VARIANCE = 1e-18
-
-# Smallest standard deviation of a prior (m or rad): nobody measures better, and smaller ones make
-# the equations singular.
-_MIN_SIGMA = 1e-6
+# Step of differences, and smallest standard deviation of a prior (m or rad): nobody measures
+# better, and smaller ones make the equations singular.
+_SMALL = 1e-6
 
 # A prior more than this many standard deviations from the estimate from motion contradicts it.
 _MAX_DISTANCE = 4.0
@@ -129,7 +121,8 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
     verdicts = [judged(axis, sigma) for axis, sigma in zip(AXES, sigmas, strict=True)]
     for k, (axis, sigma) in enumerate(zip(AXES, sigmas, strict=True)):
         is_known = verdicts[k].verdict is not DofVerdict.UNOBSERVABLE
-        if is_known and axis in prior and sigma**2 < _MOSTLY_PRIOR * before[k] ** 2:
+        # An axis is mostly from the prior if that at least halves its variance.
+        if is_known and axis in prior and 2 * sigma**2 < before[k] ** 2:
             verdicts[k] = DofObservability(axis, DofVerdict.PRIOR, sigma)
     return Fused(T, Assessment(posterior, tuple(verdicts)), contradictions)
 
@@ -169,9 +162,9 @@ def _whitened(
     known = vectors[:, values < 0.5]
     variances, axes = np.linalg.eigh(known.T @ covariance @ known)
     is_translation = (unknown[:3] ** 2).sum(axis=0) > 0.5
-    unknown_sigmas = np.where(is_translation, UNKNOWN_TRANSLATION, UNKNOWN_ROTATION)
+    unknown_sigmas = np.where(is_translation, UNKNOWN_SIGMAS[0], UNKNOWN_SIGMAS[-1])
     directions = np.concatenate([known @ axes, unknown], axis=1)
-    sigmas = np.concatenate([np.sqrt(np.maximum(variances, _ROUNDING_VARIANCE)), unknown_sigmas])
+    sigmas = np.concatenate([np.sqrt(np.maximum(variances, ROUNDING_VARIANCE)), unknown_sigmas])
     in_child = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
     targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
     targets = np.concatenate([np.zeros(len(variances)), targets])
@@ -189,20 +182,15 @@ def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
 def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """Weighted residuals (P,) of the prior and their derivatives (P, 6) by (rho, phi)."""
     residuals, jacobian = _weighted(T, prior), np.zeros((len(prior), 6))
-    for column, step in enumerate(_DIFFERENCE * np.eye(6)):
+    for column, step in enumerate(_SMALL * np.eye(6)):
         for sign in (-1, 1):
             weighted = _weighted(_moved(T, sign * step), prior)
-            jacobian[:, column] += sign * weighted / (2 * _DIFFERENCE)
+            jacobian[:, column] += sign * weighted / (2 * _SMALL)
     return residuals, jacobian
 
 
 def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
-    errors = _errors(T, prior)
-    return np.array([errors[axis] / max(sigma, _MIN_SIGMA) for axis, (_, sigma) in prior.items()])
-
-
-def _errors(T: FloatArray, prior: Prior) -> dict[str, float]:
-    """Axis name to the value of the transform less that of the prior."""
+    """Values (P,) of the transform less those of the prior, in its standard deviations."""
     errors = {
         axis: value - prior[axis][0]
         for axis, value in zip(TRANSLATIONS, T[:3, 3], strict=True)
@@ -211,13 +199,13 @@ def _errors(T: FloatArray, prior: Prior) -> dict[str, float]:
     angles = {axis: prior[axis][0] for axis in ROTATIONS if axis in prior}
     if len(angles) == 3:  # a whole rotation: no angle is singular
         nominal = se3.rotation_from_rpy(list(angles.values()))
-        return errors | dict(zip(ROTATIONS, se3.rotation_log(T[:3, :3] @ nominal.T), strict=True))
-    if angles:
+        errors |= dict(zip(ROTATIONS, se3.rotation_log(T[:3, :3] @ nominal.T), strict=True))
+    elif angles:
         found = dict(zip(ROTATIONS, se3.rotation_to_rpy(T[:3, :3]), strict=True))
         errors |= {
             axis: np.angle(np.exp(1j * (found[axis] - value))) for axis, value in angles.items()
         }
-    return errors
+    return np.array([errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()])
 
 
 def _contradictions(

@@ -3,13 +3,13 @@ little of the motion unexplained and yet spoil the extrinsic.
 """
 
 from collections.abc import Iterator
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
-from hand_eye_calib.checks.findings import Finding, Severity, finding
+from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
 from hand_eye_calib.checks.response import Fitted, Regression, delays, response
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -27,26 +27,17 @@ _Suspect: TypeAlias = tuple[float, Finding | None]
 
 _STREAMS = ("child", "parent")
 
-# Significance that a fault of the response needs, in standard deviations: a delay, which is most of
-# a lever arm at constant speed, needs less; smoothing, whose sigma does not contain noise of the
-# columns, needs more. How many times it must exceed what noise may make of it.
-_SIGMAS, _LATE_SIGMAS, _SMOOTHING_SIGMAS, _BIASES = 6.0, 5.0, 8.0, 2.0
+# How many times a fault of the response must exceed what noise of its columns may make of it.
+_BIASES = 2.0
 
-# Two frames are one if they are this close (m, rad), within their standard deviations. That of the
-# rotation must not be larger than this.
-_SAME_M, _SAME_RAD = 0.005, float(np.radians(0.3))
-_MAX_SIGMA_RAD, _WITHIN = float(np.radians(0.5)), 3.0
+# Two frames are one if they are this close (m, rad), within so many standard deviations; that of
+# the rotation must not be larger than the third.
+_SAME_M, _SAME_RAD, _MAX_SIGMA_RAD = 0.005, float(np.radians(0.3)), float(np.radians(0.5))
+_WITHIN = 3.0
 
-# Upper bounds of the lever arm (m; so many standard deviations above its length). Hardly two
-# sensors fit closer than the second; of other orientations, none are closer than the first.
-_SAME_POSITION_M, _NEARLY_M, _UPPER = 0.002, 0.012, 2.0
-
-# Where a warning and an error begin: gains of rotations and of coordinates, less 1; worlds that are
-# turned (rad); shifts of positions by a delay or smoothing (m); of the mount (m, rad).
-_GAINS, _AXIS_GAINS = (0.003, 0.03), (0.015, 0.05)
-_TURNED = (float(np.radians(0.5)), float(np.radians(1.5)))
-_SHIFTS_M = (0.008, 0.05)
-_MOVED_M, _MOVED_RAD = (0.005, 0.02), (float(np.radians(0.2)), float(np.radians(1.0)))
+# Upper bounds of the lever arm (m; two standard deviations above its length). Hardly two sensors
+# fit closer than the second; of other orientations, none are closer than the first.
+_SAME_POSITION_M, _NEARLY_M = 0.002, 0.012
 
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
@@ -65,24 +56,20 @@ _SHORT_S, _MOST_SHORT = 0.5, 6000
 _DELAY_S = 0.003
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
 
-# A world moves if it does so at this share of the sensor's speed: its direction is then off by half
-# the usual target of a rotation.
-_MOVING = 0.003
-
 # Orientations are copies if they agree to this angle, several times better than any two sensors of
 # the recordings at hand, and so many times better than each stream is rough: slow motion is smooth,
 # and a slow stream of fast motion is rough without noise. Noise of both streams that is the same
 # shows a copy as well: roughness grows with each further difference as that of white noise does
 # (by 1.9), and what remains is so many times smaller.
-_AGREE_RAD, _BELOW_ROUGHNESS = float(np.radians(0.008)), 50.0
-_AGREE_NOISE_RAD, _WHITE, _BELOW_NOISE = float(np.radians(0.02)), 1.6, 15.0
+_AGREE, _AGREE_IN_NOISE = (np.radians(0.008), 50.0), (np.radians(0.02), 15.0)
+_WHITE = 1.6
 
 # This share of the poses must agree: the rest may be jumps.
 _SHARE = 0.9
 
 # Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
-# compared: this share of them, at least and at most so many.
-_NEAREST, _FEWEST_NEAR, _MOST_NEAR = 0.01, 40, 1000
+# compared: a hundredth of them, at least and at most so many.
+_NEAREST = (40, 1000)
 
 
 def check_agreement(
@@ -142,47 +129,44 @@ def _likeliest(suspects: list[_Suspect]) -> list[Finding]:
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     """Finding about an extrinsic, or a translation, of zero."""
     distance_m, sigma_m = float(np.linalg.norm(T_parent_child[:3, 3])), float(sigmas[:3].max())
-    upper_m = distance_m + _UPPER * sigma_m
+    upper_m = distance_m + 2 * sigma_m
     if upper_m > _NEARLY_M or sigmas[3:].max() > _MAX_SIGMA_RAD:
         return []
     angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
     if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
-        size = f"{length(distance_m)} and {angle(angle_rad)}"
+        key, size = "same_frame", f"{length(distance_m)} and {angle(angle_rad)}"
         is_same = distance_m < max(_SAME_M, _WITHIN * sigma_m)
-        return [_found("same_frame", "both", is_same, size=size, translation_m=distance_m)]
-    size = f"{length(distance_m)} +/- {length(sigma_m)}"
-    is_same = upper_m < _SAME_POSITION_M
-    return [_found("same_position", "both", is_same, size=size, translation_m=distance_m)]
-
-
-def _found(key: str, stream: str, is_error: bool | np.bool_, **values: Any) -> Finding:
-    return finding(key, stream, Severity.ERROR if is_error else Severity.WARNING, **values)
+    else:
+        key, size = "same_position", f"{length(distance_m)} +/- {length(sigma_m)}"
+        is_same = upper_m < _SAME_POSITION_M
+    severity = Severity.ERROR if is_same else Severity.WARNING
+    return [finding(key, "both", severity, size=size, translation_m=distance_m)]
 
 
 def _rotation_gain(fitted: Fitted, axes: FloatArray) -> _Suspect:
     """A gain of the child's rotations about an axis."""
-    sizes, powers = np.abs(fitted.values), 1.0 / fitted.biases
-    limits = np.maximum(_SIGMAS * fitted.sigmas, _BIASES * fitted.biases)
-    ratios = sizes / np.maximum(_GAINS[0], limits)
+    sigmas, least, *_ = LIMITS["rotation_gain"]
+    limits = np.maximum(sigmas * fitted.sigmas, _BIASES * fitted.biases)
+    powers = 1.0 / fitted.biases
+    ratios = np.abs(fitted.values) / np.maximum(limits, least)
     ratios = np.where(powers > _LITTLE**2 * powers[0], ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
         return fitted.share, None
-    axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
-    values = {"axis": axis, "gain": 1.0 + fitted.values[k], "sigma": fitted.sigmas[k]}
-    return fitted.share, _found("rotation_gain", "child", sizes[k] > _GAINS[1], **values)
+    axis, gain = ", ".join(f"{component:.2f}" for component in axes[:, k]), fitted.values[k]
+    values = {"axis": axis, "gain": 1.0 + gain, "sigma": fitted.sigmas[k]}
+    return fitted.share, graded("rotation_gain", "child", gain, **values)
 
 
 def _turned(slow: Regression, stream: str) -> _Suspect:
     """Positions of a stream that are turned against its orientations."""
     fitted = slow.fit(f"turned_{stream}")
-    significance = np.abs(fitted.values) / np.maximum(fitted.sigmas, 1e-12)
-    if significance.max() < _SIGMAS or np.abs(fitted.values).max() < _TURNED[0]:
+    sizes, (sigmas, least, *_) = np.abs(fitted.values), LIMITS["worlds_turned"]
+    if (sizes < sigmas * fitted.sigmas).all() or sizes.max() < least:
         return fitted.share, None
-    turned_rad = float(np.linalg.norm(fitted.values))
-    axis = "xyz"[int(np.argmax(np.abs(fitted.values)))]
-    values = {"axis": axis, "turned_deg": float(np.degrees(turned_rad))}
-    return fitted.share, _found("worlds_turned", stream, turned_rad > _TURNED[1], **values)
+    turned_rad = float(np.linalg.norm(sizes))
+    values = {"axis": "xyz"[int(np.argmax(sizes))], "turned_deg": float(np.degrees(turned_rad))}
+    return fitted.share, graded("worlds_turned", stream, turned_rad, **values)
 
 
 def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
@@ -205,11 +189,11 @@ def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     """A coordinate of a stream that has another scale than the others."""
     fitted = slow.fit(f"axes_{stream}", without="scale")
     k, off, sigma = _odd_one(fitted)
-    if abs(off) < max(_AXIS_GAINS[0], _SIGMAS * sigma, _BIASES * fitted.biases[k]):
+    if abs(off) < _BIASES * fitted.biases[k]:
         return fitted.share, None
+    size = off if fitted.share > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
     values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-    is_error = abs(off) > _AXIS_GAINS[1] and fitted.share > _SOME
-    return fitted.share, _found("axis_scale", stream, is_error, **values)
+    return fitted.share, graded("axis_scale", stream, size, sigma, **values)
 
 
 def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspect:
@@ -217,13 +201,14 @@ def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspe
     share, sigmas = slow.fit("moved").share, np.sqrt(np.diag(change.covariance))
     known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
-    if change.log_ratio < SIGNIFICANT or (moved_m < _MOVED_M[0] and moved_rad < _MOVED_RAD[0]):
+    if change.log_ratio < SIGNIFICANT:
         return share, None
-    is_large = moved_m > _MOVED_M[1] or moved_rad > _MOVED_RAD[1]
-    size = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
-    values = {"size": size, "at_s": (change.at_ns - start_ns) * 1e-9}
-    is_error = is_large and change.log_ratio > 2.0 * SIGNIFICANT
-    return share, _found("mount_moved", "both", is_error, **values)
+    size = max(moved_m, moved_rad)
+    if change.log_ratio < 2.0 * SIGNIFICANT:
+        size = min(size, LIMITS["mount_moved"][-1])
+    told = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
+    values = {"size": told, "at_s": (change.at_ns - start_ns) * 1e-9}
+    return share, graded("mount_moved", "both", size, **values)
 
 
 def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Finding | None:
@@ -232,11 +217,11 @@ def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Fi
     turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(_rms(speeds), 1e-9)
-    if (np.abs(drift.values) < _SIGMAS * drift.sigmas).all() or share < _MOVING:
+    if (np.abs(drift.values) < LIMITS["world_drift"][0] * drift.sigmas).all():
         return None
     speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
     values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
-    return _found("world_drift", "both", False, percent=100 * share, **values)
+    return graded("world_drift", "both", share, **values, percent=100 * share)
 
 
 def _delays(fast: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
@@ -248,24 +233,19 @@ def _delays(fast: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
         k, off_s, off_sigma_s = _odd_one(by_axis)
         delay_s, along = float(whole.values[0]), speeds[:, columns + k]
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
-        for fitted, late_s, sigma_s, speed, code, names in (
-            (whole, abs(delay_s), float(whole.sigmas[0]), _rms(speeds), "position_clock", parts),
+        of_axis = (f"{'xyz'[k]} coordinates", "others")
+        speed = float(np.sqrt(np.mean(along**2)))
+        for fitted, late_s, sigma_s, speed_m_s, code, names in (
+            (whole, abs(delay_s), whole.sigmas[0], _rms(speeds), "position_clock", parts),
             # The other stream's coordinate cannot be early.
-            (
-                by_axis,
-                off_s,
-                off_sigma_s,
-                float(np.sqrt(np.mean(along**2))),
-                "axis_lag",
-                (f"{'xyz'[k]} coordinates", "others"),
-            ),
+            (by_axis, off_s, off_sigma_s, speed, "axis_lag", of_axis),
         ):
-            shift_m = late_s * speed
-            if late_s > max(_DELAY_S, _LATE_SIGMAS * sigma_s) and shift_m > _SHIFTS_M[0]:
+            shift_m = late_s * speed_m_s
+            if late_s > _DELAY_S:
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
                 told = {"part": names[0], "others": names[1]}
-                is_error = shift_m > _SHIFTS_M[1]
-                yield fitted.share, _found("late", stream, is_error, **values, **told)
+                sigma_m = sigma_s * speed_m_s
+                yield fitted.share, graded("late", stream, shift_m, sigma_m, **values, **told)
 
 
 def _smoothing(fast: Regression, more_s2: float, speeds: FloatArray) -> Iterator[_Suspect]:
@@ -273,14 +253,12 @@ def _smoothing(fast: Regression, more_s2: float, speeds: FloatArray) -> Iterator
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
             fitted = fast.fit(f"{part}_{stream}")
-            value, sigma = float(fitted.values[0]), float(fitted.sigmas[0])
-            smoothing_s = float(np.sqrt(max(value, 0.0)))
-            shift_m = smoothing_s * _rms(speeds)
-            least = max(least_s2 + more_s2, _SMOOTHING_SIGMAS * sigma)
-            if value >= least and shift_m > _SHIFTS_M[0]:
+            value_s2, sigma_s2 = float(fitted.values[0]), float(fitted.sigmas[0])
+            if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
+                smoothing_s = float(np.sqrt(value_s2))
+                shift_m = smoothing_s * _rms(speeds)
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": shift_m}
-                is_error = shift_m > _SHIFTS_M[1]
-                yield fitted.share, _found("smoothed", stream, is_error, **values)
+                yield fitted.share, graded("smoothed", stream, shift_m, **values)
 
 
 def _speeds(pose_pairs: PosePairs) -> FloatArray:
@@ -315,9 +293,8 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
         The child on the parent's clock.
     """
     (rough_p, white_p), (rough_c, white_c) = map(_roughness, (parent, child))
-    limit_rad = min(_AGREE_RAD, min(rough_p, rough_c) / _BELOW_ROUGHNESS)
-    if min(white_p, white_c) > _WHITE:
-        limit_rad = max(limit_rad, min(_AGREE_NOISE_RAD, min(rough_p, rough_c) / _BELOW_NOISE))
+    kinds = [_AGREE, _AGREE_IN_NOISE] if min(white_p, white_c) > _WHITE else [_AGREE]
+    limit_rad = max(min(angle_rad, min(rough_p, rough_c) / below) for angle_rad, below in kinds)
     # Programs interpolate at the stamps of the new stream.
     for slow, fast in ((child, parent), (parent, child), (aligned, parent), (parent, aligned)):
         residual_rad = _disagreement(slow, fast)
@@ -344,9 +321,9 @@ def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
         return np.inf
     after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[indices]), 1, len(fast) - 1)
     around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[indices]).min(axis=0)
-    n_nearest = min(max(_FEWEST_NEAR, round(_NEAREST * len(indices))), len(indices))
+    n_nearest = min(max(_NEAREST[0], len(indices) // 100), len(indices))
     indices = indices[around <= np.partition(around, n_nearest - 1)[n_nearest - 1]]
-    indices = indices[:: -(-len(indices) // _MOST_NEAR)]
+    indices = indices[:: -(-len(indices) // _NEAREST[1])]
     between = fast.at(slow.stamps_ns[indices], straight=True)
     start = np.arange(len(indices) - 1)
     pairs = pairs_between(between, slow.poses[indices], start, start + 1)

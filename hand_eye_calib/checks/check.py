@@ -32,7 +32,7 @@ from hand_eye_calib.checks.agreement import (
     check_independent,
     check_same,
 )
-from hand_eye_calib.checks.findings import Finding, Severity, finding, gravest_first
+from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.checks.hypotheses import (
     LAGS_S,
     MAX_PAIRS,
@@ -56,11 +56,6 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.text import axes_in_words
-
-# Time offsets (s) from which on an error, a warning, a note is given; each also needs this many
-# standard deviations. Differences of lengths from which on an error is given.
-_OFFSET_ERROR_S, _OFFSET_WARNING_S, _OFFSET_NOTE_S, _OFFSET_SIGMAS = 0.1, 0.01, 0.005, 5.0
-_SCALE_ERROR = 0.03
 
 # Of the interval of slow streams: accuracy of the coarse offset between them, and the gap that they
 # are interpolated across if their clocks differ by more.
@@ -202,7 +197,7 @@ def _offset(streams: StreamPair, explanation: Explanation, correlation: Correlat
         return TimeOffset(correlation.offset_s, streams.interval_s, correlation)
     right = explanation.hypothesis.undo(streams)
     parts = right.parent, right.child, correlation, streams.max_gap_s, explanation.fit
-    return refine_time_offset(*parts, least_s=_OFFSET_NOTE_S)
+    return refine_time_offset(*parts, least_s=LIMITS["time_offset"][1])
 
 
 def _check_sizes(
@@ -276,37 +271,29 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
 
 def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     """A finding if the clocks differ by more than ``known_s``, which the child's stamps have."""
-    if abs(found.seconds) < max(_OFFSET_NOTE_S, _OFFSET_SIGMAS * found.sigma_s):
-        return []
-    severity = Severity.NOTE
-    if abs(found.seconds) > _OFFSET_WARNING_S:
-        severity = Severity.ERROR if abs(found.seconds) > _OFFSET_ERROR_S else Severity.WARNING
     total_s = round(known_s + found.seconds, 4)
-    return [
-        finding(
-            "time_offset",
-            "child",
-            severity,
-            options={"time_offset": total_s},
-            total_s=total_s,
-            offset_s=found.seconds,
-            size_s=abs(found.seconds),
-            sigma_s=found.sigma_s,
-            direction="behind" if found.seconds > 0 else "ahead of",
-            beyond=f" beyond the {known_s:.4f} s that were added" if known_s else "",
-        )
-    ]
+    values: dict[str, Any] = {
+        "options": {"time_offset": total_s},
+        "total_s": total_s,
+        "offset_s": found.seconds,
+        "size_s": abs(found.seconds),
+        "sigma_s": found.sigma_s,
+        "direction": "behind" if found.seconds > 0 else "ahead of",
+        "beyond": f" beyond the {known_s:.4f} s that were added" if known_s else "",
+    }
+    offset = graded("time_offset", "child", found.seconds, found.sigma_s, **values)
+    return [offset] if offset else []
 
 
 def _check_scale(fit: SimilarityFit, known: float) -> list[Finding]:
     if not scale_differs(fit):
         return []
     scale, sigma = fit.scale, fit.scale_sigma
-    if found := in_other_units(scale, sigma, known):
-        return [found]
-    severity = Severity.ERROR if abs(scale - 1.0) > _SCALE_ERROR else Severity.WARNING
     options = {"scale": round(known * scale, 4)}
-    return [finding("scale", "child", severity, options=options, scale=scale, sigma=sigma)]
+    found = in_other_units(scale, sigma, known) or graded(
+        "scale", "child", scale - 1.0, options=options, scale=scale, sigma=sigma
+    )
+    return [found] if found else []
 
 
 def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:

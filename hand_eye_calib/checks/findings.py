@@ -5,11 +5,13 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
+import numpy as np
+
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.results.records import Finding, Severity, gravest_first
 
-__all__ = ["Finding", "Severity", "answered", "finding", "gravest_first"]
+__all__ = ["Finding", "Severity", "answered", "finding", "graded", "gravest_first"]
 
 _NOTE, _WARNING = Severity.NOTE, Severity.WARNING
 
@@ -228,6 +230,43 @@ _ROWS = {
         "a mount that came loose or was knocked, or an estimator that started anew",
     ),
 }
+
+
+_NEVER = float("inf")
+
+# How many standard deviations a fault must exceed, and from which size on it is a note, a warning
+# and an error: at least half of what spoils an extrinsic by 1 cm or 0.5 deg.
+LIMITS = {
+    "time_offset": (5.0, 0.005, 0.01, 0.1),  # s
+    "scale": (0.0, 0.01, 0.01, 0.03),  # of the factor, less 1; similarity.scale_differs knows more
+    "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
+    "frozen": (0.0, 0.02, 0.02, 0.02),  # share of the time
+    "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m
+    "inverse_both": (0.0, 0.3, 0.3, 1.0),  # logarithm of lengths
+    # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
+    # smoothing does not contain noise of the columns. Both by the shift of positions, m.
+    "late": (5.0, 0.008, 0.008, 0.05),
+    "smoothed": (8.0, 0.008, 0.008, 0.05),
+    "rotation_gain": (6.0, 0.003, 0.003, 0.03),  # of the factor, less 1
+    "axis_scale": (6.0, 0.015, 0.015, 0.05),  # of the factor, less 1
+    "worlds_turned": (6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),  # rad
+    # Share of the speed: the direction is then off by half the usual target of a rotation.
+    "world_drift": (6.0, 0.003, 0.003, _NEVER),
+    "mount_moved": (0.0, 0.005, 0.005, 0.02),  # m, of a place up to 1 m from the sensor
+}
+
+
+def graded(
+    key: str, stream: str, size: float, sigma: float = 0.0, /, **values: Any
+) -> Finding | None:
+    """The finding of a row, as grave as its size; None for a size that does not matter, or within
+    its noise.
+    """
+    sigmas, *begin = LIMITS[key]
+    if not abs(size) >= max(begin[0], sigmas * sigma):
+        return None
+    severity = [_NOTE, _WARNING, Severity.ERROR][sum(abs(size) > limit for limit in begin[1:])]
+    return finding(key, stream, severity, **values)
 
 
 def finding(

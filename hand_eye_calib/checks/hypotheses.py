@@ -22,8 +22,8 @@ import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.checks.findings import Finding, Severity, conventions, finding
-from hand_eye_calib.checks.streams import coarse
+from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, conventions, finding
+from hand_eye_calib.checks.streams import PATH_STEP_S, coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -51,11 +51,9 @@ _NOISY = 0.3
 # the parent's. A scale farther from 1 than this (logarithm) makes one less simple.
 _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 
-# Evidence (in logarithms of lengths) from which on streams are called inverted, and likely so.
-# Paths are over steps so coarse (s) that noise does not add to them. Frames this close (m, rad) may
-# be one: of one world for both streams, the lever arm between the worlds says nothing.
-_INVERTED, _LIKELY_INVERTED = 0.3, 1.0
-_PATH_STEP_S, _SAME_FRAME = 0.3, 0.01
+# Frames this close (m, rad) may be one: of one world for both streams, the lever arm between the
+# worlds says nothing.
+_SAME_FRAME = 0.01
 
 # An arm about its base, or a camera around its target, moves less than the base or target seen from
 # it. Sensors that stay within this distance (m), an arm's reach, may be such; stops too.
@@ -351,18 +349,19 @@ def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
         found = finding(code, stream, options=options, detail=detail)
         return replace(explanation, findings=(found,))
     evidence, inverted = _evidence_for_inverse(streams, explanation)
+    likely, clear = LIMITS["inverse_both"][-2:]
     if code:
         fit = explanation.fit
-        if evidence >= _INVERTED:
+        if evidence >= likely:
             stream, fit = ("parent" if stream == "child" else "child"), inverted
         # An option mends only what is clear.
-        options = conventions(code, stream) if abs(evidence) > _INVERTED else {}
+        options = conventions(code, stream) if abs(evidence) > likely else {}
         found = finding(code, stream, options=options)
         hypothesis = Hypothesis(code, stream, _INVERTED_POSES)
         return replace(explanation, hypothesis=hypothesis, fit=fit, findings=(found,))
-    if evidence < _INVERTED:
+    if evidence < likely:
         return explanation
-    if evidence <= _LIKELY_INVERTED or _may_be_an_arm(streams):
+    if evidence <= clear or _may_be_an_arm(streams):
         found = finding("inverse_both", "both", Severity.WARNING)
         return replace(explanation, findings=(found,))
     found = finding("inverse_both", options=conventions("inverse", "both"))
@@ -388,7 +387,7 @@ def _evidence_for_inverse(
     streams, fit = explanation.hypothesis.undo(streams), explanation.fit
     evidence = 0.0
     for stream in (streams.parent, streams.child):
-        poses = coarse(stream, _PATH_STEP_S).poses
+        poses = coarse(stream, PATH_STEP_S).poses
         evidence += float(np.log(_path_m(poses) / _path_m(se3.inverse(poses))))
     pairs, Ts_c_cw = streams.synchronised, se3.inverse(streams.synchronised.Ts_cw_c)
     Ts_c_cw[:, :3, 3] *= fit.scale

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.pairing.synchronise import PosePairs
@@ -129,8 +129,8 @@ class _Stream:
 
     def __init__(self, poses: FloatArray, pairs: MotionPairs, turned: FloatArray) -> None:
         self._poses, self._turned = poses, turned
-        self._rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
-        start, middle, end = (poses[rows] for rows in self._rows)
+        self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
+        start, middle, end = (poses[rows] for rows in self.rows)
         self.from_world = turned @ np.swapaxes(middle[:, :3, :3], 1, 2)
         self.ends = self.from_world @ start[:, :3, :3], self.from_world @ end[:, :3, :3]
         self.chords = self.ends[1] - self.ends[0]
@@ -140,49 +140,28 @@ class _Stream:
 
     def back(self, vectors: FloatArray) -> FloatArray:
         """Vectors (N, 3) of the poses at the start less those at the end, in axes of the start."""
-        start, _, end = (vectors[rows] for rows in self._rows)
+        start, _, end = (vectors[rows] for rows in self.rows)
         return start - _times(self.rotations, end)
 
-    def differences(self, step: int, h: float) -> "_Differences":
-        """The differences over steps of ``h`` seconds."""
-        p, rotations = self._poses[:, :3, 3], self._poses[:, :3, :3]
-
-        def at(rows: FloatArray, k: int) -> FloatArray:
-            return np.asarray(rows[np.clip(np.arange(len(rows)) + k * step, 0, len(rows) - 1)])
-
-        def turned(k: int, m: int) -> FloatArray:
-            steps = np.swapaxes(at(rotations, k), 1, 2) @ at(rotations, m)
-            return se3.rotation_log(steps) @ self._turned.T
-
-        start, middle, end = self._rows
-        velocity = (at(p, 1) - at(p, -1)) / (2 * h)
-        acceleration = (at(p, 2) - at(p, 1) - at(p, -1) + at(p, -2)) / (3 * h**2)
-        rate, bend = turned(-1, 1) / (2 * h), (turned(1, 2) - turned(-2, -1)) / (3 * h**2)
-        return _Differences(
-            faster=velocity[end] - velocity[start],
-            bent=_times(self.from_world, acceleration[end] - acceleration[start]),
-            rate_back=self.back(rate),
-            rate=rate[middle],
-            bend_back=self.back(bend),
-            bend=bend[middle],
-            bends=(bend[start], bend[end]),
+    def derivatives(self, step: int, h: float) -> tuple[FloatArray, ...]:
+        """Velocity and acceleration (N, 3) of all poses in their world, angular velocity and
+        acceleration in the parent's axes, by differences over steps of ``h`` seconds.
+        """
+        p, n = self._poses[:, :3, 3], len(self._poses)
+        rows = {k: np.clip(np.arange(n) + k * step, 0, n - 1) for k in (-2, -1, 1, 2)}
+        turned = [
+            se3.rotation_log(
+                np.swapaxes(self._poses[rows[k], :3, :3], 1, 2) @ self._poses[rows[m], :3, :3]
+            )
+            @ self._turned.T
+            for k, m in ((-1, 1), (-2, -1), (1, 2))
+        ]
+        return (
+            (p[rows[1]] - p[rows[-1]]) / (2 * h),
+            (p[rows[2]] - p[rows[1]] - p[rows[-1]] + p[rows[-2]]) / (3 * h**2),
+            turned[0] / (2 * h),
+            (turned[2] - turned[1]) / (3 * h**2),
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Differences:
-    """Changes (K, 3) of velocity in the world, and of acceleration; angular velocities and
-    accelerations at the start less those at the end, and half-way; the latter at both ends: in the
-    parent's axes.
-    """
-
-    faster: FloatArray
-    bent: FloatArray
-    rate_back: FloatArray
-    rate: FloatArray
-    bend_back: FloatArray
-    bend: FloatArray
-    bends: tuple[FloatArray, FloatArray]
 
 
 def response(
@@ -246,51 +225,42 @@ def delays(
     ``positions_child``, ``positions_parent``, ``orientations_child``, ``orientations_parent``:
     smoothed (s^2).
     """
-    interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
+    stamps_ns = pose_pairs.stamps_ns
+    interval_s = median(np.diff(stamps_ns)) * 1e-9
     step = max(round(_STEP_S / interval_s), 1)
     h = step * interval_s
-    follow = _follow(pose_pairs.stamps_ns, step, h)
-    motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
-    if len(motions) < _MIN_MOTIONS * _BLOCKS:
-        return None
-    t = np.broadcast_to(T_parent_child[:3, 3], (len(motions), 3))
-    parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
-    child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
-    of_p, of_c = (each.differences(step, h) for each in (parent, child))
-    late = -_times(child.from_world, of_c.faster)
-    arms = [_times(R, se3.cross(v, t)) for R, v in zip(parent.ends, of_p.bends, strict=True)]
-    none = np.zeros_like(late)
-    groups = {
-        "late": (late + se3.cross(of_c.rate, child.moved), of_c.rate_back),
-        "late_child": (late, none),
-        "late_parent": (_times(parent.from_world, of_p.faster), none),
-        "positions_child": (of_c.bent, none),
-        "positions_parent": (-of_p.bent, none),
-        "orientations_child": (-se3.cross(of_c.bend, child.moved), -of_c.bend_back),
-        "orientations_parent": (
-            se3.cross(of_p.bend, parent.moved) + arms[0] - arms[1],
-            of_p.bend_back,
-        ),
-    }
-    tables = {name: (t[:, :, None], r[:, :, None]) for name, (t, r) in groups.items()}
-    of_axes = (
-        -child.from_world * of_c.faster[:, None, :],
-        parent.from_world * of_p.faster[:, None, :],
-    )
-    for name, each in zip(("child", "parent"), of_axes, strict=True):
-        tables[f"late_axes_{name}"] = each, np.zeros_like(each)
-    return _regression(parent, child, T_parent_child, tables, ("late",))
-
-
-def _follow(stamps_ns: IntArray, step: int, h: float) -> BoolArray:
-    """Which poses (N,) have others at one and two steps on both sides."""
     follow = np.zeros(len(stamps_ns), dtype=bool)
     inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
     follow[inner] = True
     for k in (-2, -1, 1, 2):
         elapsed_s = (stamps_ns[inner + k * step] - stamps_ns[inner]) * 1e-9
         follow[inner] &= np.abs(elapsed_s - k * h) < _TOLERANCE * h
-    return follow
+    motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
+    if len(motions) < _MIN_MOTIONS * _BLOCKS:
+        return None
+    parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
+    child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
+    none, groups = np.zeros_like(child.chords), {}
+    for name, sign, stream in (("child", -1.0, child), ("parent", 1.0, parent)):
+        velocity, acceleration, rate, bend = stream.derivatives(step, h)
+        start, middle, end = stream.rows
+        faster = sign * (velocity[end] - velocity[start])
+        bent = sign * (acceleration[start] - acceleration[end])
+        by_axis = stream.from_world * faster[:, None, :]
+        late, positions = _times(stream.from_world, faster), _times(stream.from_world, bent)
+        orientations = sign * se3.cross(bend[middle], stream.moved)
+        if name == "child":
+            whole = late + se3.cross(rate[middle], stream.moved), stream.back(rate)
+            groups["late"] = whole[0][:, :, None], whole[1][:, :, None]
+        else:
+            arms = [se3.cross(bend[rows], T_parent_child[:3, 3]) for rows in (start, end)]
+            orientations += _times(stream.ends[0], arms[0]) - _times(stream.ends[1], arms[1])
+        of_rotation = (sign * stream.back(bend))[:, :, None]
+        groups[f"late_{name}"] = late[:, :, None], none[:, :, :1]
+        groups[f"late_axes_{name}"] = by_axis, none
+        groups[f"positions_{name}"] = positions[:, :, None], none[:, :, :1]
+        groups[f"orientations_{name}"] = orientations[:, :, None], of_rotation
+    return _regression(parent, child, T_parent_child, groups, ("late",))
 
 
 def _regression(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.checks.findings import Finding, Severity, finding
+from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -13,20 +13,19 @@ from hand_eye_calib.pairing.synchronise import find_leap
 from hand_eye_calib.stats import median, quantile
 
 # Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
-_PATH_STEP_S = 0.2
+PATH_STEP_S = 0.2
 
 # An interval is a gap if it is longer than the limit and than this many median intervals.
 _GAP_INTERVALS = 5.0
 
 # A step is a jump if it differs from the steps around it by this many times the median difference,
-# and by this many times a fast step. Jumps matter from this share of the steps on.
+# and by this many times a fast step.
 _JUMP_SIGMAS, _JUMP_STEPS = 12.0, 3.0
-_MIN_JUMPS = 0.002
 
-# A stream is frozen if its pose is repeated to the last digits for this long (s) while the other
-# stream moves, and that for more than this share of the time.
-_FROZEN_S, _MAX_FROZEN = 1.0, 0.02
-_SAME_POSE = 1e-12
+# Poses, heights and verticals (m, rad) this close are the same, to rounding. A stream moves, or
+# tilts, by more than the second; it is frozen if its pose stays the same for so long (s) while the
+# other one moves.
+_SAME, _MOVES, _FROZEN_S = 1e-6, 0.02, 1.0
 
 # Two sensors take turns if a stream is this many times rougher from pose to pose than over some
 # longer lag (in poses), by at least so many metres. Repeated poses are another matter.
@@ -36,14 +35,9 @@ _ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M, _MAX_REPEATS = 2.0, 6, 0.01, 0.1
 _TURNS, _STEADY_SHARE = 10, 0.5
 
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
-# of the smallest, to this share of a step. Steps (m) from which on that matters.
+# of the smallest, to this share of a step.
 _MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
 _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
-_COARSE_NOTE_M, _COARSE_WARNING_M, _COARSE_ERROR_M = 0.002, 0.005, 0.02
-
-# A stream is flat if its vertical and its height (m) stay the same to rounding. A stream moves, or
-# tilts, by more than this (rad, m).
-_FLAT, _MOVES = 1e-6, 0.02
 
 # Stamps of a date are around 1.7e18 ns. Read in another unit they are off by powers of a thousand.
 _STAMP_UNITS = ("nanoseconds", "microseconds", "milliseconds", "seconds")
@@ -75,7 +69,7 @@ class StreamSummary:
 def summarise(trajectory: Trajectory) -> StreamSummary:
     """StreamSummary of a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    poses = coarse(trajectory, max(_PATH_STEP_S, median(intervals_s))).poses
+    poses = coarse(trajectory, max(PATH_STEP_S, median(intervals_s))).poses
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     return StreamSummary(
@@ -110,9 +104,8 @@ def check_stream(
     if any(finding.code != "gaps" for finding in findings):
         return findings
     share = float(_jumps(trajectory).mean())
-    if share > _MIN_JUMPS:
-        findings.append(finding("jumps", stream, options={"method": "dnlo"}, share=share))
-    return findings
+    jumps = graded("jumps", stream, share, options={"method": "dnlo"}, share=share)
+    return [*findings, jumps] if jumps else findings
 
 
 def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
@@ -130,13 +123,10 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
-    if step_m >= _COARSE_NOTE_M:
-        severity = Severity.WARNING if step_m > _COARSE_WARNING_M else Severity.NOTE
-        # Of positions alone, rounding is noise like any other.
-        if step_m > _COARSE_ERROR_M and trajectory.has_rotations:
-            severity = Severity.ERROR
-        findings.append(finding("coarse_positions", stream, severity, step_m=step_m))
-    return findings
+    # Of positions alone, rounding is noise like any other.
+    most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"][-1]
+    coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
+    return [*findings, coarse] if coarse else findings
 
 
 def _interleaved(trajectory: Trajectory) -> float:
@@ -144,7 +134,7 @@ def _interleaved(trajectory: Trajectory) -> float:
     rougher from one pose to the next than over several; otherwise 0.
     """
     positions, stamps_ns = trajectory.poses[:, :3, 3], trajectory.stamps_ns
-    repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME_POSE
+    repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME
     if len(positions) < (_TURNS + 2) * _MAX_PERIOD or repeats.mean() > _MAX_REPEATS:
         return 0.0
     off = []  # the line between the poses so many before and after
@@ -170,7 +160,7 @@ def _interleaved(trajectory: Trajectory) -> float:
 def _grid_step(values: FloatArray) -> float:
     """Step (m) of which all differences (N - 1,) are multiples, 0 if there is none."""
     steps = np.abs(np.diff(values))
-    differences = steps[steps > _SAME_POSE]
+    differences = steps[steps > _SAME]
     if len(differences) < _MIN_GRID:
         return 0.0
     step = float(differences.min())
@@ -192,7 +182,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         ("child", child, "parent", parent),
     ):
         vertical, heights = flat.poses[:, 2, 2], flat.poses[:, 2, 3]
-        if np.abs(vertical - vertical[0]).max() >= _FLAT or np.ptp(heights) > _FLAT:
+        if np.abs(vertical - vertical[0]).max() > _SAME or np.ptp(heights) > _SAME:
             continue
         # The direction in the other sensor whose image in the world scatters least: its axis of
         # rotation.
@@ -219,7 +209,7 @@ def _jumps(trajectory: Trajectory) -> BoolArray:
         speed = np.linalg.norm(velocities, axis=1)
         jumps |= excess > np.maximum(
             _JUMP_SIGMAS * (median(excess) + 1e-12),
-            _JUMP_STEPS * quantile(speed, 0.9),
+            _JUMP_STEPS * quantile(speed, _USUAL),
         )
     return jumps
 
@@ -227,18 +217,15 @@ def _jumps(trajectory: Trajectory) -> BoolArray:
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Findings about streams that repeat their pose while the other moves, on one clock."""
     shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
-    return [
-        finding("frozen", name, share=share)
-        for name, share in shares.items()
-        if share > _MAX_FROZEN
-    ]
+    found = (graded("frozen", name, share, share=share) for name, share in shares.items())
+    return [*filter(None, found)]
 
 
 def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
     """Share of the time in which a stream repeats its pose to the last digits while another one, on
     the same clock, moves.
     """
-    same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
+    same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME
     edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int)))
     frozen_ns = 0
     for start, end in zip(edges[::2], edges[1::2], strict=True):
