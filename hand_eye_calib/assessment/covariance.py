@@ -210,8 +210,14 @@ def combined(
     resampling if there is one, and directions (6, U) that the motion does not reveal.
     """
     known, scaled = np.eye(6) - unknown @ unknown.T, UNKNOWN_SIGMAS[:, None] * unknown
-    raised = model if resampled is None else _raised(model, resampled)
-    covariance, rotation = known @ raised @ known + scaled @ scaled.T, T_parent_child[:3, :3]
+    if resampled is not None:  # the larger one, direction by direction
+        # In the coordinates where the model's is the identity, the eigenvalues are the ratios.
+        variances, axes = np.linalg.eigh(model)
+        root = axes * np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
+        ratios, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, resampled).T))
+        raised = root @ vectors
+        model = (raised * np.maximum(ratios, 1.0)) @ raised.T
+    covariance, rotation = known @ model @ known + scaled @ scaled.T, T_parent_child[:3, :3]
     sigmas = sigmas_in_parent(rotation, covariance)
     shares = ((np.kron(np.eye(2), rotation) @ unknown) ** 2).sum(axis=1)
     sigmas = np.where(shares > HIDDEN_SHARE, np.inf, sigmas)
@@ -333,17 +339,6 @@ def widened_by_halves(
         return model
     error = model @ away
     return model + (excess - 1.0) / float(error @ away) * np.outer(error, error)
-
-
-def _raised(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The larger of two covariances, direction by direction."""
-    # In the coordinates where the first is the identity, the eigenvalues of the second are the
-    # ratios.
-    variances, axes = np.linalg.eigh(first)
-    root = axes * np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
-    values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, second).T))
-    raised = root @ vectors
-    return (raised * np.maximum(values, 1.0)) @ raised.T
 
 
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -300,7 +300,10 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
             np.concatenate([_about_answer(H_of[:k], S_of[:k]), _about_answer(H_of[k:], S_of[k:])])
             for k in range(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
         ]
-        long_run = max(long_run, min(_long_run(H_of, rest) for rest in rests))
+        # Mean of S' H^-1 S of scores about two answers, per degree of freedom.
+        seen = np.trace(H_of, axis1=1, axis2=2) > 0
+        squared = [squared_shift(H_of[seen], rest[seen], 1e-6).sum() for rest in rests]
+        long_run = max(long_run, float(min(squared)) / max(6 * seen.sum() - 12, 1))
     before_H, before_S = np.cumsum(H, axis=0)[:-1], np.cumsum(S, axis=0)[:-1]
     after_H, after_S = H.sum(axis=0) - before_H, S.sum(axis=0) - before_S
     # The common answer is free.
@@ -342,15 +345,6 @@ def _by_second(
 def _about_answer(H: FloatArray, S: FloatArray) -> FloatArray:
     """Scores of shifts from the answer of all of them, to first order."""
     return np.asarray(S - H @ (_inverse(H.sum(axis=0)) @ S.sum(axis=0)))
-
-
-def _long_run(H: FloatArray, S: FloatArray) -> float:
-    """Long-run variance f of scores about two answers in units of the information, at least 1: mean
-    of ``S' H^-1 S`` per degree of freedom.
-    """
-    informative = np.trace(H, axis1=1, axis2=2) > 0
-    squared = squared_shift(H[informative], S[informative], 1e-6)
-    return max(float(squared.sum()) / max(6 * len(squared) - 12, 1), 1.0)
 
 
 def _inverse(H: FloatArray) -> FloatArray:

@@ -96,7 +96,8 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         frame, angles about fixed axes) to (value, sigma), in m and rad. May be empty.
     """
     covariance = assessment.cov_parent_child_in_child
-    unknown = _unknown_directions(covariance)
+    shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
+    unknown = np.linalg.qr(UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE])[0]
     contradictions = _contradictions(T_parent_child, assessment, prior) if prior else {}
     prior = {axis: known for axis, known in prior.items() if axis not in contradictions}
     if not prior and not unknown.shape[1]:
@@ -141,13 +142,6 @@ def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) ->
         for dof, more in zip(assessment.observability, added, strict=True)
     )
     return Assessment(assessment.cov_parent_child_in_child + spread, observability)
-
-
-def _unknown_directions(covariance: FloatArray) -> FloatArray:
-    """Orthonormal basis (6, U) of the directions whose variance stands for unknown."""
-    shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
-    directions = UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE]
-    return np.linalg.qr(directions)[0]
 
 
 def _whitened(

@@ -96,9 +96,9 @@ def check_agreement(
         return same
     change = find_change(pose_pairs, T_parent_child)
     slow, axes = response(pose_pairs, motions, T_parent_child, change.at_ns if change else None)
-    speeds = _speeds(pose_pairs)
+    speeds, speed = _speeds(pose_pairs)
     drift = slow.fit("drift")
-    tried = [(drift.share, _world_drift(drift, pose_pairs, speeds))]
+    tried = [(drift.share, _world_drift(drift, pose_pairs, speed))]
     tried += [_rotation_gain(slow.fit("gain"), axes)]
     tried += [_turned(slow, stream) for stream in (*_STREAMS, "both")]
     tried += [_axis_gain(slow, stream) for stream in _STREAMS]
@@ -107,23 +107,19 @@ def check_agreement(
     suspects = [max(tried, key=lambda each: each[0])]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
     if fast := delays(pose_pairs, motions, T_parent_child):
-        suspects += _delays(fast, speeds)
+        suspects += _delays(fast, speeds, speed)
         interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
-        suspects += _smoothing(fast, _OF_INTERVAL * interval_s**2, speeds)
-    return _likeliest(suspects)
+        suspects += _smoothing(fast, _OF_INTERVAL * interval_s**2, speed)
+    found = [(share, each) for share, each in suspects if each]
+    return [max(found, key=lambda each: each[0])[1]] if found else []
 
 
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     slow, _ = response(pose_pairs, motions, X)
-    tried = [_axis_gain(slow, stream) for stream in _STREAMS]
-    return _likeliest([each for each in tried if each[0] > _MOST])
-
-
-def _likeliest(suspects: list[_Suspect]) -> list[Finding]:
-    found = [(share, each) for share, each in suspects if each]
-    return [max(found, key=lambda each: each[0])[1]] if found else []
+    share, found = max((_axis_gain(slow, stream) for stream in _STREAMS), key=lambda each: each[0])
+    return [found] if found and share > _MOST else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -211,12 +207,12 @@ def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspe
     return share, graded("mount_moved", "both", size, **values)
 
 
-def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Finding | None:
+def _world_drift(drift: Fitted, pose_pairs: PosePairs, usual: float) -> Finding | None:
     """A world that moves against the other."""
     positions = pose_pairs.Ts_cw_c[:, :3, 3]
     turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
-    share = float(moving) / max(_rms(speeds), 1e-9)
+    share = float(moving) / max(usual, 1e-9)
     if (np.abs(drift.values) < LIMITS["world_drift"][0] * drift.sigmas).all():
         return None
     speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
@@ -224,21 +220,20 @@ def _world_drift(drift: Fitted, pose_pairs: PosePairs, speeds: FloatArray) -> Fi
     return graded("world_drift", "both", share, **values, percent=100 * share)
 
 
-def _delays(fast: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
+def _delays(fast: Regression, speeds: FloatArray, speed: float) -> Iterator[_Suspect]:
     """Positions that are late, or early, against orientations of their stream: all, or those along
     one axis of its world.
     """
     for stream, columns in (("child", 0), ("parent", 3)):
         whole, by_axis = fast.fit(f"late_{stream}"), fast.fit(f"late_axes_{stream}")
         k, off_s, off_sigma_s = _odd_one(by_axis)
-        delay_s, along = float(whole.values[0]), speeds[:, columns + k]
+        delay_s, along = float(whole.values[0]), float(speeds[columns + k])
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
         of_axis = (f"{'xyz'[k]} coordinates", "others")
-        speed = float(np.sqrt(np.mean(along**2)))
         for fitted, late_s, sigma_s, speed_m_s, code, names in (
-            (whole, abs(delay_s), whole.sigmas[0], _rms(speeds), "position_clock", parts),
+            (whole, abs(delay_s), whole.sigmas[0], speed, "position_clock", parts),
             # The other stream's coordinate cannot be early.
-            (by_axis, off_s, off_sigma_s, speed, "axis_lag", of_axis),
+            (by_axis, off_s, off_sigma_s, along, "axis_lag", of_axis),
         ):
             shift_m = late_s * speed_m_s
             if late_s > _DELAY_S:
@@ -248,7 +243,7 @@ def _delays(fast: Regression, speeds: FloatArray) -> Iterator[_Suspect]:
                 yield fitted.share, graded("late", stream, shift_m, sigma_m, **values, **told)
 
 
-def _smoothing(fast: Regression, more_s2: float, speeds: FloatArray) -> Iterator[_Suspect]:
+def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Suspect]:
     """Smoothing of one part of the poses."""
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
@@ -256,26 +251,23 @@ def _smoothing(fast: Regression, more_s2: float, speeds: FloatArray) -> Iterator
             value_s2, sigma_s2 = float(fitted.values[0]), float(fitted.sigmas[0])
             if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
                 smoothing_s = float(np.sqrt(value_s2))
-                shift_m = smoothing_s * _rms(speeds)
+                shift_m = smoothing_s * speed
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": shift_m}
                 yield fitted.share, graded("smoothed", stream, shift_m, **values)
 
 
-def _speeds(pose_pairs: PosePairs) -> FloatArray:
-    """Velocities (M, 6), m/s: of the child in its world, then of the parent in its own. Jumps are
-    left out.
+def _speeds(pose_pairs: PosePairs) -> tuple[FloatArray, float]:
+    """Root mean square speeds (m/s) along the axes (6,) of the child's world and of the parent's,
+    and of the parent as a whole. Jumps are left out.
     """
     positions = np.concatenate([pose_pairs.Ts_cw_c[:, :3, 3], pose_pairs.Ts_pw_p[:, :3, 3]], axis=1)
     step = max(1, round(_SHORT_S / max(median(np.diff(pose_pairs.stamps_ns)) * 1e-9, 1e-9)))
     seconds = (pose_pairs.stamps_ns[step:] - pose_pairs.stamps_ns[:-step]) * 1e-9
     velocities = (positions[step:] - positions[:-step]) / seconds[:, None]
     sizes = np.linalg.norm(velocities[:, 3:], axis=1)
-    return np.asarray(velocities[sizes <= 3 * median(sizes)])
-
-
-def _rms(speeds: FloatArray) -> float:
-    """Root mean square speed of the parent."""
-    return float(np.sqrt((speeds[:, 3:] ** 2).sum(axis=1).mean())) if len(speeds) else 0.0
+    usual = velocities[sizes <= 3 * median(sizes)]
+    speeds = np.sqrt((usual**2).sum(axis=0) / max(len(usual), 1))
+    return speeds, float(np.linalg.norm(speeds[3:]))
 
 
 def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory) -> list[Finding]:
@@ -307,7 +299,9 @@ def _roughness(trajectory: Trajectory) -> tuple[float, float]:
     """Third difference of the orientations, rad, and by how much the fourth is larger."""
     rotations = trajectory.poses[:, :3, :3]
     steps = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    third, fourth = (_size(np.diff(steps, n=n, axis=0)) for n in (2, 3))
+    third, fourth = (
+        quantile(np.linalg.norm(np.diff(steps, n=n, axis=0), axis=1), _SHARE) for n in (2, 3)
+    )
     return third, fourth / max(third, 1e-300)
 
 
@@ -331,8 +325,4 @@ def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
     if len(pairs) < 3:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
-    return _size(pairs.residuals(X)[1])
-
-
-def _size(vectors: FloatArray) -> float:
-    return quantile(np.linalg.norm(vectors, axis=1), _SHARE)
+    return quantile(np.linalg.norm(pairs.residuals(X)[1], axis=1), _SHARE)

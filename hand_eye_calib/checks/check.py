@@ -128,28 +128,22 @@ def check_streams(
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
         return CheckResult(gravest_first([*findings, *flat]), correlation)
-    explanation, found = _explained(aligned, correlation.is_clear, known[0] if known else None)
+    start = known[0] if known else None
+    explanation, found = _explained(aligned, correlation, start, is_frozen=bool(frozen))
     findings += found
     if explanation is None:
-        # Nothing is said about the rates of a frozen stream.
-        if not correlation.is_clear and not frozen:
-            is_still = correlation.variation < MIN_VARIATION
-            doubt = f"the streams agree at no clock offset: {correlation.doubt()}"
-            found = [finding("no_turning") if is_still else finding("unrelated", text=doubt)]
-            findings += found
         return CheckResult(gravest_first(findings), correlation)
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
-    if is_sound := not any(each.makes_unusable for each in findings):
-        findings += check_lengths(parent)
-        is_sound = not any(each.makes_unusable for each in findings)
-    offset = _offset(streams, explanation, correlation)
-    findings += check_offset(offset, time_offset_s)
-    right = explanation.hypothesis.undo(streams).shifted(offset.seconds)
-    found, fit = _check_sizes(right.synchronised, explanation, scale)
-    findings += found
-    if is_sound:
+    is_sound = not any(each.makes_unusable for each in findings)
+    lengths = check_lengths(parent) if is_sound else []
+    right = explanation.hypothesis.undo(streams)
+    offset = _offset(right, explanation.fit, correlation)
+    right = right.shifted(offset.seconds)
+    sizes, fit = _check_sizes(right.synchronised, explanation, scale)
+    findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
+    if is_sound and not lengths:
         findings += _check_agreeing(right, streams, fit, known)
     return CheckResult(gravest_first(findings), correlation, explanation.fit, offset)
 
@@ -173,46 +167,56 @@ def _on_one_clock(
 
 
 def _explained(
-    streams: StreamPair, is_clear: bool, start: FloatArray | None
+    streams: StreamPair, correlation: Correlation, start: FloatArray | None, is_frozen: bool
 ) -> tuple[Explanation | None, list[Finding]]:
-    """The explanation that holds, if there is one, and findings; ``is_clear`` if the angular rates
-    agree.
-    """
+    """The explanation that holds, if there is one, and findings."""
     try:
-        explanation = explain(streams, is_clear, start)
+        explanation = explain(streams, correlation.is_clear, start)
     except NotEnoughDataError as error:
-        return None, [finding("too_short", text=str(error))] if is_clear else []
-    if explanation.holds:
-        return explanation, [*explanation.findings]
-    if not is_clear:
+        if correlation.is_clear:
+            return None, [finding("too_short", text=str(error))]
+    else:
+        if explanation.holds:
+            return explanation, [*explanation.findings]
+        if correlation.is_clear:
+            pairs = streams.synchronised
+            found = check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
+            return None, found or [*explanation.findings]
+    if is_frozen:  # nothing is said about its rates
         return None, []
-    motions = _motions(streams.synchronised, _MAX_MOTIONS)
-    found = check_coordinates(streams.synchronised, motions)
-    return None, found or [*explanation.findings]
+    if correlation.variation < MIN_VARIATION:
+        return None, [finding("no_turning")]
+    doubt = f"the streams agree at no clock offset: {correlation.doubt()}"
+    return None, [finding("unrelated", text=doubt)]
 
 
-def _offset(streams: StreamPair, explanation: Explanation, correlation: Correlation) -> TimeOffset:
-    """The time offset of streams that agree under a hypothesis."""
+def _offset(streams: StreamPair, fit: SimilarityFit, correlation: Correlation) -> TimeOffset:
+    """The time offset of streams that agree."""
     if streams.are_slow:  # too slow to refine it
         return TimeOffset(correlation.offset_s, streams.interval_s, correlation)
-    right = explanation.hypothesis.undo(streams)
-    parts = right.parent, right.child, correlation, streams.max_gap_s, explanation.fit
-    return refine_time_offset(*parts, least_s=LIMITS["time_offset"][1])
+    both = streams.parent, streams.child, correlation, streams.max_gap_s, fit
+    return refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
 
 
 def _check_sizes(
-    pose_pairs: PosePairs, explanation: Explanation, scale: float
+    pose_pairs: PosePairs, explanation: Explanation, known: float
 ) -> tuple[list[Finding], SimilarityFit]:
     """Findings about the scale, beside the one that is known, and the axes of rotation of streams
     that agree, and the fit with the scale.
     """
-    rotations = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3]
-    findings, fit = _check_axes(rotations, explanation.fit.sigma_rotation), explanation.fit
+    rotations, fit = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3], explanation.fit
+    of_noise = fit.sigma_rotation**2 * np.eye(3)
+    hidden = LeverArms.of(rotations - np.eye(3)).hidden_axes(of_noise)
+    findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
             fit = estimate_scale(pose_pairs, start=fit)
-            findings = [*_check_scale(fit, scale), *findings]
-    return findings, fit
+            if scale_differs(fit):
+                values: dict[str, Any] = {"scale": fit.scale, "sigma": fit.scale_sigma}
+                values["options"] = {"scale": round(known * fit.scale, 4)}
+                differs = graded("scale", "child", fit.scale - 1.0, **values)
+                findings.append(in_other_units(fit.scale, fit.scale_sigma, known) or differs)
+    return [*filter(None, findings)], fit
 
 
 def _check_agreeing(
@@ -285,17 +289,6 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     return [offset] if offset else []
 
 
-def _check_scale(fit: SimilarityFit, known: float) -> list[Finding]:
-    if not scale_differs(fit):
-        return []
-    scale, sigma = fit.scale, fit.scale_sigma
-    options = {"scale": round(known * scale, 4)}
-    found = in_other_units(scale, sigma, known) or graded(
-        "scale", "child", scale - 1.0, options=options, scale=scale, sigma=sigma
-    )
-    return [found] if found else []
-
-
 def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:
     """The finding that a stream's lengths are in another unit, by the scale that was found beside
     the known one: the child's if it is below 1, otherwise the parent's; None if the scale is about
@@ -319,12 +312,6 @@ def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
     motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in LAGS_S)
     # There are enough over one of the lags: the fit is over it.
     return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
-
-
-def _check_axes(rotations: FloatArray, sigma_rotation: float) -> list[Finding]:
-    """A note if nearly all rotation is about one axis."""
-    hidden = LeverArms.of(rotations - np.eye(3)).hidden_axes(sigma_rotation**2 * np.eye(3))
-    return [unseen(hidden)] if hidden else []
 
 
 def unseen(axes: Sequence[str]) -> Finding:

@@ -215,7 +215,9 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
     failed: list[Explanation] = []
     for lag_s in LAGS_S:
         try:
-            plain = _plain(streams, lag_s, start)
+            plain = _fitted(_PLAIN, streams, lag_s, start)
+            if start is not None and not plain.holds:
+                plain = _fitted(_PLAIN, streams, lag_s)
         except NotEnoughDataError as error:
             too_few = error
             continue
@@ -241,15 +243,6 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
     share = min(unexplained, 1.0)
     text = f"no extrinsic, scale or usual mistake explains {share:.0%} of the motion"
     return replace(best, findings=(finding("unrelated", text=text, share=share),))
-
-
-def _plain(streams: StreamPair, lag_s: float, start: FloatArray | None) -> Explanation:
-    """The hypothesis that nothing is wrong, from a start if that leads to a fit that holds."""
-    if start is not None:
-        explanation = _fitted(_PLAIN, streams, lag_s, start)
-        if explanation.holds:
-            return explanation
-    return _fitted(_PLAIN, streams, lag_s)
 
 
 def _or_rival(
@@ -388,7 +381,9 @@ def _evidence_for_inverse(
     evidence = 0.0
     for stream in (streams.parent, streams.child):
         poses = coarse(stream, PATH_STEP_S).poses
-        evidence += float(np.log(_path_m(poses) / _path_m(se3.inverse(poses))))
+        steps = (np.diff(Ts[:, :3, 3], axis=0) for Ts in (poses, se3.inverse(poses)))
+        path_m, inverted_m = (np.linalg.norm(each, axis=1).sum() + 1e-9 for each in steps)
+        evidence += float(np.log(path_m / inverted_m))
     pairs, Ts_c_cw = streams.synchronised, se3.inverse(streams.synchronised.Ts_cw_c)
     Ts_c_cw[:, :3, 3] *= fit.scale
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ Ts_c_cw
@@ -399,7 +394,3 @@ def _evidence_for_inverse(
     if (np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])) > _SAME_FRAME).all():
         evidence += 0.5 * float(np.log(arms_m[0] / arms_m[1]))
     return evidence, inverted
-
-
-def _path_m(poses: FloatArray) -> float:
-    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()) + 1e-9

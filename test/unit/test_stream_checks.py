@@ -10,7 +10,9 @@ import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
 from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses, write_pair
 
+from hand_eye_calib.alignment.similarity import EXPLAINED, fit_similarity
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
+from hand_eye_calib.checks import hypotheses
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.checks.streams import (
@@ -51,6 +53,19 @@ def grave(agreement):
 def test_no_false_alarm(seed, wander):
     agreement = check_streams(*drive(seed, wander=wander))
     assert grave(agreement) == []
+
+
+@pytest.mark.parametrize("wander", [wandering_poses, planar_poses])
+def test_no_rival_is_fitted_to_noisy_streams_that_agree(wander, monkeypatch):
+    fits = []
+
+    def counted(*arguments, **options):
+        fits.append(fit_similarity(*arguments, **options))
+        return fits[-1]
+
+    monkeypatch.setattr(hypotheses, "fit_similarity", counted)
+    assert grave(check_streams(*drive(1, noise=0.02, wander=wander))) == []
+    assert [EXPLAINED < fit.unexplained < hypotheses.HOLDS for fit in fits] == [True]
 
 
 @pytest.mark.parametrize("centred", ["parent", "child"])
