@@ -124,7 +124,8 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
         in child.text
     )
     assert child.refused["unusable"] == 8
-    publishers[0].publish(message(publishers[0].msg_type, 0, Ts_pw_p[0], "lidar"))
+    for stamp_ns in (0, next(later_ns)):
+        publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[0], "lidar"))
     found = state(lambda each: each.inputs["parent"].refused.get("corrupt stamp") == 1)
     assert found.inputs["parent"].level is Level.ERROR
 
