@@ -35,7 +35,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags import PoseBag, write_bag
+from hand_eye_calib.io.bags import PoseBag, storage, write_bag
 from hand_eye_calib.io.bags.writer import write_streams
 
 MIB = 1 << 20
@@ -210,6 +210,17 @@ def test_mcap_files_without_parts_of_an_index_are_whole(tmp_path, options):
             writer.add_message(ids[channel.id], times[0], message.data, times[1])
         writer.finish()
     assert read(tmp_path / "a.mcap") == (all_poses(tmp_path / "bag"), [])
+
+
+def test_without_the_library_mcap_whole_files_are_read(tmp_path, monkeypatch):
+    write_bag(tmp_path / "bag", STREAMS)
+    whole = all_poses(tmp_path / "bag")
+    monkeypatch.setattr(storage, "find_spec", lambda _: None)
+    assert all_poses(tmp_path / "bag") == whole
+    file = storage_file(tmp_path / "bag")
+    os.truncate(file, file.stat().st_size // 2)
+    with pytest.raises(InputError, match="cut off.*'pip install mcap'"):
+        PoseBag(tmp_path / "bag")
 
 
 # ---- what is no bag

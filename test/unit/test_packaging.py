@@ -23,7 +23,7 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 # Library imported: (requirement in setup.py, key in package.xml); None where that side has no say,
 # as with pip and launch.
 DECLARED_AS = {
-    # Optional, or without a rosdep key: mcap is for damaged files alone.
+    # Optional, or without a rosdep key: rosbags reads whole files of mcap.
     **{name: (name, None) for name in ("mcap", "fsspec", "small_gicp", "argcomplete", "segno")},
     **{name: (name, None) for name in ("pandas", "pyulog")},
     "backports": ("backports.zstd", None),  # rosbags requires it too

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from importlib import import_module
+from importlib.util import find_spec
 from io import BufferedReader, BytesIO
 from operator import attrgetter, itemgetter
 from pathlib import Path, PurePath
@@ -64,6 +65,8 @@ class Storage(ABC):
     the last, if there are any, and ``losses`` what could not be read, one line each.
     """
 
+    repair = ""
+
     def __init__(self, path: Path, file: Path, opened: ExitStack) -> None:
         self.path, self._file = path, file
         self.counts = Counter[MessageKind]()
@@ -106,7 +109,7 @@ class Storage(ABC):
         except Exception as error:
             why = (
                 f"it is cut off, damaged or of an unsupported kind ({_reason_of(error)}); repair "
-                f"it with {_REPAIRS[_suffix(self.path)]}, or record it again"
+                f"it with {self.repair or _REPAIRS[_suffix(self.path)]}, or record it again"
             )
             # NoMemError is SQLite's, as rosbags uses it.
             if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
@@ -115,14 +118,22 @@ class Storage(ABC):
 
 
 class RosbagsFile(Storage):
-    """A .db3 or .bag file, through the library rosbags."""
+    """A .db3 or .bag file, through the library rosbags; and a whole .mcap file of ROS 2 where the
+    library mcap, which rosdep does not have, is not installed.
+    """
 
     def _open(self, opened: ExitStack) -> None:
         self._reader = reader = rosbags(1 if self._file.suffix == ".bag" else 2).Reader(self._file)
         if self._file.suffix == ".db3":  # whose path SQLite reads as an address
             reader.storage.path = Path(quote(str(self._file)))
+        if self._file.suffix == ".mcap":
+            self.repair = "the library that reads what is left, 'pip install mcap'"
         reader.open()
         opened.callback(reader.close)
+        if self.repair:
+            counts = (sum(each.channel_count.values()) for each in reader.storage.chunks)
+            if sum(counts) != reader.message_count:
+                raise ValueError("it has no index of its messages")
         for each in reader.connections:
             encoding = getattr(each.ext, "serialization_format", "ros1")
             definition = each.msgdef.format.name, each.msgdef.data.encode()
@@ -147,11 +158,12 @@ class McapFile(Storage):
     """
 
     def _open(self, opened: ExitStack) -> None:
-        reading = required("mcap.reader", "this bag", "mcap")
+        from mcap.reader import make_reader
+
         self._stream = _WholeReads(opened.enter_context(self._file.open("rb", buffering=0)))
         self._chunks: list[Any] | None = None
         try:
-            summary = reading.make_reader(self._stream).get_summary()
+            summary: Any = make_reader(self._stream).get_summary()
             about, chunks = summary.statistics, summary.chunk_indexes
             found = len(summary.channels), len(chunks), bool(chunks)
             if found != (about.channel_count, about.chunk_count, about.message_count > 0):
@@ -310,7 +322,8 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
             folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
             readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
             lost = _unpack(file, readable)
-        kind = McapFile if _suffix(file) == ".mcap" else RosbagsFile
+        is_mcap = _suffix(file) == ".mcap" and find_spec("mcap")
+        kind = McapFile if is_mcap else RosbagsFile
         storage: Storage = kind(file, readable, opened)
         storage.losses[:0] = [lost] * bool(lost)
         found.append(storage)
