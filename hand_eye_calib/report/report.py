@@ -34,7 +34,6 @@ from hand_eye_calib.text import (
     counted,
     duration,
     fixed,
-    in_words,
     length,
     listing,
 )
@@ -222,7 +221,7 @@ def _data(
     """What the result comes from, for the template."""
     options = snapshot.config.to_options() if snapshot else {}
     usual = CalibratorConfig().to_options()
-    given = {name: each for name, each in options.items() if each != usual[name]}
+    given = [f"{name} {each}" for name, each in options.items() if each != usual[name]]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     rows, kind = summary(calibration), "stops"
     if evidence:
@@ -232,7 +231,7 @@ def _data(
     return {
         "labels": inputs.get("labels", {}),
         "summary": rows
-        | {"Poses": f"{calibration.n_poses:,} {kind}", "Options": in_words(given) or "defaults"}
+        | {"Poses": f"{calibration.n_poses:,} {kind}", "Options": ", ".join(given) or "defaults"}
         | {"Written": f"{now}, hand_eye_calib {package_version()}; extrinsic.yaml has the rest"},
         "streams": [_stream(name, inputs, streams.get(name)) for name in names],
     }
