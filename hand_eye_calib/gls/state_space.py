@@ -199,7 +199,6 @@ class Posterior:
             self.markov.append(Markov(*of_group, space.intervals_s))
             start, at = start + size, at + 2
         diagonal, below = self._blocks(0, n_poses - 1)
-        diagonal[0] += self._first_block()
         states = range(start)
         diagonal[:, states, states] *= 1.0 + TUNING.raised
         self.factor = Factor(diagonal, below)
@@ -222,7 +221,8 @@ class Posterior:
 
     def _blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d), of the m increments
-        from pose to pose; without what is known of the first pose by itself.
+        from pose to pose. What is known of a pose by itself is in the block of the increment
+        before, or of the first one.
         """
         space, part, here = self.space, slice(start, end), slice(1, None)
         ahead, behind, weights = space.ahead[part], space.behind[part], self._weights[part]
@@ -242,16 +242,12 @@ class Posterior:
             below[:, states, states] += process.beside[part, None] / variance
             diagonal[:-1, states, states] += process.before[part, None] / variance
             diagonal[1:, states, states] += process.after[part, None] / variance
+        if start == 0:
+            diagonal[0, :WHITE, :WHITE] += self._of_poses[0]
+            for process in self.markov:
+                states = range(size)[process.states]
+                diagonal[0, states, states] += 1.0 / process.variance
         return diagonal, below
-
-    def _first_block(self) -> FloatArray:
-        """What is known of the state (d, d) of the first pose by itself."""
-        block = np.zeros((self.space.behind.shape[2],) * 2)
-        block[:WHITE, :WHITE] = self._of_poses[0]
-        for process in self.markov:
-            states = range(len(block))[process.states]
-            block[states, states] = 1.0 / process.variance
-        return block
 
     @cached_property
     def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
@@ -294,7 +290,6 @@ class Posterior:
         size = self.space.behind.shape[2]
         ends = np.linspace(0, n, min(TUNING.n_parts, n) + 1).astype(int).tolist()
         known = np.zeros((size + n_columns, size + n_columns))
-        known[:size, :size] = self._first_block()
         totals = [np.zeros((n_columns, n_columns))]
         for start, end in zip(ends[:-1], ends[1:], strict=True):
             form = self._form_of_part(start, end)

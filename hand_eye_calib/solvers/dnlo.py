@@ -83,13 +83,8 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
         searched = pairs[np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)]
     floor = min_inlier_fraction * len(searched)
     T = _Search(quadratic_form.condense(searched), threshold, floor).best(searched)
-    return _improved(pairs, T, threshold, min_inlier_fraction * len(pairs))
-
-
-def _improved(pairs: MotionPairs, T: FloatArray, threshold: float, floor: float) -> Solution:
-    """Improve weights and X in turn on all pairs, from a transform (4, 4), until the objective
-    falls no more. The costs come from the matrices, which cancel least.
-    """
+    # On all pairs, by costs from the matrices, which cancel least.
+    floor = min_inlier_fraction * len(pairs)
     coefficients = quadratic_form.coefficients(pairs)
     weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
     Q = quadratic_form.weighted_sum(coefficients, weights)
