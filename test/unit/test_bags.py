@@ -26,7 +26,7 @@ from published_data import data_folder
 from rosbags import rosbag1, rosbag2
 
 import hand_eye_calib as hec
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import PoseBag, write_bag
@@ -348,16 +348,14 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
 
 def test_writing_refuses_what_it_cannot_do(tmp_path, new_bag):
     path = new_bag()
-    new, text = tmp_path / "new", {"/a": (PARENT, "std_msgs/msg/String")}
-    for error, message, arguments in (
-        (InputError, "exists already", (path, STREAMS)),
-        (InputError, r"must be named \.bag", (new, STREAMS, "rosbag1")),
-        (InputError, r"must be named \.bag", (tmp_path / "new.bag", STREAMS, "mcap")),
-        (ConfigError, "cannot write .* as zip; known are mcap, sql", (new, STREAMS, "zip")),
-        (ConfigError, "cannot write messages of std_msgs/msg/String", (new, text)),
-        (InputError, "cannot write bag", (storage_file(path) / "new", STREAMS)),
+    new = tmp_path / "new"
+    for message, arguments in (
+        ("exists already", (path, STREAMS)),
+        (r"must be named \.bag", (new, STREAMS, "rosbag1")),
+        (r"must be named \.bag", (tmp_path / "new.bag", STREAMS, "mcap")),
+        ("cannot write bag", (storage_file(path) / "new", STREAMS)),
     ):
-        with pytest.raises(error, match=message):
+        with pytest.raises(InputError, match=message):
             write_bag(*arguments)
     assert not {*tmp_path.iterdir()} - {path}
 

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.storage import rosbags
 
 STORAGES = ("mcap", "sqlite3", "rosbag1")
-_ODOMETRY, _POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 
 Streams = Mapping[str, tuple[Trajectory, str]]
 
@@ -22,23 +21,11 @@ Streams = Mapping[str, tuple[Trajectory, str]]
 def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None:
     """Write trajectories into a new bag, the poses of all topics in the order of their stamps.
 
-    Parameters
-    ----------
-    path : str or path-like
-        Directory to make, or for rosbag1 the ``.bag`` file; an InputError if it exists.
-    streams : mapping of str to (Trajectory, str)
-        Topic to trajectory and message type, Odometry (with the sensor's frame) or PoseStamped.
-        Stamps are written to both header and bag.
-    storage : str
-        One of STORAGES.
+    ``path`` is the directory to make, or for rosbag1 the ``.bag`` file; an InputError if it exists.
+    ``streams`` are topics with trajectory and message type, Odometry (with the sensor's frame) or
+    PoseStamped; stamps are written to both header and bag. ``storage`` is one of STORAGES.
     """
     path = Path(path)
-    unknown = [each for _, each in streams.values() if each not in (_ODOMETRY, _POSE)]
-    if storage not in STORAGES or unknown:
-        raise ConfigError(
-            f"cannot write messages of {', '.join(unknown) or 'poses'} as {storage}; known are "
-            f"{', '.join((*STORAGES, _ODOMETRY, _POSE))}"
-        )
     if (path.suffix == ".bag") != (storage == "rosbag1"):
         raise InputError(
             f"cannot write {path} as {storage}: a rosbag1 file, and nothing else, must be named "
@@ -94,7 +81,7 @@ def stamped_messages(
         rotation = make("Quaternion", *quat_xyzw.tolist())
         pose = make("Pose", make("Point", *position.tolist()), rotation)
         parts: tuple[Any, ...] = (pose,)
-        if message_type == _ODOMETRY:
+        if message_type == "nav_msgs/msg/Odometry":
             with_covariance = make("PoseWithCovariance", pose, no_covariance)
             parts = (trajectory.sensor_frame, with_covariance, twist)
         yield int(stamp_ns), types[message_type](types["std_msgs/msg/Header"](**head), *parts)
