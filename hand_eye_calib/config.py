@@ -123,9 +123,6 @@ class CalibratorConfig(OptionSet):
         object.__setattr__(config, "given", frozenset(given) - {"given"})
         return config
 
-    def __post_init__(self, given: object) -> None:
-        super().__post_init__()
-
     method: str = option(
         "auto",
         "How the extrinsic is solved; auto: adaptive, dnlo where its noise model cannot work, and "

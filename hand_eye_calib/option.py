@@ -108,7 +108,7 @@ class OptionSet:
     given: frozenset[str]
     __dataclass_fields__: ClassVar[dict[str, OptionField]]
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, _: object = None) -> None:
         for field in dataclasses.fields(self):
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
 
