@@ -6,13 +6,12 @@ import threading
 from pathlib import Path
 
 import numpy as np
-from result_making import calibration
+from result_making import calibration, dofs
 
 from hand_eye_calib.cli.batch.work import Outcome, Task
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.calibration import SolveStatus
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 DAY_NS = 86_400_000_000_000
 
 
@@ -60,12 +59,11 @@ def recordings_of(seed, count, unknown_z=False):
 def outcome(name, vehicle, T, covariance, day=0):
     """What a batch keeps of a recording."""
     sigmas = np.sqrt(np.diag(covariance)).tolist()
-    dofs = tuple(map(DofObservability, AXES, [DofVerdict.OBSERVED] * 6, sigmas))
     found = calibration(
         T_parent_child=T,
         covariance=covariance,
         status=SolveStatus.OK,
-        observability=dofs,
+        observability=dofs(sigmas),
         warnings=(),
         child_frame="camera",
     )

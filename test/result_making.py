@@ -1,7 +1,5 @@
 """A calibration with all kinds of values in it."""
 
-import dataclasses
-
 import numpy as np
 
 from hand_eye_calib.assessment.excitation import Excitation
@@ -17,18 +15,26 @@ from hand_eye_calib.results.calibration import (
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
+def dofs(sigmas, hidden=()):
+    """What is known of six axes: the hidden ones nothing, the others to these sigmas."""
+    seen, unseen = DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE
+    return tuple(
+        DofObservability(name, unseen if name in hidden else seen, float(sigma))
+        for name, sigma in zip(NAMES, sigmas, strict=True)
+    )
+
+
 def calibration(**changes):
     random = np.random.default_rng(11)
     root = random.normal(size=(6, 6)) * 1e-3
     covariance = root @ root.T
     covariance[2, 2] = np.inf
-    verdicts = [DofVerdict.UNOBSERVABLE if name == "z" else DofVerdict.OBSERVED for name in NAMES]
     sigmas = np.where([name == "z" for name in NAMES], np.inf, random.uniform(1e-7, 1e-2, 6))
     values = {
         "T_parent_child": se3.exp(random.normal(size=6)),
         "covariance": covariance,
         "status": SolveStatus.UNOBSERVABLE,
-        "observability": tuple(map(DofObservability, NAMES, verdicts, sigmas.tolist())),
+        "observability": dofs(sigmas, "z"),
         "objective": 1 / 3,
         "method": "dnlo",
         "reference": "B10",
@@ -58,17 +64,9 @@ def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
     T[:3, :3] = se3.rotation_exp(off[3:]) @ T[:3, :3]
     T[:3, 3] += off[:3]
     to_child = np.kron(np.eye(2), T[:3, :3].T)
-    dofs = tuple(
-        DofObservability(
-            axis, DofVerdict.UNOBSERVABLE if axis == hidden else DofVerdict.OBSERVED, float(sigma)
-        )
-        for axis, sigma in zip(NAMES, sigmas, strict=True)
-    )
-    fields = {"status": SolveStatus.OK, "cross_check": None} | fields
+    fields = {"status": SolveStatus.OK, "observability": dofs(sigmas, [hidden])} | fields
     covariance = to_child @ np.diag(sigmas**2) @ to_child.T
-    return dataclasses.replace(
-        calibration(), T_parent_child=T, covariance=covariance, observability=dofs, **fields
-    )
+    return calibration(T_parent_child=T, covariance=covariance, **fields)
 
 
 def shift(axis, size):
@@ -77,11 +75,10 @@ def shift(axis, size):
 
 def good_calibration(**changes):
     """One with nothing against it."""
-    verdicts = [DofVerdict.OBSERVED] * 6
     sigmas = [0.003] * 3 + [0.001] * 3
     values = {
         "status": SolveStatus.OK,
-        "observability": tuple(map(DofObservability, NAMES, verdicts, sigmas)),
+        "observability": dofs(sigmas),
         "covariance": np.diag(np.square(sigmas)),
     }
     return calibration(**(values | changes))

@@ -1,12 +1,12 @@
 """Between messages and numbers, without a node."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
+from result_making import NAMES, dofs, good_calibration
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib import config
@@ -14,36 +14,16 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
 from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
-from hand_eye_calib.results.status import AXES
 from hand_eye_calib.ros import conversions
 from hand_eye_calib.ros.outputs import ResultTopics
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
 
-def calibration(covariance, T_parent_child=T_PARENT_CHILD):
-    return Calibration(
-        T_parent_child=T_parent_child,
-        covariance=covariance,
-        status=SolveStatus.OK,
-        observability=(),
-        objective=0.0,
-        method="dnlo",
-        reference="B1",
-        backend="fast",
-        n_poses=10,
-        n_pairs=9,
-        n_inliers=9,
-        stamp_ns=1_700_000_000_123_456_789,
-        parent_frame="lidar",
-        child_frame="camera",
-    )
+def calibration(covariance, **changes):
+    named = {"child_frame": "camera", "stamp_ns": 1_700_000_000_123_456_789}
+    changes |= named | {"T_parent_child": T_PARENT_CHILD, "covariance": covariance}
+    return good_calibration(**changes)
 
 
 def test_every_pose_type_of_the_options_can_be_read():
@@ -92,7 +72,7 @@ def test_messages_carry_frames_stamp_and_transform():
     assert conversions.to_ns(transform.header.stamp) == 1_700_000_000_123_456_789
     pose = conversions.to_pose_with_covariance(calibration(np.eye(6)))
     assert pose.header == transform.header
-    total = dataclasses.replace(calibration(np.eye(6)), floor=np.eye(6))
+    total = calibration(np.eye(6), floor=np.eye(6))
     total = conversions.to_pose_with_covariance(total).pose.covariance
     np.testing.assert_allclose(np.reshape(total, (6, 6)), 2.0 * np.eye(6), atol=1e-12)
     for place, turn in (
@@ -114,11 +94,7 @@ def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
 
     topics = ResultTopics(SimpleNamespace(create_publisher=create, destroy_publisher=gone.append))
     sure, unsure = (
-        dataclasses.replace(
-            calibration(np.eye(6)),
-            observability=tuple(DofObservability(axis, verdict, 0.01) for axis in AXES),
-        )
-        for verdict in (DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE)
+        calibration(np.eye(6), observability=dofs([0.01] * 6, hidden)) for hidden in ((), NAMES)
     )
     for each in (unsure, sure, unsure, unsure):
         topics.publish(each)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from result_making import NAMES
 from result_making import calibration as made
+from result_making import dofs
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import (
@@ -11,7 +11,7 @@ from hand_eye_calib.geometry.extrinsic import (
     sigmas_rpy,
     sigmas_translation,
 )
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.text import printed_angle
 
 SAMPLES = 20_000
@@ -91,10 +91,7 @@ def calibration(rotation, sigmas_deg):
         T_parent_child=T,
         covariance=covariance,
         status=SolveStatus.OK,
-        observability=tuple(
-            DofObservability(name, DofVerdict.OBSERVED, sigma)
-            for name, sigma in zip(NAMES, sigmas, strict=True)
-        ),
+        observability=dofs(sigmas),
     )
 
 
