@@ -18,10 +18,10 @@ from hand_eye_calib.pairing.synchronise import find_leap, synchronise
 from hand_eye_calib.results.records import ClockRate
 
 # Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
-# Short motions show the offset best. Most motions that are compared, and if there is a rate to be
+# Short motions show the offset best. Most motions that are compared if there is a rate to be
 # measured.
 _LAGS_S = (1.0, 0.3, 3.0)
-_PAIRS, _PAIRS_OF_RATE = MAX_PAIRS, 5 * MAX_PAIRS
+_PAIRS_OF_RATE = 5 * MAX_PAIRS
 
 # Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
 # intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
@@ -162,7 +162,7 @@ def _fine_offset(
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
     offset_s, rate = correlation.offset_s, ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
-    most_pairs = _PAIRS
+    most_pairs = MAX_PAIRS
     for _ in range(_MAX_ROUNDS):
         shifted = child.shifted(offset_s, rate.used, rate.at_ns)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
@@ -191,9 +191,9 @@ def _fine_offset(
             found = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
             is_settled = abs(found.used - rate.used) * child.duration_s < _SETTLED_S
             rate = found
-            if is_settled and (most_pairs > _PAIRS or not rate.is_used):
+            if is_settled and (most_pairs > MAX_PAIRS or not rate.is_used):
                 break
-            most_pairs = _PAIRS_OF_RATE if rate.is_used else _PAIRS
+            most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
     known = rate if np.isfinite(rate.sigma_ppm) else None
     assert fit is not None
     return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known)

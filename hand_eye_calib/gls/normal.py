@@ -14,12 +14,6 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.gls.tuning import TUNING
 
-# The blocks that are left when they have so few rows together are one dense matrix.
-_DENSE = 64
-
-# So many triangular matrices are inverted row by row, all at once: half the time of LAPACK.
-_MANY = 64
-
 
 def transposed(blocks: FloatArray) -> FloatArray:
     """The transposes (..., k, d) of matrices (..., d, k)."""
@@ -37,7 +31,7 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     lower = np.linalg.cholesky(matrices)
     pivots = np.diagonal(lower, axis1=1, axis2=2)
-    if len(lower) < _MANY:
+    if len(lower) < TUNING.many:
         inverse: FloatArray = np.linalg.inv(lower)
     else:
         inverse = np.zeros_like(lower)
@@ -69,7 +63,7 @@ class Factor:
         # block, and that times its coupling to the block before and, if there is one, behind.
         self._levels: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.log_determinant = 0.0
-        while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _DENSE:
+        while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > TUNING.dense:
             (inverse, logarithms), n_behind = (
                 inverse_roots(diagonal[1::2]),
                 (len(diagonal) - 1) // 2,

@@ -27,9 +27,6 @@ from hand_eye_calib.text import angle, length
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
-# Stamps that jitter by less are not worth a sentence (s).
-_NOTABLE_JITTER_S = 1e-4
-
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSolution:
@@ -202,7 +199,7 @@ class AdaptiveSolution(ModelSolution):
             f"Drift: {drift}.",
             *map(_slow_in_words, lasting),
         ]
-        if sigmas[JITTER] > _NOTABLE_JITTER_S:
+        if sigmas[JITTER] > TUNING.notable_jitter_s:
             said.append(f"stamps jitter by {1000 * sigmas[JITTER]:.2g} ms")
         if self.heavy_tails:
             said.append("Some poses are outliers and get less weight.")

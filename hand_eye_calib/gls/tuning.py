@@ -150,6 +150,8 @@ class Tuning:
     unknown_m: float = 0.2
     # What is beyond so many standard deviations is there.
     plain: float = 3.0
+    # Stamps that jitter by less are not worth a sentence (s).
+    notable_jitter_s: float = 1e-4
     # Parts of a recording for the jackknife.
     n_parts: int = 20
 
@@ -197,6 +199,12 @@ class Tuning:
     least_variance: float = 1e-18
     # Precision (1/m^2, 1/rad^2) of poses that may be anywhere.
     free: float = 1.0
+
+    # -- Speed --
+    # The blocks that are left when they have so few rows together are one dense matrix; so many
+    # triangular matrices are inverted row by row, all at once: half the time of LAPACK.
+    dense: int = 64
+    many: int = 64
 
 
 TUNING = Tuning()
