@@ -36,8 +36,10 @@ _CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
 
 
 def chained(steps: FloatArray) -> FloatArray:
-    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on."""
-    rotations = np.concatenate([np.eye(3)[None], steps])
+    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on; or
+    poses.
+    """
+    rotations = np.concatenate([np.eye(steps.shape[-1])[None], steps])
     # Products of all up to each, in as many passes as their number has binary digits.
     span = 1
     while span < len(rotations):

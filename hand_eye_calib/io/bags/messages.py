@@ -254,19 +254,6 @@ def pose_row(position: Any, orientation: Any) -> tuple[float, ...]:
     return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
-def transforms_in(message: Any) -> Iterator[PoseFields]:
-    """The transforms of a message of one of TF_TYPES, frames without a leading slash."""
-    for each in getattr(message, "transforms", [message]):
-        if hasattr(each, "header"):
-            stamp, parent, pose = each.header.stamp, each.header.frame_id, each.transform
-        else:  # of Foxglove
-            stamp, parent, pose = each.timestamp, each.parent_frame_id, each
-        frames = (printable(name[:LONGEST_NAME]) for name in (parent, each.child_frame_id))
-        row = pose_row(pose.translation, pose.rotation)
-        parent, frame = (name.lstrip("/") for name in frames)
-        yield PoseFields(ns_of(stamp) or 0, parent, frame, row[:3], row[3:])
-
-
 class Run(NamedTuple):
     """Messages of one kind that follow each other, and their bag times (N,)."""
 
@@ -284,14 +271,27 @@ class Run(NamedTuple):
                 raise self.unreadable(error) from error
             yield message
 
-    def transforms(self) -> Iterator[PoseFields]:
-        """The transforms of all messages, which are of one of TF_TYPES."""
-        for message in self.decoded():
+    def transforms(self) -> Iterator[tuple[int, PoseFields]]:
+        """Bag times, and the transforms of all messages, which are of one of TF_TYPES; frames
+        without a leading slash.
+        """
+        for message, bag_ns in zip(self.decoded(), self.bag_ns.tolist(), strict=True):
             try:
-                found = [*transforms_in(message)]
+                for each in getattr(message, "transforms", [message]):
+                    if hasattr(each, "header"):
+                        stamp, parent, pose = (
+                            each.header.stamp,
+                            each.header.frame_id,
+                            each.transform,
+                        )
+                    else:  # of Foxglove
+                        stamp, parent, pose = each.timestamp, each.parent_frame_id, each
+                    names = (x[:LONGEST_NAME].lstrip("/") for x in (parent, each.child_frame_id))
+                    parent, frame = map(printable, names)
+                    row = pose_row(pose.translation, pose.rotation)
+                    yield bag_ns, PoseFields(ns_of(stamp) or 0, parent, frame, row[:3], row[3:])
             except (AttributeError, TypeError) as error:  # JSON may have anything
                 raise self.unreadable(error) from error
-            yield from found
 
     def unreadable(self, error: Exception) -> InputError:
         """What to raise for a message that is not of its type."""

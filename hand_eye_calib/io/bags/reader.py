@@ -112,7 +112,7 @@ class PoseBag:
         """
         runs = self._runs([topic] if self.topics[topic].type in messages.TF_TYPES else [])
         first = next((run.transforms() for run in runs), ())
-        return sorted({f"{each.world_frame}:{each.sensor_frame}" for each in first})
+        return sorted({f"{each.world_frame}:{each.sensor_frame}" for _, each in first})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
         """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
@@ -288,7 +288,7 @@ class PoseBag:
         tree, notes = FrameTree("the bag's transforms"), {}
         for run in self._runs(self._of_transforms()):
             is_fixed = is_static(run.kind.topic)
-            for _, parent, frame, *values in run.transforms():
+            for _, (_, parent, frame, *values) in run.transforms():
                 try:
                     pose = checked_pose(*values) if is_fixed else None
                 except InputError as error:

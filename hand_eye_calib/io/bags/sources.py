@@ -18,14 +18,8 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import (
-    MALFORMED,
-    MessageReader,
-    Run,
-    ns_of,
-    pose_row,
-    transforms_in,
-)
+from hand_eye_calib.geometry.trajectory import chained
+from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, Run, ns_of, pose_row
 from hand_eye_calib.io.bags.poses import PoseTable, are_believable
 from hand_eye_calib.io.bags.scans import ScanOdometry, scan_of
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
@@ -246,10 +240,7 @@ class FieldReading(Reading):
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
     """Poses (N, 7) of velocities (N, 6), m/s and rad/s, in the sensor's own frame."""
     steps = (twists[1:] + twists[:-1]) / 2 * (np.diff(stamps_ns) * 1e-9)[:, None]
-    poses = np.tile(np.eye(4), (len(twists), 1, 1))
-    for row, step in enumerate(se3.exp(steps), start=1):
-        poses[row] = poses[row - 1] @ step
-        poses[row, :3, :3] = se3.nearest_rotation(poses[row, :3, :3])
+    poses = chained(se3.exp(steps))
     return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
 
 
@@ -264,10 +255,9 @@ class TransformReading(Reading):
         self._found: list[tuple[Any, ...]] = []
 
     def take(self, run: Run) -> None:
-        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
-            for transform in transforms_in(message):
-                poses = self._source.edges_at(transform, False)
-                self._found += ((bag_ns, *pose) for pose in poses)
+        for bag_ns, transform in run.transforms():
+            poses = self._source.edges_at(transform, False)
+            self._found += ((bag_ns, *pose) for pose in poses)
 
     def table(self) -> PoseTable:
         frames = self._source.source
