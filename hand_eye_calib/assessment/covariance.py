@@ -74,10 +74,6 @@ class Assessment:
     cov_parent_child_in_child: FloatArray
     observability: tuple[DofObservability, ...]
 
-    def named(self, verdict: DofVerdict) -> list[str]:
-        """Names of the axes with a verdict."""
-        return [dof.name for dof in self.observability if dof.verdict is verdict]
-
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
     """Covariance and observability of the solution of K motion pairs in order of time;
@@ -187,7 +183,7 @@ def noise_driven(
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
     rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])
-    found = []
+    found: list[FloatArray] = []
     for baseline in sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True):
         motions = np.swapaxes(rotations[:-baseline], 1, 2) @ rotations[baseline:]
         # No baseline may run across a jump, unless all of them do.
@@ -196,8 +192,8 @@ def noise_driven(
             weights[:] = 1.0
         lever_arms = LeverArms.of((motions - np.eye(3)) @ T_parent_child[:3, :3], weights)
         noise = rotation_variance(baseline) * np.eye(3)
-        found.append(_hidden_translations(lever_arms, noise, least_share))
-    return min(found, key=len)
+        found.append(lever_arms.hidden_directions(noise, least_share).T)
+    return [np.r_[direction, np.zeros(3)] for direction in min(found, key=len)]
 
 
 def combined(
@@ -229,7 +225,9 @@ def without_axes(
 ) -> Assessment:
     """An assessment that counts these axes of the parent's frame as unobservable."""
     # A direction that is unknown already is hardly ever an axis: both would hide a second one.
-    known = {*axes} - {*assessment.named(DofVerdict.UNOBSERVABLE)}
+    known = {*axes}.difference(
+        dof.name for dof in assessment.observability if dof.verdict is DofVerdict.UNOBSERVABLE
+    )
     rows = [index for index, axis in enumerate(AXES) if axis in known]
     if not rows:
         return assessment
@@ -274,16 +272,9 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     inverse = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)) @ vectors.T
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 
-    hidden = _hidden_translations(LeverArms.of(moved @ rotation, weights), cov_r)
-    return covariance, basis([*hidden, *vectors[:, ~seen].T])
-
-
-def _hidden_translations(
-    lever_arms: LeverArms, cov_rotation: FloatArray, least_share: float = MIN_SHARE
-) -> list[FloatArray]:
-    """Directions (6,) of translation that the rotations do not reveal."""
-    hidden = lever_arms.hidden_directions(cov_rotation, least_share)
-    return [np.r_[direction, np.zeros(3)] for direction in hidden.T]
+    hidden = LeverArms.of(moved @ rotation, weights).hidden_directions(cov_r).T
+    of_lever_arm = [np.r_[direction, np.zeros(3)] for direction in hidden]
+    return covariance, basis([*of_lever_arm, *vectors[:, ~seen].T])
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:

@@ -76,7 +76,8 @@ class Fused:
     @property
     def warnings(self) -> list[str]:
         """What the reasons of the verdict do not say."""
-        names = self.assessment.named(DofVerdict.PRIOR)
+        axes = self.assessment.observability
+        names = [dof.name for dof in axes if dof.verdict is DofVerdict.PRIOR]
         if not names:
             return []
         return [f"{', '.join(names)} of the child sensor: mostly from the prior, not the motion"]

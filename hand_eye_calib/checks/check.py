@@ -157,7 +157,7 @@ def _on_one_clock(
     """
     moved = streams.shifted(known_s)
     from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
-    if not streams.are_slow:
+    if streams.interval_s <= streams.max_gap_s:  # most poses have others to interpolate between
         return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
@@ -192,7 +192,7 @@ def _explained(
 
 def _offset(streams: StreamPair, fit: SimilarityFit, correlation: Correlation) -> TimeOffset:
     """The time offset of streams that agree."""
-    if streams.are_slow:  # too slow to refine it
+    if streams.interval_s > streams.max_gap_s:  # too slow to refine it
         return TimeOffset(correlation.offset_s, streams.interval_s, correlation)
     both = streams.parent, streams.child, correlation, streams.max_gap_s, fit
     return refine_time_offset(*both, least_s=LIMITS["time_offset"][1])

@@ -73,11 +73,6 @@ class StreamPair:
         """Median time between poses of the faster stream, s."""
         return min(self.parent.interval_s, self.child.interval_s)
 
-    @property
-    def are_slow(self) -> bool:
-        """Whether nothing is interpolated between most poses of both streams."""
-        return self.interval_s > self.max_gap_s
-
     def shifted(self, offset_s: float) -> "StreamPair":
         """The same with another clock of the child."""
         return replace(self, child=self.child.shifted(offset_s))
@@ -304,9 +299,10 @@ def _left_unexplained(pairs: MotionPairs) -> float:
         column = -(moved @ turned.T)[:, :, None]
         x, left_m = _fit_robustly(np.concatenate([chords, column], axis=2), -A[:, :3, 3])
         left_rad = _deviation(a - b @ (turned @ rotation).T)
-        size_m = min(_rms(A[:, :3, 3]), max(x[3], 0.0) * _rms(moved))
-        shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (_rms(a) + 1e-12)))
-    return float(min(shares))
+        size_m = min(np.linalg.norm(A[:, :3, 3]), max(x[3], 0.0) * np.linalg.norm(moved))
+        size_rad = np.linalg.norm(a)
+        shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (size_rad + 1e-12)))
+    return float(min(shares) * np.sqrt(len(pairs)))
 
 
 def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
@@ -326,10 +322,6 @@ def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, flo
 
 def _deviation(vectors: FloatArray) -> float:
     return median(np.linalg.norm(vectors, axis=1)) / MEDIAN_LENGTH
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
@@ -365,7 +357,7 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
     """Whether inverse poses may be right, or path lengths deceive: stops, or a small space."""
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
-    return streams.are_slow or all(
+    return streams.interval_s > streams.max_gap_s or all(
         np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
         for each in positions
     )
