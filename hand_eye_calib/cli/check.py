@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.check import check_streams
     from hand_eye_calib.checks.findings import answered, finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
-    from hand_eye_calib.engine.checking import check
+    from hand_eye_calib.engine.run import check
     from hand_eye_calib.engine.snapshot import whole_snapshot
     from hand_eye_calib.plain import json_text
 

@@ -23,8 +23,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.checking import check
-from hand_eye_calib.engine.run import review, with_options
+from hand_eye_calib.engine.run import check, review, with_options
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration

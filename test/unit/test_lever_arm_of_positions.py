@@ -6,7 +6,7 @@ from motions import geodetic, planar_poses, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.checking import check
+from hand_eye_calib.engine.run import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

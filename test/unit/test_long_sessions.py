@@ -19,7 +19,7 @@ from motions import (
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.engine.checking import check
+from hand_eye_calib.engine.run import check
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 
