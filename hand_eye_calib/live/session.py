@@ -13,11 +13,7 @@ from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
 from hand_eye_calib.live.journal import SessionJournal
 from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.state import JournalState, Level
-
-# How long (s) a disk, or a solve under way, may each hold up the end of the program.
-GRACE_S = 0.4
-
+from hand_eye_calib.live.state import GRACE_S, JournalState, Level
 
 # The engines by the child sensor of each; all of them have the same parent.
 Engines = Mapping[str, Calibrator]

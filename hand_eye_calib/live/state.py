@@ -14,8 +14,9 @@ from hand_eye_calib.plain import plain
 from hand_eye_calib.results.context import Comparison, Progress
 from hand_eye_calib.results.status import AXES
 
-# The node says how it is so often (s).
-REPORT_PERIOD_S = 1.0
+# The node says how it is so often (s). A disk, a solve under way and who listens may each hold up
+# its end for so long (s).
+REPORT_PERIOD_S, GRACE_S = 1.0, 0.4
 
 AxisValues = Mapping[str, float | None]
 

@@ -76,7 +76,7 @@ def _run_node(signals: int) -> int:
     from rclpy.executors import SingleThreadedExecutor
 
     from hand_eye_calib.errors import HandEyeCalibError
-    from hand_eye_calib.live.session import GRACE_S
+    from hand_eye_calib.live.state import GRACE_S
     from hand_eye_calib.ros.calibrator_node import CalibratorNode
 
     # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.

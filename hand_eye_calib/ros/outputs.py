@@ -9,8 +9,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from hand_eye_calib.live.session import GRACE_S
-from hand_eye_calib.live.state import NodeState
+from hand_eye_calib.live.state import GRACE_S, NodeState
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.status import AXES, ROTATIONS
