@@ -252,7 +252,7 @@ LIMITS = {
     "worlds_turned": (6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),  # rad
     # Share of the speed: the direction is then off by half the usual target of a rotation.
     "world_drift": (6.0, 0.003, 0.003, _NEVER),
-    "mount_moved": (0.0, 0.005, 0.005, 0.02),  # m, of a place up to 1 m from the sensor
+    "mount_moved": (0.0, 0.005, 0.005, 0.0175),  # m, of a place up to 1 m from the sensor
 }
 
 
