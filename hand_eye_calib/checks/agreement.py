@@ -30,6 +30,10 @@ _STREAMS = ("child", "parent")
 # How many times a fault of the response must exceed what noise of its columns may make of it.
 _BIASES = 2.0
 
+# An odometry may drift along one axis by this share of the distance: on a flat floor that alone
+# is its motion along z, and the other stream knows nothing of it.
+_DRIFT = 0.02
+
 # Two frames are one if they are this close (m, rad), within so many standard deviations; that of
 # the rotation must not be larger than the third.
 _SAME_M, _SAME_RAD, _MAX_SIGMA_RAD = 0.005, float(np.radians(0.3)), float(np.radians(0.5))
@@ -185,7 +189,9 @@ def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     """A coordinate of a stream that has another scale than the others."""
     fitted = slow.fit(f"axes_{stream}", without="scale")
     k, off, sigma = _odd_one(fitted)
-    if abs(off) < _BIASES * fitted.biases[k]:
+    of_noise = fitted.biases[k]
+    of_drift = _DRIFT**2 * of_noise / slow.fit("scale", without="scale").biases[0]
+    if abs(off) < _BIASES * (of_noise + of_drift):
         return fitted.share, None
     size = off if fitted.share > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
     values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}

@@ -1,5 +1,6 @@
 """Faults that give a wrong extrinsic in confidence are found and named, in a simulated drive."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -14,7 +15,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
 from reproduction.fault_cases import FAULTS, SILENT
 
 # Seen by a solve or with no effect at that severity: too little noise, or a part of the tilt.
@@ -41,6 +42,13 @@ def test_every_fault_is_named(fault):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_drive_has_no_finding(seed):
     assert [found.code for found in check_streams(*_streams(drive(seed))).findings] == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drift_on_a_flat_floor_is_no_scale_of_heights(seed):
+    noise = dataclasses.replace(REALISTIC, drift=0.01)
+    flat = simulate_drive(seed, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0), noise)
+    assert "axis_scale" not in {found.code for found in check_streams(*_streams(flat)).findings}
 
 
 def _streams(simulated):
