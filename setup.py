@@ -115,7 +115,6 @@ setup(
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "camera": ["opencv-python-headless>=4.7,<5"],
         "cluster": ["distributed>=2024.1"],
-        "completion": ["argcomplete>=2.0"],
         "qr": ["segno>=1.5"],
         "foxglove": ["mcap-protobuf-support>=0.5"],
         "fleet": ["fsspec[http]>=2024.2"],

@@ -30,7 +30,7 @@ examples:
   hand_eye_calib calibrate lidar.txt camera.txt --out result
   hand_eye_calib calibrate my_bag --list
   hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
-  hand_eye_calib calibrate my_bag --parent-tf odom:lidar --child-topic /vio --out result
+  hand_eye_calib calibrate my_bag --parent-topic odom:lidar --child-topic /vio --out result
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
   hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
   hand_eye_calib calibrate monday/bag tuesday/bag wednesday/bag --out together
@@ -144,7 +144,7 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise ConfigError("--dask and --vehicle are for --batch")
     if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
-    named = [f"{stream}_{kind}" for stream in STREAMS for kind in ("topic", "tf")]
+    named = [f"{stream}_topic" for stream in STREAMS]
     others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
     if arguments.topics and others:
         raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
@@ -230,7 +230,6 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         usable, frames = "yes" * topic["is_usable"], " ".join(map(printable, topic["frames"]))
         print(_ROW.format(*cells, usable, frames).rstrip())
     print(
-        "--parent-topic and --child-topic take the topics with poses, --parent-tf and --child-tf "
-        "frames of /tf: odom:lidar"
+        "--parent-topic and --child-topic take the topics with poses, or frames of /tf: odom:lidar"
     )
     return 0

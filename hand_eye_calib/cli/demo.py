@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note, print_result, waiting_for
-from hand_eye_calib.cli.options import at_least
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
@@ -38,14 +37,12 @@ _STOP_S = 10.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...]"
-    parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --seed 7 --out demo_7"
+    parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --out demo_2"
     out = (
         "directory for the bag, the node's log and report.html; those of an earlier demo are "
         "replaced. Default: demo_output"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_output"), help=out)
-    seed = "another seed gives another recording. Default: 0"
-    parser.add_argument("--seed", type=at_least(0), default=0, help=seed)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.simulation.drive import simulate_drive
 
     with waiting_for("simulating"):
-        drive = simulate_drive(arguments.seed, DRIVE, REALISTIC)
+        drive = simulate_drive(0, DRIVE, REALISTIC)
         bag_path = arguments.out / "demo_bag"
         if bag_path.is_dir():
             shutil.rmtree(bag_path)

@@ -5,7 +5,6 @@ when it is asked for, so that a missing optional package breaks no other command
 """
 
 import argparse
-import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -144,15 +143,9 @@ def _run(argv: Sequence[str]) -> int:
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     added = {each: commands.add_parser(each, help=COMMANDS[each], **look) for each in COMMANDS}
-    is_completing = "_ARGCOMPLETE" in os.environ  # set by the shell functions of argcomplete
-    for name in COMMANDS if is_completing else filter(None, [command]):
-        added[name].description = COMMANDS[name]
-        module_of(name).add_arguments(added[name])
-    if is_completing:
-        with contextlib.suppress(ModuleNotFoundError):
-            import argcomplete
-
-            argcomplete.autocomplete(parser)  # tells the shell, and ends the process
+    if command is not None:
+        added[command].description = COMMANDS[command]
+        module_of(command).add_arguments(added[command])
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
         word = next((each for each in rest if each.startswith("-")), rest[0]).partition("=")[0]

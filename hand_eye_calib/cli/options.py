@@ -17,7 +17,6 @@ from hand_eye_calib.cli.console import OPTION_FIELDS, STREAMS, flag, note
 from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS, NodeConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.option import check_value, did_you_mean, option_name
-from hand_eye_calib.text import split_frames
 
 Options = dict[str, Any]
 
@@ -203,11 +202,11 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         "out if the bag has only two",
     )
     for stream in STREAMS:
-        add = group.add_mutually_exclusive_group().add_argument
-        topic = f"poses of the {stream} sensor, of any type, or FIX+IMU of two topics"
-        add(f"--{stream}-topic", metavar="TOPIC", help=topic)
-        tf = "the same from /tf and /tf_static: fixed frame and the sensor's, as odom:lidar"
-        add(f"--{stream}-tf", metavar="WORLD:SENSOR", type=_frames, help=tf)
+        topic = (
+            f"poses of the {stream} sensor, of any type; FIX+IMU of two topics; or from /tf and "
+            "/tf_static: fixed frame and the sensor's, as odom:lidar"
+        )
+        group.add_argument(f"--{stream}-topic", metavar="TOPIC", help=topic)
         fields = (
             f"where the poses are in messages of any type on --{stream}-topic: "
             "t=header.stamp,x=pose.position.x,..."
@@ -232,14 +231,12 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
     """Topic or frames, WORLD:SENSOR, of "parent" and "child", if they are given."""
     found = {}
     for stream in STREAMS:
-        topic, tf, fields = (
-            getattr(arguments, f"{stream}_{kind}") for kind in ("topic", "tf", "fields")
-        )
+        topic, fields = (getattr(arguments, f"{stream}_{kind}") for kind in ("topic", "fields"))
         if fields and not topic:
             raise ConfigError(f"--{stream}-fields is of messages: give --{stream}-topic, too")
         if stream == "child" and topic and getattr(arguments, "target", None):
             fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
-        found[stream] = f"{topic}?{fields}" if fields else topic or tf
+        found[stream] = f"{topic}?{fields}" if fields else topic
     return {stream: source for stream, source in found.items() if source}
 
 
@@ -278,11 +275,6 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
     if or_verbose:
         text = "print details of the solution, too"
         parser.add_argument("-v", "--verbose", action="store_true", help=text)
-
-
-@argument_type
-def _frames(text: str) -> str:
-    return ":".join(split_frames("it", text))
 
 
 def _path(text: str) -> Path | str:

@@ -93,13 +93,15 @@ def test_frames_stand_for_topics(run, bag, tmp_path):
         both = [(ns, "map", "lidar", parent), (ns, "odom", "camera", child)]
         messages.append((ns, "/tf", TF, tf_message(both)))
     path = write_messages(tmp_path / "tf", messages)
-    code, out, err = run(path, "--parent-tf", "map:lidar", "--child-tf", "odom:camera", "--json")
+    code, out, err = run(
+        path, "--parent-topic", "map:lidar", "--child-topic", "odom:camera", "--json"
+    )
     document = json.loads(out)
     assert (code, err) == (0, "")
     assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
     assert document["inputs"]["child"]["topic"] == "transform odom:camera"
     np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
-    code, out, err = run(path, "--parent-tf", "map:lidar", "--child-tf", "odom:radar")
+    code, out, err = run(path, "--parent-topic", "map:lidar", "--child-topic", "odom:radar")
     assert (code, out) == (1, "")
     assert "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera" in err
 
@@ -117,8 +119,6 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["bag", "--parent-tf", "odom"], "--parent-tf: it must be two frames as WORLD:SENSOR"),
-        (["bag", "--parent-tf", "a:b", "--parent-topic", "/a"], "not allowed with argument"),
         (["bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
         (["bag", "--batch", "fleet.yaml"], "--batch cannot be combined with PATH or --list"),
         (["--batch", "none*"], "no bag matches none*"),

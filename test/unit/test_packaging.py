@@ -24,7 +24,7 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 # as with pip and launch.
 DECLARED_AS = {
     # Optional, or without a rosdep key: rosbags reads whole files of mcap.
-    **{name: (name, None) for name in ("mcap", "fsspec", "small_gicp", "argcomplete", "segno")},
+    **{name: (name, None) for name in ("mcap", "fsspec", "small_gicp", "segno")},
     **{name: (name, None) for name in ("pandas", "pyulog")},
     "backports": ("backports.zstd", None),  # rosbags requires it too
     "compression": (None, None),  # the standard library of Python 3.14

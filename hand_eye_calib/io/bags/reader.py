@@ -145,7 +145,7 @@ class PoseBag:
         elif not fields and (type_ := self._type_of(topic)) not in messages.MESSAGE_TYPES:
             hint = "read others by their fields, TOPIC?t=header.stamp,x=..."
             if type_ in messages.TF_TYPES:
-                hint = "name two of its frames with --parent-tf and --child-tf"
+                hint = "name two of its frames instead, as odom:lidar"
             elif type_ in messages.IMAGE_TYPES:
                 hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
             raise InputError(
@@ -177,8 +177,8 @@ class PoseBag:
         if wanted and not choices:
             found = sorted({edge for name in self.topics for edge in self.edges_on(name)})
             raise InputError(
-                "name the topics of poses with --parent-topic and --child-topic, or frames with "
-                f"--parent-tf and --child-tf. {self._listing()}"
+                "name the topics of poses with --parent-topic and --child-topic, or frames as "
+                f"odom:lidar. {self._listing()}"
                 + (f". Transforms are {', '.join(found)[:LONGEST_NAME]}" if found else "")
             )
         chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
