@@ -7,14 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-
-from hand_eye_calib.errors import MissingDependencyError
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # No number of a file is as large: the products of some are still finite.
 _LARGEST = 1e50
@@ -118,20 +113,3 @@ def _of_type(kind: type, value: Any) -> Any:
 def json_text(document: Any) -> str:
     """One JSON document, as people can read it."""
     return json.dumps(plain(document), indent=2, allow_nan=False)
-
-
-def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
-    """A DataFrame of rows with equal names, one of which is the index.
-
-    Raises
-    ------
-    MissingDependencyError
-        Without pandas.
-    """
-    try:
-        import pandas as pd
-    except ImportError as error:
-        raise MissingDependencyError(
-            "tables need pandas, which is not installed: pip install 'hand_eye_calib[notebook]'"
-        ) from error
-    return pd.DataFrame(list(rows)).set_index(index)

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import WEAK
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.synchronise import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.stats import median, quantile
-from hand_eye_calib.text import amount, angle, axes_in_words, length, listing
+from hand_eye_calib.text import axes_in_words, listing
 
 # Most poses that are looked at, evenly over the session: enough to see curves, and few enough to
 # cost a few milliseconds.
@@ -158,25 +157,15 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     str
         Empty if nothing is missing.
     """
-    hidden = seen.hidden_axes()
+    axes, what = [*seen.hidden_axes()], "cannot be determined from"
     if calibration:
-        reach = set(calibration.out_of_reach)
-        hidden = tuple(axis for axis in calibration.unobservable() if axis not in reach)
-    if hidden:
-        return (
-            f"{axes_in_words(hidden)} cannot be determined from the motion so far: "
-            f"{helpful_motion(hidden, seen)}"
-        )
-    known = calibration.observability if calibration else ()
-    weak = [dof for dof in known if dof.verdict is DofVerdict.WEAK]
-    if not weak:
+        axes = [each for each in calibration.unobservable() if each not in calibration.out_of_reach]
+        if not axes:
+            known, what = calibration.observability, "still uncertain after"
+            axes = [dof.name for dof in known if dof.verdict is DofVerdict.WEAK]
+    if not axes:
         return ""
-    told = [f"{axes_in_words([dof.name])} (+/- {amount(dof.name, dof.sigma)})" for dof in weak]
-    limits = f"{length(WEAK[0])} or {angle(WEAK[1])}"
-    return (
-        f"{listing(told)} still more uncertain than {limits}: continue; "
-        f"{helpful_motion([dof.name for dof in weak], seen)}"
-    )
+    return f"{axes_in_words(axes)} {what} the motion so far: {helpful_motion(axes, seen)}"
 
 
 def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:

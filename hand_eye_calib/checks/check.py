@@ -46,7 +46,6 @@ from hand_eye_calib.checks.streams import (
     check_frozen,
     check_lengths,
     check_positions,
-    check_stamps,
     check_stream,
 )
 from hand_eye_calib.config import CalibratorConfig
@@ -253,10 +252,8 @@ def _check_each(
     max_gap_s: float,
     check: Callable[[Trajectory, str, float], list[Finding]],
 ) -> list[Finding]:
-    """Findings about the stamps of two streams together, and by a check of each alone."""
+    """Findings about two streams by a check of each alone."""
     findings = []
-    if min(len(parent), len(child)):
-        findings += check_stamps(parent.stamps_ns, child.stamps_ns)
     for stream, trajectory in (("parent", parent), ("child", child)):
         findings += check(trajectory, stream, max_gap_s)
     return findings

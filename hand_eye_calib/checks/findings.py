@@ -52,11 +52,6 @@ _ROWS = {
         "sensor moves",
         "find out why its source stopped, and cut that part out",
     ),
-    "stamp_unit": _Row(
-        "{whose} stamps are {unit} instead of nanoseconds: they are {factor:g} times nearer to "
-        "1970 than the {other}'s",
-        "multiply {whose} stamps by {factor:g}",
-    ),
     "interleaved": _Row(
         "{whose} poses alternate between two levels {distance_m:.2g} m apart",
         "give each its own topic, and calibrate one",

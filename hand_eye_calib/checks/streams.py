@@ -1,10 +1,10 @@
-"""Checks of a single stream, and of the stamps of two."""
+"""Checks of a single stream, and of one beside another."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
@@ -38,10 +38,6 @@ _TURNS, _STEADY_SHARE = 10, 0.5
 # of the smallest, to this share of a step.
 _MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
 _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
-
-# Stamps of a date are around 1.7e18 ns. Read in another unit they are off by powers of a thousand.
-_STAMP_UNITS = ("nanoseconds", "microseconds", "milliseconds", "seconds")
-_DATE_NS = 1e17
 
 # No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears ten times
 # gravity for a whole second (m/s^2), which is twice what a racing car does. Arms, which move least,
@@ -238,19 +234,6 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
         if max(distance, angle) > _MOVES:
             frozen_ns += until_ns - from_ns
     return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
-
-
-def check_stamps(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> list[Finding]:
-    """Finding about stamps (N,), as read, in another unit than the other stream's, or none."""
-    stamps = {"parent": median(parent_stamps_ns), "child": median(child_stamps_ns)}
-    early, late = sorted(stamps, key=lambda name: stamps[name])
-    if stamps[early] <= 0 or stamps[late] < _DATE_NS:
-        return []
-    power = round(np.log10(stamps[late] / stamps[early]) / 3)
-    if not 0 < power < len(_STAMP_UNITS):
-        return []
-    unit = _STAMP_UNITS[power]
-    return [finding("stamp_unit", early, other=late, unit=unit, factor=1000.0**power)]
 
 
 def check_lengths(parent: Trajectory) -> list[Finding]:

@@ -21,7 +21,8 @@ from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
-    from hand_eye_calib.arrays import FloatArray
+    from numpy import ndarray
+
     from hand_eye_calib.results.calibration import Calibration
     from hand_eye_calib.simulation.drive import SimulatedDrive
 
@@ -110,7 +111,7 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
             process.kill()
 
 
-def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "FloatArray") -> Iterator[str]:
+def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> Iterator[str]:
     """The verdict, each result beside the truth, and how far it is off."""
     from hand_eye_calib.assessment.metrics import absolute_errors
     from hand_eye_calib.geometry import se3

@@ -6,6 +6,7 @@ both halves of the recording what changes during it. Neither shows an error that
 """
 
 import contextlib
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,7 +20,6 @@ from hand_eye_calib.engine.estimation import Solved, solve_poses
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.synchronise import PosePairs
-from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import AxisScatter, CrossCheck
 from hand_eye_calib.results.status import AXES
@@ -139,12 +139,11 @@ def compare_answers(
         "excess_of_halves": excess_of_halves,
         "excess_over_own": of_as_certain / np.hypot(own, floor),
     }
-    known = np.isfinite(sigmas)
+    table = np.where(np.isfinite(sigmas), [*columns.values()], np.nan).T.tolist()
+    rows = [[each if math.isfinite(each) else None for each in row] for row in table]
     return {
-        axis: AxisScatter(
-            **{name: plain(values[k]) if known[k] else None for name, values in columns.items()}
-        )
-        for k, axis in enumerate(AXES)
+        axis: AxisScatter(**dict(zip(columns, row, strict=True)))
+        for axis, row in zip(AXES, rows, strict=True)
     }
 
 

@@ -160,9 +160,7 @@ class AdaptiveSolution(ModelSolution):
             translation_white_m=float(sigmas[TRANSLATION]),
             rotation_drift_rad_per_pose=float(sigmas[WALK_ROTATION]),
             translation_drift_m_per_pose=float(sigmas[WALK_TRANSLATION]),
-            stamp_jitter_s=float(sigmas[JITTER]),
             lasting=lasting,
-            rotation_turns_about=self.model.centre,
             heavy_tails=self.heavy_tails,
             systematic=self.systematic,
             misfit=self.misfit,
@@ -261,13 +259,13 @@ class LeverArmSolution(ModelSolution):
         sigmas = np.exp(0.5 * self.levels)
         white, walk = (float(sigmas[level]) for level in (TRANSLATION, WALK_TRANSLATION))
         turned = float(sigmas[WALK_ROTATION])
-        worse = float(np.mean(self.worse))
         said = [
             f"each position is off by {length(white)} per axis, and the odometry drifts by "
             f"{length(walk)} and {angle(turned)} from one to the next"
         ]
-        if worse:
-            said.append(f"{worse:.0%} of the positions are far less precise, and are left out")
+        if self.worse.any():
+            share = f"{self.worse.mean():.0%} of the positions"
+            said.append(f"{share} are far less precise, and are left out")
         response, sigma = 1e3 * np.array(self.response)
         if abs(response) > TUNING.plain * sigma:
             said.append(
@@ -281,7 +279,6 @@ class LeverArmSolution(ModelSolution):
             translation_white_m=white,
             translation_drift_m_per_pose=walk,
             rotation_drift_rad_per_pose=turned,
-            share_of_worse_positions=worse,
             misfit=self.misfit,
             in_words=tuple(said),
         )

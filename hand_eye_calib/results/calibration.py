@@ -1,7 +1,7 @@
 """The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
+from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance
-from hand_eye_calib.plain import data_frame
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, usable_numbers, values_of
 from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
@@ -38,6 +38,14 @@ __all__ = [
     "SolveStatus",
     "Verdict",
 ]
+
+
+def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
+    """A DataFrame of rows with equal names, one of which is the index; a MissingDependencyError
+    without pandas.
+    """
+    pandas = required("pandas", "a table", "hand_eye_calib[notebook]")
+    return cast("pd.DataFrame", pandas.DataFrame(rows).set_index(index))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

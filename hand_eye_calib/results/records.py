@@ -153,11 +153,8 @@ class Noise:
     rotation_white_rad: float | None = None
     translation_drift_m_per_pose: float | None = None
     rotation_drift_rad_per_pose: float | None = None
-    stamp_jitter_s: float | None = None
     lasting: tuple[CorrelatedError, ...] = ()
-    rotation_turns_about: str | None = None
     heavy_tails: bool | None = None
-    share_of_worse_positions: float | None = None
     systematic: str = ""
 
 

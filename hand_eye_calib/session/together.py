@@ -15,8 +15,13 @@ from hand_eye_calib.assessment.moved import scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.plain import data_frame
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.results.calibration import (
+    Calibration,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+    data_frame,
+)
 from hand_eye_calib.results.context import Recorded, Together
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions

@@ -307,7 +307,7 @@ def test_a_camera_that_sees_a_target_swings_about_it(centre):
         else:
             parent = disturbed_about_origin(parent, 300 + seed, 0.003, 0.004)
         solution = estimator.solve(stamps(200), parent, child)
-        assert solution.noise.rotation_turns_about == centre
+        assert solution.model.centre == centre
         distances.append(squared_distance(solution))
     assert 2.0 < np.median(distances) < 11.0
 

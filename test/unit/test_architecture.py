@@ -64,7 +64,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, "ros/") | {
     "pyulog": "io/trajectory_files/foreign.py",
     "casadi": "solvers/ipopt.py",
     "matplotlib": "report/",
-    "pandas": ("results/calibration.py", "plain.py", "session/together.py"),
+    "pandas": ("results/calibration.py", "session/together.py"),
     "jinja2": "report/",
 }
 
