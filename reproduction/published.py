@@ -16,7 +16,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import read_trajectory
+from hand_eye_calib.io.trajectory_files.reading import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import park
 from reproduction.metrics import Errors

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import read_trajectory, read_trajectory_file
+from hand_eye_calib.io.trajectory_files.reading import read_trajectory, read_trajectory_file
 from reproduction.published import KEYFRAMES, KITTI_DRIVES, RECTIFIED
 
 # Parts of a drive, by how many there are.

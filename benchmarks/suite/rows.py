@@ -16,7 +16,8 @@ from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
-from hand_eye_calib.io.bags import PoseBag, write_bag
+from hand_eye_calib.io.bags.reader import PoseBag
+from hand_eye_calib.io.bags.writer import write_bag
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.solvers import quadratic_form
 from hand_eye_calib.solvers.registry import Method

@@ -201,8 +201,8 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """Print the topics of a bag, with the rate in the bag's time, the frames of the first messages,
     and whether one can be one of the two sensors; returns the exit code.
     """
-    from hand_eye_calib.io.bags import PoseBag
     from hand_eye_calib.io.bags.messages import MESSAGE_TYPES
+    from hand_eye_calib.io.bags.reader import PoseBag
 
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
         topics = [

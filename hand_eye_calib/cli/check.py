@@ -89,7 +89,7 @@ def _opened(
         return names, *reading.read_files(arguments, paths, options)
     from hand_eye_calib.cli import bags
     from hand_eye_calib.config import CalibratorConfig
-    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.reader import PoseBag
 
     config = CalibratorConfig.from_options(options)
     with PoseBag(paths[0]) as bag:

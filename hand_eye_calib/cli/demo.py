@@ -51,7 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.cli.bags import read_recording
     from hand_eye_calib.cli.present import exit_code
     from hand_eye_calib.cli.reporting import write_report
-    from hand_eye_calib.io.bags import PoseBag, write_bag
+    from hand_eye_calib.io.bags.reader import PoseBag
+    from hand_eye_calib.io.bags.writer import write_bag
     from hand_eye_calib.ros.player import play
     from hand_eye_calib.simulation.drive import simulate_drive
 

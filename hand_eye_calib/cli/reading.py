@@ -96,7 +96,7 @@ def read_files(
     guessed. How each is read is among the arguments: of two, its own options go before those for
     both. ``options`` say what the sensors measure.
     """
-    from hand_eye_calib.io.trajectory_files import FileOptions, read_trajectory_files
+    from hand_eye_calib.io.trajectory_files.reading import FileOptions, read_trajectory_files
 
     streams = STREAMS[: len(paths)] if len(paths) < 3 else [""] * len(paths)
     for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):

@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write; returns the exit code."""
     from hand_eye_calib.geometry.trajectory import Trajectory
-    from hand_eye_calib.io.trajectory_files import write_trajectory
+    from hand_eye_calib.io.trajectory_files.writing import write_trajectory
     from hand_eye_calib.simulation.drive import simulate_drive
 
     config = _DRIVES[arguments.drive]
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         write_trajectory(folder / TRUTH_FILE, truth)
         streams = {PARENT_TOPIC: (drive.parent, _TYPE), CHILD_TOPIC: (drive.child, _TYPE)}
         if arguments.bag:
-            from hand_eye_calib.io.bags import write_bag
+            from hand_eye_calib.io.bags.writer import write_bag
 
             name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
             write_bag(folder / name, streams, arguments.bag)

@@ -27,7 +27,7 @@ from hand_eye_calib.text import parse_pose
 # Results say what they are.
 _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
-_DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib", ".npy")
+_DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
 _EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(FORMATS)
 
 
@@ -82,7 +82,7 @@ def stated(
 
 def frames_of_bag(path: str | Path) -> FrameTree:
     """The frames of a bag's ``/tf_static``."""
-    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.reader import PoseBag
 
     with PoseBag(path) as bag:
         return bag.static_frames
@@ -104,11 +104,6 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
 
 def _document(path: Path) -> Any:
     """What a file has, in plain values."""
-    if path.suffix == ".npy":
-        try:
-            return np.load(path, allow_pickle=False, mmap_mode="r").tolist()
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"cannot read {path}: {error}") from None
     document = read_yaml(path, _EXPECTED)
     if isinstance(document, str) and "EKF2_" in document:
         raise InputError(

@@ -10,7 +10,7 @@ from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.io.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from reproduction.independent import shrimp_sensors
 from reproduction.recordings import between

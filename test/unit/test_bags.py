@@ -29,8 +29,8 @@ import hand_eye_calib as hec
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags import PoseBag, write_bag
-from hand_eye_calib.io.bags.writer import stamped_messages, write_streams
+from hand_eye_calib.io.bags.reader import PoseBag
+from hand_eye_calib.io.bags.writer import stamped_messages, write_bag, write_streams
 
 SECOND = 10**9
 POSES = wandering_poses(120)

@@ -28,7 +28,7 @@ from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.bags.writer import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import SolveStatus

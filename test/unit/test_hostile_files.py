@@ -16,7 +16,8 @@ from hand_eye_calib.cli.batch.run import stored
 from hand_eye_calib.cli.batch.work import Task
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.results import load_result, save_result
-from hand_eye_calib.io.trajectory_files import read_trajectory_file, write_trajectory
+from hand_eye_calib.io.trajectory_files.reading import read_trajectory_file
+from hand_eye_calib.io.trajectory_files.writing import write_trajectory
 
 PARENT = as_trajectory(wandering_poses(30), sensor_frame="lidar")
 CHILD = as_trajectory(

@@ -15,7 +15,7 @@ from rosbags.typesys import get_types_from_msg
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags import PoseBag
+from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.transforms import TfSource
 
 TIMES = np.arange(0, 30, 0.05)

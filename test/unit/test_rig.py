@@ -11,7 +11,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.cli.rig import as_lines
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags import write_bag
+from hand_eye_calib.io.bags.writer import write_bag
 from hand_eye_calib.io.results import save_rig
 from hand_eye_calib.report.report import render_rig
 from reproduction.rig import simulated, unequal

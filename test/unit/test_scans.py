@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags import PoseBag
+from hand_eye_calib.io.bags.reader import PoseBag
 
 pytest.importorskip("small_gicp", reason="needs small_gicp")
 

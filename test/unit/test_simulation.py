@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.cli import main
 from hand_eye_calib.cli import simulate as simulate_command
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.trajectory_files import read_trajectory
+from hand_eye_calib.io.trajectory_files.reading import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.simulation.drive import simulate_drive, surface
 from hand_eye_calib.simulation.options import (
@@ -168,7 +168,7 @@ def test_command_writes_the_published_layout(tmp_path, capsys):
     ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
 )
 def test_command_writes_bags(tmp_path, capsys, storage, name):
-    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.reader import PoseBag
 
     given = f"--drive hilly --poses 30 --bag {storage}".split()
     assert simulate(capsys, "--out", tmp_path / "sims", *given)[0] == 0

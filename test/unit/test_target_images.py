@@ -10,7 +10,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags import PoseBag
+from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.writer import stamped_messages
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, images_in, read_camera
 from hand_eye_calib.io.trajectory_files.writing import write_trajectory

@@ -12,7 +12,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.trajectory_files import (
+from hand_eye_calib.io.trajectory_files.reading import (
     AUTO,
     FileOptions,
     read_trajectory_file,

@@ -117,12 +117,7 @@ class MessageType(NamedTuple):
 
 
 # Where that stands in what is unpacked; latitude, longitude and height are positions.
-_PARTS = {
-    "poses": slice(7),
-    "positions": slice(3),
-    "rotations": slice(3, 7),
-    "rates": slice(3),
-}
+_PARTS = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7), "rates": slice(3)}
 _OF_POSES, _OF_POINTS = ("poses", "positions", "rotations"), ("positions",)
 _TURN = "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
 _PLACE = "lat_deg={0}latitude,lon_deg={0}longitude,height={0}altitude"
@@ -278,14 +273,11 @@ class Run(NamedTuple):
         for message, bag_ns in zip(self.decoded(), self.bag_ns.tolist(), strict=True):
             try:
                 for each in getattr(message, "transforms", [message]):
-                    if hasattr(each, "header"):
-                        stamp, parent, pose = (
-                            each.header.stamp,
-                            each.header.frame_id,
-                            each.transform,
-                        )
+                    if is_ros := hasattr(each, "header"):
+                        stamp, parent = each.header.stamp, each.header.frame_id
                     else:  # of Foxglove
-                        stamp, parent, pose = each.timestamp, each.parent_frame_id, each
+                        stamp, parent = each.timestamp, each.parent_frame_id
+                    pose = each.transform if is_ros else each
                     names = (x[:LONGEST_NAME].lstrip("/") for x in (parent, each.child_frame_id))
                     parent, frame = map(printable, names)
                     row = pose_row(pose.translation, pose.rotation)

@@ -6,21 +6,3 @@ names no other unit. The units of stamps and of angles are recognised from their
 a quaternion's coefficients is the format's or is named. Only with ``auto`` is it judged by the
 motion, and what was found is said.
 """
-
-from hand_eye_calib.io.trajectory_files.reading import (
-    AUTO,
-    FileOptions,
-    read_trajectory,
-    read_trajectory_file,
-    read_trajectory_files,
-)
-from hand_eye_calib.io.trajectory_files.writing import write_trajectory
-
-__all__ = [
-    "AUTO",
-    "FileOptions",
-    "read_trajectory",
-    "read_trajectory_file",
-    "read_trajectory_files",
-    "write_trajectory",
-]

@@ -38,13 +38,11 @@ _Reader = Callable[[bytes, str | None], _Rows]
 
 
 def foreign_table(
-    path: str | Path, data: bytes, read: _Reader | str, choice: str | None, measures: str
+    path: str | Path, data: bytes, read: _Reader, choice: str | None, measures: str
 ) -> Table:
     """The rows of a file in one of these formats, with what :data:`PROGRAMS` has for it.
     ``choice`` says which of several bodies is meant. An InputError if it cannot be read.
     """
-    if isinstance(read, str):
-        raise InputError(f"{path}: {read}")
     try:
         header, rows, notes = read(data, choice)
         rows = [[*map(str, row)] for row in rows]
@@ -272,15 +270,8 @@ def _chosen(found: Mapping[str, Any], choice: str | None, what: str) -> str:
     return next(iter(found))
 
 
-#: How files begin that are no text with a row of numbers on each line, and what reads them, or what
-#: to do.
-PROGRAMS: dict[bytes, _Reader | str] = {
-    rb"\AMATLAB 5.0 MAT-file": "a binary file of MATLAB; save the poses as text, "
-    "save('poses.txt', 'poses', '-ascii', '-double')",
-    rb"\APK\x03\x04": "a spreadsheet or another zip file; save the sheet as csv",
-    rb"\A\x89HDF": "an HDF5 file; save the poses as csv or .npy",
-    rb"\A\x80\x04": "a pickle of Python, which is not read as it could run anything; save .npy or "
-    "csv",
+#: How files begin that are no text with a row of numbers on each line, and what reads them.
+PROGRAMS: dict[bytes, _Reader] = {
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
     rb"\A(<\?xml[^>]*>\s*)?<gpx": _of_gpx,

@@ -196,7 +196,7 @@ def read_trajectory(
 
 
 def _of_bag(path: Path, topic: str | None, tf: str | None, measures: str) -> Trajectory:
-    from hand_eye_calib.io.bags import PoseBag
+    from hand_eye_calib.io.bags.reader import PoseBag
     from hand_eye_calib.io.transforms import TfSource
 
     with PoseBag(path) as bag:
@@ -330,7 +330,10 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected lines of a trajectory") from None
+        raise InputError(
+            f"{path}: not a text file; expected lines of a trajectory: save the poses of MATLAB, "
+            "HDF5, spreadsheets and pickles as csv"
+        ) from None
     number, cells, names, format, header = _beginning(path, text)
     columns, times, guesses = options.columns, options.times, list[str]()
     if options.format != AUTO or columns or times:
