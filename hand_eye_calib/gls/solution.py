@@ -73,6 +73,18 @@ class ModelSolution:
     objective: float
     converged: bool
 
+    def events(self, stamps_ns: IntArray) -> list[str]:
+        """Jumps and outliers in words, with the times (s) of the first."""
+        said, found = [], {
+            "jumps of a trajectory, just before": stamps_ns[1:][self.jumps],
+            "poses wrong by themselves and left out, at": stamps_ns[self.spikes],
+        }
+        for what, at_ns in found.items():
+            if count := len(at_ns):
+                first = ", ".join(f"{each * 1e-9:.3f}" for each in at_ns[:5].tolist())
+                said.append(f"{count} {what} {first}{' ...' if count > 5 else ''} s")
+        return said
+
 
 def parts_of(parameters: FloatArray, sigmas: FloatArray, unit: float = 1.0) -> dict[str, Any]:
     """The fields of a solution that parameters make, with the factor of the child's lengths that
@@ -168,10 +180,7 @@ class AdaptiveSolution(ModelSolution):
 
     def describe(self, stamps_ns: IntArray) -> Noise:
         """The noise in plain numbers and in words, with the times of jumps and outliers."""
-        jumps, spikes = stamps_ns[1:][self.jumps], stamps_ns[self.spikes]
-        said = [*self._noise_in_words(), *self._systematic_in_words()]
-        said += _when("jump", "of a trajectory, just before", jumps)
-        said += _when("pose", "wrong by {} and left out, at", spikes)
+        said = [*self._noise_in_words(), *self._systematic_in_words(), *self.events(stamps_ns)]
         return replace(self.noise, in_words=tuple(said))
 
     def _noise_in_words(self) -> list[str]:
@@ -180,28 +189,14 @@ class AdaptiveSolution(ModelSolution):
         if self.metres_per_pose:
             white = f"{length(sigmas[TRANSLATION])} and {white}"
             by_m, by_rad = sigmas[[WALK_TRANSLATION, WALK_ROTATION]] / self.metres_per_pose**0.5
-            drift = (
-                f"{length(by_m)} and {angle(by_rad)} after 1 m, "
-                f"{length(10 * by_m)} and {angle(10 * by_rad)} after 100 m"
-            )
+            drift = f"{length(by_m)} and {angle(by_rad)} after 1 m, ten times that after 100 m"
         else:
             lasting = tuple(slow for slow in lasting if slow.part == "rotation")
-        about = ""
-        if self.model.centre != "sensors":
-            about = (
-                f", its rotation about the origin of the {self.model.centre}'s world, as of a "
-                "camera that sees a target"
-            )
-        said = [
-            f"Noise: {white} per axis of each pose (both sensors together){about}.",
+        return [
+            f"Noise: {white} per axis of each pose (both sensors together).",
             f"Drift: {drift}.",
             *map(_slow_in_words, lasting),
         ]
-        if sigmas[JITTER] > TUNING.notable_jitter_s:
-            said.append(f"stamps jitter by {1000 * sigmas[JITTER]:.2g} ms")
-        if self.heavy_tails:
-            said.append("Some poses are outliers and get less weight.")
-        return said
 
     def _systematic_in_words(self) -> list[str]:
         systematic, said = self.systematic.split("+"), []
@@ -272,9 +267,7 @@ class LeverArmSolution(ModelSolution):
                 f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
                 "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
             )
-        for what, found in (("jumps", self.jumps), ("positions wrong by themselves", self.spikes)):
-            if found.any():
-                said.append(f"{int(found.sum())} {what}")
+        said += self.events(stamps_ns)
         return Noise(
             translation_white_m=white,
             translation_drift_m_per_pose=walk,
@@ -289,12 +282,3 @@ def _slow_in_words(slow: CorrelatedError) -> str:
         return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
     size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
     return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
-
-
-def _when(thing: str, what: str, stamps_ns: IntArray) -> list[str]:
-    """A line, or none, about what happened at these times."""
-    if not (count := len(stamps_ns)):
-        return []
-    shown = ", ".join(f"{stamp_ns * 1e-9:.3f}" for stamp_ns in stamps_ns[:5].tolist())
-    things, selves = (thing, "itself") if count == 1 else (f"{thing}s", "themselves")
-    return [f"{count} {things} {what.format(selves)} {shown}{' ...' if count > 5 else ''} s"]

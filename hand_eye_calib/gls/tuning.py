@@ -150,8 +150,6 @@ class Tuning:
     unknown_m: float = 0.2
     # What is beyond so many standard deviations is there.
     plain: float = 3.0
-    # Stamps that jitter by less are not worth a sentence (s).
-    notable_jitter_s: float = 1e-4
     # Parts of a recording for the jackknife.
     n_parts: int = 20
 

@@ -281,7 +281,7 @@ def test_poses_wrong_by_themselves_are_bridged():
     assert (
         "5 poses wrong by themselves and left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s" in said
     )
-    assert "1 jump of a trajectory, just before 10.000 s" in said
+    assert "1 jumps of a trajectory, just before 10.000 s" in said
 
 
 def test_heavy_tails_leave_the_answer_near():
