@@ -19,7 +19,7 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.tuning import TUNING
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import Rig, real_rigs
 from reproduction.writing import markdown_table, seed_of, show, study_parser

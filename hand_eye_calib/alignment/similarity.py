@@ -23,8 +23,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.solvers import dnl, quadratic_form
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 

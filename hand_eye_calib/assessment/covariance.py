@@ -26,8 +26,7 @@ from hand_eye_calib.assessment.lever_arm import (
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.results.status import AXES, ROTATIONS, DofObservability, DofVerdict
 from hand_eye_calib.solvers.solution import Solution
 from hand_eye_calib.stats import CHI2

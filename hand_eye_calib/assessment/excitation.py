@@ -10,7 +10,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.stats import median, quantile

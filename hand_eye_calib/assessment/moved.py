@@ -33,8 +33,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import (
     CHI2,

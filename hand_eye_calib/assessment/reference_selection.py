@@ -8,8 +8,7 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.solvers.registry import Method
 
 _CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")

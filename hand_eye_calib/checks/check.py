@@ -2,7 +2,7 @@
 wrong with them.
 
 1. Each stream alone (:mod:`~hand_eye_calib.checks.streams`).
-2. The angular rates (:mod:`~hand_eye_calib.alignment.angular_rates`): whether they agree at any
+2. The angular rates (:mod:`~hand_eye_calib.alignment.time_offset`): whether they agree at any
    clock offset. Reordered or inverted quaternions, units and axes do not affect them.
 3. The whole motion (:mod:`~hand_eye_calib.checks.hypotheses`): which usual mistake, undone, makes
    the streams agree.
@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import (
+from hand_eye_calib.alignment.similarity import SimilarityFit, estimate_scale, scale_differs
+from hand_eye_calib.alignment.time_offset import (
     MIN_VARIATION,
     Correlation,
+    TimeOffset,
     correlate_rates,
+    refine_time_offset,
 )
-from hand_eye_calib.alignment.similarity import SimilarityFit, estimate_scale, scale_differs
-from hand_eye_calib.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks.agreement import (
@@ -52,8 +53,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_over
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.text import axes_in_words
 
 # Of the interval of slow streams: accuracy of the coarse offset between them, and the gap that they

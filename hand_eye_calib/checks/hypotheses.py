@@ -27,8 +27,13 @@ from hand_eye_calib.checks.streams import PATH_STEP_S, coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, pairs_between, pairs_over
-from hand_eye_calib.pairing.synchronise import PosePairs, synchronise
+from hand_eye_calib.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_between,
+    pairs_over,
+    synchronise,
+)
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;

@@ -24,8 +24,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses

@@ -9,7 +9,7 @@ from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.synchronise import find_leap
+from hand_eye_calib.pairing.motion_pairs import find_leap
 from hand_eye_calib.stats import median, quantile
 
 # Shortest step (s) of a path length: over shorter steps it would be the length of the noise.

@@ -7,7 +7,7 @@ from pathlib import Path
 from hand_eye_calib.cli.console import with_progress
 from hand_eye_calib.cli.options import at_least
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.simulation.options import (
+from hand_eye_calib.simulation.drive import (
     HILLY_DRIVE,
     MIXTURE,
     PUBLISHED_DRIVE,

@@ -19,7 +19,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import Solved, solve_poses
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import AxisScatter, CrossCheck
 from hand_eye_calib.results.status import AXES

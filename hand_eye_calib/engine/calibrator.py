@@ -26,7 +26,7 @@ from hand_eye_calib.engine.snapshot import (
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.frames import check_pose
 from hand_eye_calib.geometry.trajectory import REACH, Trajectory
-from hand_eye_calib.pairing.synchronise import PosePairs, slower_stream
+from hand_eye_calib.pairing.motion_pairs import PosePairs, slower_stream
 from hand_eye_calib.results.calibration import Calibration
 
 

@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import angular_rates
+from hand_eye_calib.alignment.time_offset import angular_rates
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.streams import are_gaps
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.stats import median
 

@@ -29,8 +29,7 @@ from hand_eye_calib.gls.increments import (
     without_rate_bias,
 )
 from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.results.records import RateBias
 

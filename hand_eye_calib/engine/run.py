@@ -10,8 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import correlate_rates
-from hand_eye_calib.alignment.time_offset import TimeOffset
+from hand_eye_calib.alignment.time_offset import TimeOffset, correlate_rates
 from hand_eye_calib.checks.check import (
     CheckResult,
     check_offset,
@@ -24,7 +23,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.snapshot import CONVENTIONS, MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.status import AXES
 

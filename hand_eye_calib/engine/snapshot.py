@@ -6,15 +6,19 @@ from functools import cached_property
 
 import numpy as np
 
-from hand_eye_calib.alignment.angular_rates import Correlation, correlate_rates
-from hand_eye_calib.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.alignment.time_offset import (
+    Correlation,
+    TimeOffset,
+    correlate_rates,
+    estimate_time_offset,
+)
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.answers import cross_checked
 from hand_eye_calib.engine.estimation import solve_poses
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.synchronise import PosePairs, select_keyframes, synchronise
+from hand_eye_calib.pairing.motion_pairs import PosePairs, select_keyframes, synchronise
 from hand_eye_calib.results.calibration import Calibration
 
 STREAMS = ("parent", "child")

@@ -13,7 +13,6 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.gls.increments import BIAS, PARAMETERS, RATE, SCALE, TIME
 from hand_eye_calib.gls.noise_model import (
-    JITTER,
     N_FAST,
     ROTATION,
     TRANSLATION,
@@ -75,10 +74,13 @@ class ModelSolution:
 
     def events(self, stamps_ns: IntArray) -> list[str]:
         """Jumps and outliers in words, with the times (s) of the first."""
-        said, found = [], {
-            "jumps of a trajectory, just before": stamps_ns[1:][self.jumps],
-            "poses wrong by themselves and left out, at": stamps_ns[self.spikes],
-        }
+        said, found = (
+            [],
+            {
+                "jumps of a trajectory, just before": stamps_ns[1:][self.jumps],
+                "poses wrong by themselves and left out, at": stamps_ns[self.spikes],
+            },
+        )
         for what, at_ns in found.items():
             if count := len(at_ns):
                 first = ", ".join(f"{each * 1e-9:.3f}" for each in at_ns[:5].tolist())

@@ -25,7 +25,7 @@ from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.run import check, review, with_options
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 
 # Not `-m`: its classes would belong to the module __main__, which the node does not have.

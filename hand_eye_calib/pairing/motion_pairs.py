@@ -1,6 +1,8 @@
-"""Pairs of relative motions, what every AX = XB solver starts from."""
+"""Two streams to pairs: their poses at common instants, by interpolation; and relative motions of
+both between these, what every AX = XB solver starts from.
+"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -8,12 +10,167 @@ from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.stats import median
 from hand_eye_calib.text import parse_reference
 
+# Streams whose intervals differ by less than this factor count as equally fast: they are paired at
+# the child's stamps.
+_EQUALLY_FAST = 1.2
+
+# Number of poses checked at once in the search for the next keyframe.
+_WINDOW = 64
+
+# No recording pauses this long (s): a stamp is wrong.
+_LEAP_S = 86_400.0
+
 # Pairs that are compared where the choice of poses is free.
 MAX_PAIRS = 800
+
+
+@dataclass(frozen=True)
+class PosePairs:
+    """Poses of both sensors at common instants.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64 array
+        Parent clock, strictly increasing.
+    Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
+        Pose of each sensor in its own world.
+    """
+
+    stamps_ns: IntArray
+    Ts_pw_p: FloatArray
+    Ts_cw_c: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
+        return type(self)(self.stamps_ns[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
+
+    def child_scaled(self, factor: float) -> Self:
+        """The same poses with the child's translations times ``factor``."""
+        Ts_cw_c = self.Ts_cw_c.copy()
+        Ts_cw_c[:, :3, 3] *= factor
+        return replace(self, Ts_cw_c=Ts_cw_c)
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No poses."""
+        return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
+
+    @classmethod
+    def concatenate(cls, *parts: Self) -> Self:
+        """All parts in the given order."""
+        columns = zip(*((one.stamps_ns, one.Ts_pw_p, one.Ts_cw_c) for one in parts), strict=True)
+        return cls(*map(np.concatenate, columns))
+
+
+def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
+    """The stream at whose stamps to pair, "parent" or "child": the slower one by the median
+    interval; the child if both are about equally fast.
+    """
+    if len(parent_stamps_ns) < 2 or len(child_stamps_ns) < 2:
+        return "child"
+    interval_parent = median(np.diff(parent_stamps_ns))
+    interval_child = median(np.diff(child_stamps_ns))
+    return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
+
+
+def synchronise(
+    parent: Trajectory, child: Trajectory, max_gap_s: float, at: str | None = None
+) -> PosePairs:
+    """Interpolate the faster stream at the slower stream's stamps.
+
+    An instant outside the faster stream, or between two of its poses that are more than
+    ``max_gap_s`` apart, is left out. An instant at which it has a pose of its own is always kept.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        On one clock.
+    max_gap_s : float
+        Seconds.
+    at : {"parent", "child"}, optional
+        The stream at whose stamps to pair; the slower one by default.
+    """
+    if len(parent) == 0 or len(child) == 0:
+        return PosePairs.empty()
+    at = at or slower_stream(parent.stamps_ns, child.stamps_ns)
+    slow, fast = (parent, child) if at == "parent" else (child, parent)
+    # Wanted stamps at which the faster stream has a pose, or may be interpolated.
+    after = np.searchsorted(fast.stamps_ns, slow.stamps_ns)
+    inside = after < len(fast)
+    after = np.minimum(after, len(fast) - 1)
+    gap_ns = fast.stamps_ns[after] - fast.stamps_ns[np.maximum(after - 1, 0)]
+    exact = fast.stamps_ns[after] == slow.stamps_ns
+    keep = inside & (exact | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))
+    stamps_ns = slow.stamps_ns[keep]
+    is_one = len(fast) == 1
+    fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0) if is_one else fast.at(stamps_ns)
+    both = (slow.poses[keep], fast_poses) if at == "parent" else (fast_poses, slow.poses[keep])
+    return PosePairs(stamps_ns, *both)
+
+
+def select_keyframes(
+    pose_pairs: PosePairs,
+    min_translation: float,
+    min_rotation: float,
+    min_interval_s: float,
+    previous: PosePairs | None = None,
+) -> IntArray:
+    """Indices of the pose pairs to keep, in order.
+
+    A pose pair is kept if ``min_interval_s`` has passed since the last one kept and the parent
+    sensor has since moved ``min_translation`` or rotated by ``min_rotation``. A threshold of zero
+    switches that criterion off.
+
+    Thresholds are in m, rad and s; ``previous`` is the last one kept before these, of length 1 (0
+    for none).
+    """
+    n_poses = len(pose_pairs)
+    if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
+        return np.arange(n_poses)
+    stamps_ns, poses, kept = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, []
+    if previous is not None and len(previous):
+        last_ns, T_last = previous.stamps_ns[-1], previous.Ts_pw_p[-1]
+    else:
+        kept, last_ns, T_last = [0], stamps_ns[0], poses[0]
+    index = len(kept)
+    while index < n_poses:
+        window = slice(index, index + _WINDOW)
+        wanted = stamps_ns[window] - last_ns >= min_interval_s * 1e9
+        has_moved = np.full(len(wanted), max(min_translation, min_rotation) == 0.0)
+        if min_translation > 0.0:
+            away_m = np.linalg.norm(poses[window, :3, 3] - T_last[:3, 3], axis=1)
+            has_moved |= away_m >= min_translation
+        if min_rotation > 0.0:
+            turned = se3.rotation_angle(T_last[:3, :3].T @ poses[window, :3, :3])
+            has_moved |= turned >= min_rotation
+        hits = index + np.flatnonzero(wanted & has_moved)
+        if hits.size:
+            kept.append(int(hits[0]))
+            last_ns, T_last = stamps_ns[hits[0]], poses[hits[0]]
+        index = kept[-1] + 1 if hits.size else index + _WINDOW
+    return np.array(kept, dtype=int)
+
+
+def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
+    """The longest leap in stamps (N,), in rising order, of a stream: what it is, to follow "the
+    parent stream's", and what to do about it; None without one.
+    """
+    if len(stamps_ns) < 2:
+        return None
+    intervals_s, count = np.diff(stamps_ns) * 1e-9, len(stamps_ns)
+    before = int(np.argmax(intervals_s)) + 1
+    days = float(intervals_s[before - 1]) / _LEAP_S
+    if days <= 1.0:
+        return None
+    few = f"the first {before}" if before < count - before else f"the last {count - before}"
+    what = f"stamps leap by {days:,.0f} days after pose {before} of {count}"
+    return what, f"repair the stamps, or remove {few} of its poses"
 
 
 def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]:

@@ -12,7 +12,7 @@ from hand_eye_calib.engine.run import run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.synchronise import synchronise
+from hand_eye_calib.pairing.motion_pairs import synchronise
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.rig.result import RigCalibration
 

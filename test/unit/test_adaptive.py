@@ -19,7 +19,7 @@ from hand_eye_calib.gls.increments import (
 )
 from hand_eye_calib.gls.noise_model import CENTRES
 from hand_eye_calib.gls.tuning import TUNING
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import DofVerdict
 
 VALUES = {

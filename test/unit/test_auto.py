@@ -17,7 +17,7 @@ from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine import estimation
 from hand_eye_calib.gls import estimator
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.verdict import Verdict
 from hand_eye_calib.solvers.registry import Method
 

@@ -9,7 +9,7 @@ from motions import as_trajectory, child_of, planar_poses, wandering_poses
 from hand_eye_calib.assessment.excitation import excitation, helpful_motion, what_is_missing
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 
 

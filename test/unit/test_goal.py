@@ -13,7 +13,7 @@ from hand_eye_calib.cli.present import as_text
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.records import CorrelatedError, Noise
 from hand_eye_calib.results.status import AXES

@@ -9,7 +9,7 @@ from hand_eye_calib.assessment.lever_arm import LeverArms
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 
 
 def chords(rotation_vectors):

@@ -4,9 +4,10 @@ from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import motion_pairs, reference_indices
-from hand_eye_calib.pairing.synchronise import (
+from hand_eye_calib.pairing.motion_pairs import (
     PosePairs,
+    motion_pairs,
+    reference_indices,
     select_keyframes,
     slower_stream,
     synchronise,

@@ -19,7 +19,7 @@ from hand_eye_calib.alignment.similarity import estimate_scale
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.synchronise import PosePairs
+from hand_eye_calib.pairing.motion_pairs import PosePairs
 
 
 def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=wandering_poses):

@@ -15,8 +15,7 @@ from motions import (
     wandering_poses,
 )
 
-from hand_eye_calib.alignment.angular_rates import correlate_rates
-from hand_eye_calib.alignment.time_offset import estimate_time_offset
+from hand_eye_calib.alignment.time_offset import correlate_rates, estimate_time_offset
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.offline import calibrate
