@@ -2,20 +2,17 @@
 with time, and a row for each recording with a link to its report.
 """
 
-import json
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import printable
-from hand_eye_calib.report.figures import UNITS, Drawn
+from hand_eye_calib.report.figures import Drawn
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.style import (
     BAD,
@@ -23,7 +20,6 @@ from hand_eye_calib.report.style import (
     GRID,
     INK,
     LOOK,
-    MUTED,
     as_svg,
     page_style,
 )
@@ -54,13 +50,6 @@ def render_batch(
     )
     counts = Counter(cell[2] for cell in cells)
     ordered = sorted(vehicles.items(), key=lambda one: _GRAVITY.index(TONES[one[1].verdict.value]))
-    figures, left = [], LOOK.page - len(json.dumps(cells))
-    for number, (_, result) in enumerate(ordered[: LOOK.vehicles], start=1):
-        figures.append(_trend(result, number))
-        left -= len(figures[-1].svg)
-        if left < 0:
-            figures.pop()
-            break
     return page(
         "batch.html",
         TONES.get(cells[0][2], "bad"),
@@ -69,25 +58,51 @@ def render_batch(
         batch=title.rpartition("/")[2],
         vehicles_left_out=max(0, len(ordered) - LOOK.vehicles),
         vehicles=[
-            (name, result, _values(row_of_result(result.to_dict())))
-            for name, result in ordered[: LOOK.vehicles]
+            (name, result, _values(row_of_result(result.to_dict())), _trend(result, number))
+            for number, (name, result) in enumerate(ordered[: LOOK.vehicles], start=1)
         ],
-        figures=figures,
         rows=cells,
         tones=TONES,
         headings=[f"{name} {unit}" for name, unit in _AXES.items()],
     )
 
 
+@page_style()
 def _trend(result: Calibration, number: int) -> Drawn:
-    """The figure of a vehicle's recordings; ``number`` is that of the vehicle on the page."""
+    """The figure of a vehicle's recordings about their common extrinsic, axis by axis, over time;
+    ``number`` is that of the vehicle on the page.
+    """
+    recordings = result.together.recordings if result.together else ()
+    at = np.array(
+        date2num([datetime.fromtimestamp(each.stamp_ns * 1e-9, UTC) for each in recordings])
+    )
+    apart = np.array([bool(each.left_out) for each in recordings])
+    figure = Figure(figsize=(LOOK.width, 3.9), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True).ravel()
+    for axis, panel, sigma in zip(_AXES, panels, result.sigmas, strict=True):
+        factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
+        points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
+        values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
+        band = factor * LOOK.sigmas * sigma
+        told = axes_in_words([axis]).removeprefix("the rotation ")
+        told += f", {unit}" if np.isfinite(band) else ": not determined"
+        panel.set_title(told, loc="left")
+        panel.axhline(0, color=GRID, lw=0.8)
+        if np.isfinite(band):
+            panel.axhspan(-band, band, color=BAND, alpha=0.15, lw=0)
+        for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
+            look: dict[str, Any] = {"fmt": fmt, "color": colour, "ms": 3.2, "elinewidth": 0.8}
+            panel.errorbar(at[group], values[group], sigmas[group], **look)
+    locator = AutoDateLocator(minticks=2, maxticks=4)
+    panels[0].xaxis.set_major_locator(locator)
+    panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
     said = (
         "Difference of each recording from the common value along and about the parent's axes, "
         "with its standard deviation. The band is three standard deviations of the common value. "
         "Squares do not belong to the others."
     )
-    title = "Each recording against the common extrinsic"
-    return Drawn(f"vehicle-{number}", title, said, _draw_trend(result, f"trend{number}"))
+    title, svg = "Each recording against the common extrinsic", as_svg(figure, f"trend{number}")
+    return Drawn(f"vehicle-{number}", title, said, svg)
 
 
 def _values(row: Plain) -> list[str]:
@@ -106,47 +121,3 @@ def _cells(row: Plain, is_linked: bool) -> list[Any]:
     start = (row["start"] or "").removesuffix("+00:00").replace("T", " ")
     verdict = "failed" if row["error"] else row["verdict"]
     return [printable(row["name"]), row["vehicle"], verdict, start, int(is_linked), values]
-
-
-def _draw_trend(result: Calibration, name: str) -> str:
-    """SVG of a name: recordings about their common extrinsic, axis by axis, over time."""
-    recordings = result.together.recordings if result.together else ()
-    dates = [datetime.fromtimestamp(each.stamp_ns * 1e-9, UTC) for each in recordings]
-    at = np.array(date2num(dates))
-    apart = np.array([bool(each.left_out) for each in recordings])
-    with page_style():
-        figure = Figure(figsize=(LOOK.width, 3.9), layout="constrained")
-        panels = figure.subplots(2, 3, sharex=True).ravel()
-        for axis, panel, band in zip(_AXES, panels, LOOK.sigmas * result.sigmas, strict=True):
-            factor, _ = UNITS["x" if axis in "xyz" else "yaw"]
-            unit = "cm" if axis in "xyz" else "deg"
-            name = axes_in_words([axis]).removeprefix("the rotation ")
-            panel.set_title(f"{name}, {unit}", loc="left")
-            points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
-            values = np.where(np.isfinite(points), points, np.nan).T
-            _draw_axis(panel, at, values, band, factor, apart)
-            locator = AutoDateLocator(minticks=2, maxticks=4)
-            panel.xaxis.set_major_locator(locator)
-            panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
-        return as_svg(figure, name)
-
-
-def _draw_axis(
-    panel: Axes,
-    at: FloatArray,
-    values_sigmas: FloatArray,
-    band: float,
-    factor: float,
-    apart: BoolArray,
-) -> None:
-    """Deviations of one axis with their standard deviations, and the band of the common value."""
-    values, sigmas = factor * values_sigmas
-    if np.isnan(values).all() or np.isinf(band):
-        panel.text(0.5, 0.5, "not determined", transform=panel.transAxes, ha="center", color=MUTED)
-        panel.set_yticks([])
-        return
-    panel.axhspan(-factor * band, factor * band, color=BAND, alpha=0.15, lw=0)
-    panel.axhline(0, color=GRID, lw=0.8)
-    for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
-        look: dict[str, Any] = {"fmt": fmt, "color": colour, "ms": 3.2, "elinewidth": 0.8}
-        panel.errorbar(at[group], values[group], sigmas[group], **look)

@@ -69,7 +69,7 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
 @page_style()
 def figure_of_views(calibrations: Sequence[Calibration]) -> Drawn:
     """Where the child sensors of one or several results are in their parent's frame."""
-    figure, panels = _figure(3.1, 1, 3, left=0.7, gap=0.75)
+    figure, panels = _figure(3.1, 1, 3, gap=0.36)
     draw_views(panels, *calibrations)
     svg = as_svg(figure, "views")
     return Drawn("views", "The sensors in space", said_of_views(*calibrations), svg)
@@ -82,9 +82,7 @@ def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
     """
     is_speed = seen.quantity == "speed"
     factor, unit = _time_axis(max(times[-1] if len(times) else 0.0 for times, _ in seen.rates))
-    figure, (rate, strip) = _figure(
-        2.95, 2, 1, left=0.8, top=0.25, sharex=True, height_ratios=(5, 1)
-    )
+    figure, (rate, strip) = _figure(3.0, 2, 1, sharex=True, height_ratios=(5, 1))
     looks = ((PARENT, 2.6), (CHILD, 1.0))
     streams = zip(seen.rates, seen.spans_s, names, looks, strict=True)
     for row, ((times, rates), spans, name, (colour, width)) in enumerate(streams):
@@ -112,31 +110,14 @@ def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
 
 
 def _figure(
-    height: float,
-    rows: int,
-    columns: int,
-    *,
-    left: float,
-    bottom: float = 0.5,
-    gap: float = 0.2,
-    top: float = 0.3,
-    **options: Any,
+    height: float, rows: int, columns: int, bottom: float = 0.5, gap: float = 0.2, **options: Any
 ) -> tuple[Figure, Sequence[Axes]]:
-    """A figure with its panels; margins are given in inches, because measuring the text takes more
-    time than all else.
+    """A figure with its panels, with ``bottom`` inches below them: to measure the text instead
+    takes more time than all else.
     """
     figure = Figure(figsize=(LOOK.width, height))
-    right, between = 0.12, 0.15
-    width = (LOOK.width - left - right - gap * (columns - 1)) / columns
-    tall = (height - top - bottom - between * (rows - 1)) / rows
-    spacing = {
-        "left": left / LOOK.width,
-        "right": 1 - right / LOOK.width,
-        "bottom": bottom / height,
-        "top": 1 - top / height,
-        "wspace": gap / width,
-        "hspace": between / tall,
-    }
+    spacing = {"left": 0.085, "right": 0.985, "wspace": gap, "hspace": 0.12}
+    spacing |= {"bottom": bottom / height, "top": 1 - 0.3 / height}
     panels = figure.subplots(rows, columns, gridspec_kw=spacing, squeeze=False, **options)
     return figure, panels.ravel()
 
@@ -149,7 +130,7 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     # A camera moves in its x and z: x and y would be a view from the side.
     across = int(np.argmin(np.ptp(tracks.parent, axis=0)))
     first, second = (axis for axis in range(3) if axis != across)
-    figure, (plane, side) = _figure(4.1, 1, 2, left=0.7, bottom=0.85, gap=0.7)
+    figure, (plane, side) = _figure(4.1, 1, 2, bottom=0.85)
     names = [calibration.parent_frame, calibration.child_frame]
     is_reversed = calibration.measured == "positions" and not evidence.has_positions_of_parent
     through = 0 if is_reversed else 1  # whose path is computed through the result
@@ -201,8 +182,7 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
         what = f"motion pairs ({calibration.reference if uses_reference else 'B1'})"
         if calibration.measured == "positions":
             what = "distances from one position to the next"
-    height = 1.0 + 1.6 * len(sizes)
-    figure, panels = _figure(height, len(sizes), 1, left=0.7, bottom=0.8, top=0.1, sharex=True)
+    figure, panels = _figure(1.2 + 1.6 * len(sizes), len(sizes), 1, bottom=0.8, sharex=True)
     for panel, (name, values) in zip(panels, sizes.items(), strict=True):
         to_unit, of_axis = UNITS[name]
         _draw_residuals(panel, times, np.maximum(values * to_unit, 1e-5), is_out)

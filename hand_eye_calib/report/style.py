@@ -43,7 +43,7 @@ class Look(NamedTuple):
     distance_m : of the object whose error is told, m.
     bar_decades, bar_above : powers of ten that a bar reaches over, and over its target.
     points : most points drawn of a line, and of dots that each stand alone.
-    vehicles, page : most vehicles on the page of a batch, and characters of it with their figures.
+    vehicles : most vehicles on the page of a batch.
     """
 
     width: float = 8.6
@@ -54,8 +54,7 @@ class Look(NamedTuple):
     bar_decades: float = 4.0
     bar_above: float = 1.0
     points: int = 1000
-    vehicles: int = 20
-    page: int = 1_900_000
+    vehicles: int = 10
 
 
 LOOK = Look()
