@@ -5,13 +5,12 @@ name, for bags and journals alone.
 
 import argparse
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import STREAMS, note, waiting_for
+from hand_eye_calib.cli.console import STREAMS, note, print_result, waiting_for
 from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
@@ -20,7 +19,7 @@ from hand_eye_calib.cli.options import (
     options_from,
     sources_from,
 )
-from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
@@ -219,17 +218,15 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     document = as_given(document)
     for text in document["warnings"]:
         note(text)
-    if arguments.json:
-        print(json.dumps(document, indent=2))
-        return 0
-    print(f"{document['bag']}, {document['duration_s']:.1f} s")
-    print(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
+    lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
+    lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
     for topic in topics:
         rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
-        cells = (printable(topic["name"]), topic["type"] or "several types", topic["count"], rate)
-        usable, frames = "yes" * topic["is_usable"], " ".join(map(printable, topic["frames"]))
-        print(_ROW.format(*cells, usable, frames).rstrip())
-    print(
+        cells = (topic["name"], topic["type"] or "several types", topic["count"], rate)
+        usable, frames = "yes" * topic["is_usable"], " ".join(topic["frames"])
+        lines.append(_ROW.format(*cells, usable, frames).rstrip())
+    lines.append(
         "--parent-topic and --child-topic take the topics with poses, or frames of /tf: odom:lidar"
     )
+    print_result(lines, document if arguments.json else None)
     return 0

@@ -12,7 +12,7 @@ from hand_eye_calib.cli.options import (
     options_from,
     sources_from,
 )
-from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.engine.run import check
     from hand_eye_calib.engine.snapshot import whole_snapshot
-    from hand_eye_calib.plain import json_text
 
     options = options_from(arguments)
     sources, (first, second), repairs = _opened(arguments, options)
@@ -64,12 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
     findings = gravest_first(answered([*checked.findings, *of_files], config))
     both = zip(STREAMS, (parent, child), strict=True)
     streams = {name: summarise(one) for name, one in both if len(one) > 1}
-    if arguments.json:
-        summaries = {name: {"source": sources[name], **vars(streams[name])} for name in streams}
-        print(json_text({"streams": summaries, "findings": findings}))
-    else:
-        lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
-        print_result("\n".join(lines))
+    summaries = {name: {"source": sources[name], **vars(streams[name])} for name in streams}
+    document = {"streams": summaries, "findings": findings} if arguments.json else None
+    lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
+    print_result(lines, document)
     unusable = [each for each in findings[:1] if each.makes_unusable]
     return fail(unusable[0], 1) if unusable else 0
 
@@ -100,7 +97,7 @@ def _opened(
 
 def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:
     """Both streams."""
-    yield from (f"{stream} is {printable(source)}" for stream, source in sources.items())
+    yield from (f"{stream} is {source}" for stream, source in sources.items())
     yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
         path, rotation = summary.path_m, summary.rotation_rad
@@ -119,13 +116,10 @@ def _verdict(findings: "Sequence[Finding]") -> str:
     if not serious:
         return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
     errors = [finding for finding in serious if finding.makes_unusable]
-    codes = ", ".join(finding.code for finding in errors or serious)
-    told = f"look at the findings first ({codes})"
+    told = f"look at the findings first ({', '.join(each.code for each in errors or serious)})"
     if all(finding.options for finding in serious):
         options = " ".join(typed_options(finding.options.items()) for finding in serious)
         told = f"not as they are; calibrate with {options}"
-    elif errors:
-        told = f"no result from these streams is right ({codes})"
     return f"{(Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value}: {told}."
 
 

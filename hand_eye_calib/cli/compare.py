@@ -4,9 +4,9 @@ import argparse
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import waiting_for
+from hand_eye_calib.cli.console import print_result, waiting_for
 from hand_eye_calib.cli.options import add_json_argument
-from hand_eye_calib.errors import InputError, printable
+from hand_eye_calib.errors import InputError
 from hand_eye_calib.text import amount, told_apart
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compare; returns the exit code."""
     from hand_eye_calib.io.results import load_result
-    from hand_eye_calib.plain import json_text
     from hand_eye_calib.session.compare import compare
 
     results = [load_result(path) for path in arguments.results]
@@ -57,10 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     if len({*names}) < len(names):
         raise InputError(f"expected different results; got {', '.join(names)}")
     found = compare(results, installed, names)
-    if arguments.json:
-        print(json_text(found))
-    else:
-        print("\n".join(printable(line) for line in _lines(found, results[0])))
+    print_result(_lines(found, results[0]), found if arguments.json else None)
     return {"same": 0, "moved": 4}.get(found.verdict, 3)
 
 

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         poses = bag.poses(TOPICS["parent"], TOPICS["child"])
         online = play(poses, TOPICS, PLAY_SPEED, offline.stamp_ns, check)
     note("3/4 calibrated live; the report follows")
-    print_result("\n".join(_lines(drive, offline, online)))
+    print_result(_lines(drive, offline, online))
     write_report(arguments.out, offline, recording.snapshot, recording.inputs)
     note(f"4/4 done; everything is in {arguments.out}")
     return exit_code(offline)

@@ -25,15 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print a saved calibration; returns the exit code, 0 whatever the calibration's status."""
-    from hand_eye_calib.cli.present import as_text
+    from hand_eye_calib.cli.present import as_lines
     from hand_eye_calib.io.results import load_result
-    from hand_eye_calib.plain import json_text
 
     calibration = load_result(arguments.result)
     if arguments.format:
         print(calibration.export(arguments.format), end="")
-    elif arguments.json:
-        print(json_text(calibration.to_dict()))
     else:
-        print_result(as_text(calibration, with_details=arguments.verbose))
+        document = calibration.to_dict() if arguments.json else None
+        print_result(as_lines(calibration, (), arguments.verbose), document)
     return 0

@@ -18,7 +18,6 @@ from hand_eye_calib.cli.console import (
     waiting_for,
 )
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
@@ -52,11 +51,9 @@ def deliver(
 
         keep_earlier_results(arguments.out)
         note(f"wrote {save_result(calibration, arguments.out, inputs)}")
-    if arguments.json:
-        print(json_text(calibration.to_dict() | {"inputs": inputs}), flush=True)
-    else:
-        steps = next_steps(calibration, arguments, snapshot)
-        print_result(as_text(calibration, steps, arguments.verbose))
+    steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
+    document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
+    print_result(as_lines(calibration, steps, arguments.verbose), document)
     if arguments.out and calibration.motion_residuals:
         from hand_eye_calib.cli.reporting import write_report
 
@@ -100,7 +97,9 @@ def exit_code(calibration: Calibration) -> int:
     return Exit.NOT_ALL if hidden or calibration.verdict is Verdict.DO_NOT_USE else Exit.GOOD
 
 
-def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False) -> str:
+def as_lines(
+    calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False
+) -> list[str]:
     """What a person needs to see: verdict and reasons, the extrinsic in both directions, the steps
     to take next; with details also quaternions, and how it was solved.
     """
@@ -124,8 +123,7 @@ def as_text(calibration: Calibration, steps: Sequence[str] = (), with_details: b
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = list(_details(calibration) if with_details else _comparisons(calibration))
     lines += ["Details"] * bool(details)
-    lines += [line for detail in details for line in wrapped(detail, "  ", "    ")]
-    return "\n".join(printable(line) for line in lines)
+    return lines + [line for detail in details for line in wrapped(detail, "  ", "    ")]
 
 
 def verdict_lines(calibration: Calibration) -> Iterator[str]:

@@ -8,8 +8,7 @@ from hand_eye_calib.cli.options import options_from
 from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.cli.reporting import write_rig_report
-from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.plain import json_text
+from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
@@ -56,10 +55,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         rig = of_rig.calibrate_rig(sensors, inputs["options"])
     if arguments.out:
         note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
-    if arguments.json:
-        print(json_text(rig.to_dict() | {"inputs": inputs}), flush=True)
-    else:
-        print_result("\n".join(printable(line) for line in as_lines(rig)))
+    print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
     if arguments.out:
         write_rig_report(arguments.out, rig, names)
     failed = [each for each in rig.calibrations if each.status.failure]

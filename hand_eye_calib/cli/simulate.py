@@ -12,7 +12,6 @@ from hand_eye_calib.simulation.drive import (
     MIXTURE,
     PUBLISHED_DRIVE,
     REALISTIC,
-    NoiseConfig,
 )
 from hand_eye_calib.text import counted
 
@@ -58,14 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     poses = "poses of the parent sensor. Default: 100 (published), 1200 (hilly)"
     group.add_argument("--poses", type=at_least(2), metavar="N", help=poses)
     group = parser.add_argument_group("noise")
-    level = group.add_mutually_exclusive_group()
-    level.add_argument(
-        "--noise-free",
-        action="store_true",
-        help="exact poses: streams that agree to the last digit count as copies of each other, and "
-        "a result from them as unusable",
-    )
-    level.add_argument(
+    group.add_argument(
         "--mixture",
         action="store_true",
         help=f"the paper's mixture: errors of {MIXTURE.gaussian} m per axis, jumps at "
@@ -81,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     config = _DRIVES[arguments.drive]
     config = dataclasses.replace(config, poses=arguments.poses or config.poses)
-    noise = MIXTURE if arguments.mixture else NoiseConfig() if arguments.noise_free else REALISTIC
+    noise = MIXTURE if arguments.mixture else REALISTIC
     _make_empty(arguments.out)
     digits = max(2, len(str(arguments.runs)))
     folders = [arguments.out / f"run_{number:0{digits}}" for number in range(1, arguments.runs + 1)]

@@ -125,7 +125,7 @@ def _figure(
 @page_style()
 def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     tracks = evidence
-    shown = _downsample(len(tracks.times_s), LOOK.points)
+    shown = _downsample(len(tracks.times_s))
     factor, unit = _time_axis(tracks.times_s[-1])
     # A camera moves in its x and z: x and y would be a view from the side.
     across = int(np.argmin(np.ptp(tracks.parent, axis=0)))
@@ -194,24 +194,18 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
         listing([amount(name, float(of(values))) for name, values in sizes.items()])
         for of in (np.median, np.max)
     )
-    said = f"Half of the {len(residuals):,} {what} agree with the result to {halves}"
-    if is_out.any():
-        axis, values = next(iter(sizes.items()))
-        worst = int(np.argmax(np.where(is_out, values, -1)))
-        at = f"at {times[worst]:.1f} {unit}" if unit else f"stop {worst + 1}"
-        said += (
-            f"; {is_out.sum():,} ({share(float(is_out.mean()))}) were rejected as outliers, the "
-            f"largest {amount(axis, values[worst])} {at}."
-        )
-    else:
-        said += f", all of them to {furthest}. There are no outliers."
+    rejected = f"{is_out.sum():,} ({share(float(is_out.mean()))})" if is_out.any() else "None"
+    said = (
+        f"Half of the {len(residuals):,} {what} agree with the result to {halves}, all of them to "
+        f"{furthest}. {rejected} of them are rejected as outliers."
+    )
     return Drawn("residuals", "Residuals", said, as_svg(figure, "residuals"))
 
 
 def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:
     """Sizes (K,) of residuals, above zero, and which were rejected."""
     dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
-    dots = dots[_downsample(len(dots), LOOK.points)]
+    dots = dots[_downsample(len(dots))]
     crosses = crosses[np.argsort(-values[crosses])[: LOOK.points]]
     used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
     rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
@@ -231,6 +225,6 @@ def _time_axis(duration_s: float) -> tuple[float, str]:
     return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
 
 
-def _downsample(count: int, most: int) -> IntArray:
-    """Indices of at most ``most`` of so many points, first and last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+def _downsample(count: int) -> IntArray:
+    """Indices of those of so many points that are drawn, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, LOOK.points)).round().astype(int))

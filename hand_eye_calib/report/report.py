@@ -2,7 +2,6 @@
 a rig, where its sensors are.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -204,11 +203,8 @@ def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
 
 def _bar(ratio: float) -> float:
     """Length in per cent of the bar for a standard deviation, from its ratio to the target."""
-    if not ratio > 0:
-        return 1.0
-    if not np.isfinite(ratio):
-        return 100.0
-    decades = LOOK.bar_above - math.log10(ratio)
+    with np.errstate(divide="ignore"):
+        decades = LOOK.bar_above - np.log10(ratio)
     return float(np.clip(100 * (1 - decades / LOOK.bar_decades), 1, 100))
 
 

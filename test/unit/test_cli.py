@@ -22,9 +22,9 @@ import yaml
 from motions import disturbed, write_pair
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.console import fail, note, waiting_for, with_progress
+from hand_eye_calib.cli.console import fail, note, print_result, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.present import as_text
+from hand_eye_calib.cli.present import as_lines
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -204,7 +204,7 @@ def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
         code="jumps", severity=Severity.WARNING, what="many jumps", advice="find out why"
     )
     calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
-    lines = as_text(calibration).splitlines()
+    lines = as_lines(calibration)
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"
     assert lines[1:5] == [
         "- z cannot be determined from this motion",
@@ -240,10 +240,10 @@ def test_a_solve_that_did_not_converge_fails(run, new_bag, monkeypatch):
     from hand_eye_calib.engine.snapshot import Snapshot
 
     calibration = some_calibration(status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
-    assert as_text(calibration).startswith(
+    assert "\n".join(as_lines(calibration)).startswith(
         "DO NOT USE: the solver did not converge\n  -> record more varied motion\nNote: look here\n"
     )
-    assert "static_transform_publisher" not in as_text(calibration)
+    assert "static_transform_publisher" not in "\n".join(as_lines(calibration))
     monkeypatch.setattr(Snapshot, "estimate", lambda self, **_: calibration)
     code, out, err = run("replay", new_bag(), *TOPICS, "--json")
     assert (code, json.loads(out)["status"]) == (1, "not_converged")
@@ -509,7 +509,8 @@ def test_messages_name_options_as_they_are_typed(capsys):
 
 def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     hostile = "cam\x1b[2Jera\nStatus: ok"
-    text = as_text(some_calibration(child_frame=hostile, warnings=("w\x1b[31m",)))
+    print_result(as_lines(some_calibration(child_frame=hostile, warnings=("w\x1b[31m",))))
+    text = capsys.readouterr().out
     assert "\x1b" not in text
     assert "\ncam\\x1b[2Jera\\nStatus: ok in lidar" in text
     fail(hostile, 1)

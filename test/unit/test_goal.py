@@ -9,7 +9,7 @@ from result_making import seen
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.excitation import excitation, helpful_motion
-from hand_eye_calib.cli.present import as_text
+from hand_eye_calib.cli.present import as_lines
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
@@ -162,7 +162,7 @@ def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     assert found == progress
     assert found.sentence == progress.sentence
     assert (found.axes["z"].sigma, found.axes["z"].target) == (np.inf, 0.02)
-    text = " ".join(as_text(hec.load(tmp_path)).split())
+    text = " ".join(" ".join(as_lines(hec.load(tmp_path))).split())
     assert f"the session: {progress.sentence}" in text
 
 

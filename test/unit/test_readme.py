@@ -195,7 +195,7 @@ def test_launch_arguments_make_targets_and_files_exist(page):
 
 def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["simulate", "--out", "drives", "--seed", "3", "--noise-free"]) == 0
+    assert main(["simulate", "--out", "drives", "--seed", "3"]) == 0
     for sensor, name in ((1, "lidar"), (2, "camera")):
         (tmp_path / f"{name}.tum").write_bytes(
             (tmp_path / "drives" / "run_01" / f"T_S{sensor}_W{sensor}.txt").read_bytes()
@@ -207,7 +207,7 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     assert result.T_parent_child.shape == (4, 4)
     assert result.covariance.shape == (6, 6)
     truth = names["hec"].read_trajectory("drives/run_01/T_S2_S1.txt").poses[0]
-    np.testing.assert_allclose(result.T_parent_child, truth, atol=1e-6)
+    np.testing.assert_allclose(result.T_parent_child, truth, atol=5e-3)
     assert (tmp_path / "result" / "extrinsic.yaml").exists()
 
 
