@@ -24,8 +24,9 @@ from hand_eye_calib.assessment.lever_arm import (
     weighted_products,
 )
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
+from hand_eye_calib.gls.noise_model import WALK_ROTATION
 from hand_eye_calib.gls.normal import NormalEquations, answers_without
-from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.results.status import AXES, ROTATIONS, DofObservability, DofVerdict
 from hand_eye_calib.solvers.solution import Solution
@@ -119,13 +120,13 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     return combined(solution.T_parent_child, whole, None, basis(unknown))
 
 
-def assess_lever_arm(Ts: FloatArray, solution: LeverArmSolution) -> Assessment:
+def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatArray) -> Assessment:
     """Covariance and observability of a lever arm in the frame of a sensor with poses (N, 4, 4): of
-    a transform with no rotation, which is unknown.
+    a transform with no rotation, which is unknown. ``covariance`` (3, 3) is that of the model.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = _widened(solution.covariance, solution, slice(0, 3))
-    white, walk = _white_rotation(Ts), solution.rotation_walk
+    whole[:3, :3] = _widened(covariance, solution, slice(0, 3))
+    white, walk = _white_rotation(Ts), np.exp(solution.levels[WALK_ROTATION])
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
     )
@@ -145,9 +146,7 @@ def _white_rotation(Ts: FloatArray) -> float:
     return float(np.sort(variances)[:2].mean())
 
 
-def _widened(
-    covariance: FloatArray, solution: AdaptiveSolution | LeverArmSolution, part: slice
-) -> FloatArray:
+def _widened(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
     """The model's covariance of a part of xi, widened by blocks and halves."""
     if len(solution.jumps) < _BLOCKS * _FEWEST[1]:
         return covariance

@@ -28,7 +28,6 @@ from hand_eye_calib.gls.increments import (
     SYSTEMATIC_OF_ROTATIONS,
     without_rate_bias,
 )
-from hand_eye_calib.gls.solution import AdaptiveSolution, LeverArmSolution
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
 from hand_eye_calib.results.records import RateBias
@@ -74,7 +73,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         ) from None
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
-    fused = fuse(T, assess_lever_arm(poses, solution), config.prior())
+    fused = fuse(T, assess_lever_arm(poses, solution, solution.covariance), config.prior())
     findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child)
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
@@ -101,7 +100,10 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
 
 
 def _steps(
-    solution: LeverArmSolution, stamps_ns: IntArray, poses: FloatArray, positions: FloatArray
+    solution: of_positions.LeverArmSolution,
+    stamps_ns: IntArray,
+    poses: FloatArray,
+    positions: FloatArray,
 ) -> Residuals:
     """Of the steps from each position to the next, along the axes of the sensor with poses."""
     steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
@@ -118,7 +120,7 @@ def _steps(
 
 
 def _of_path(
-    solution: LeverArmSolution,
+    solution: of_positions.LeverArmSolution,
     fused: Fused,
     stamps_ns: IntArray,
     poses: FloatArray,
@@ -187,7 +189,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
 
 def _rotation(
     stamps_ns: IntArray, Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, has_rates: bool
-) -> tuple[AdaptiveSolution, FloatArray]:
+) -> tuple[adaptive_estimator.AdaptiveSolution, FloatArray]:
     """The solution, and the child's poses freed of the bias of the rates.
 
     The noise is fitted to increments of up to some seconds. What a bias does to these is linear
@@ -208,7 +210,7 @@ def _rotation(
     return replace(solution, parameters=parameters), Ts_cw_c
 
 
-def _rate_bias(solution: AdaptiveSolution, config: CalibratorConfig) -> RateBias:
+def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: CalibratorConfig) -> RateBias:
     """The bias of the rates, in the axes of the sensor that has it.
 
     Of two gyroscopes only the difference of the biases shows, the child's less the parent's.

@@ -25,6 +25,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import reml
+from hand_eye_calib.gls.estimator import ModelSolution, parts_of
 from hand_eye_calib.gls.increments import (
     BIAS,
     N_SYSTEMATIC,
@@ -42,6 +43,7 @@ from hand_eye_calib.gls.noise_model import (
     N_FAST,
     ROTATION,
     ROTATIONS,
+    TRANSLATION,
     TRANSLATIONS,
     WALK_ROTATION,
     WALK_TRANSLATION,
@@ -50,15 +52,65 @@ from hand_eye_calib.gls.noise_model import (
 )
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.gls.outliers import Outliers, bridged, judged, surprises
-from hand_eye_calib.gls.solution import LeverArmSolution, parts_of
 from hand_eye_calib.gls.stages import known_products, rough_levels, sample
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
+from hand_eye_calib.results.records import Noise
+from hand_eye_calib.text import angle, length
 
 # A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
 # acceleration (s^2). It is not solved with those in the model.
 RESPONSE = N_SYSTEMATIC
 _SHARED = [SCALE, *BIAS, TIME]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeverArmSolution(ModelSolution):
+    """A lever arm and what it rests on.
+
+    Attributes
+    ----------
+    lever_arm : (3,) array
+        m, in the axes of the sensor with poses.
+    covariance : (3, 3) array
+        Under the model, misfit accounted for.
+    response : (float, float)
+        What positions less odometry are per m/s^2 of acceleration, s^2, and its sigma.
+    worse : (N,) bool array
+        Positions that are left out, for those around are far less precise than the best.
+    """
+
+    lever_arm: FloatArray
+    covariance: FloatArray
+    response: tuple[float, float]
+    worse: BoolArray
+
+    def describe(self, stamps_ns: IntArray) -> Noise:
+        """The noise in plain values and in words, as of an AdaptiveSolution."""
+        sigmas = np.exp(0.5 * self.levels)
+        white, walk = (float(sigmas[level]) for level in (TRANSLATION, WALK_TRANSLATION))
+        turned = float(sigmas[WALK_ROTATION])
+        said = [
+            f"each position is off by {length(white)} per axis, and the odometry drifts by "
+            f"{length(walk)} and {angle(turned)} from one to the next"
+        ]
+        if self.worse.any():
+            share = f"{self.worse.mean():.0%} of the positions"
+            said.append(f"{share} are far less precise, and are left out")
+        response, sigma = 1e3 * np.array(self.response)
+        if abs(response) > TUNING.plain * sigma:
+            said.append(
+                f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
+                "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
+            )
+        said += self.events(stamps_ns)
+        return Noise(
+            translation_white_m=white,
+            translation_drift_m_per_pose=walk,
+            rotation_drift_rad_per_pose=turned,
+            misfit=self.misfit,
+            in_words=tuple(said),
+        )
 
 
 def solve(
