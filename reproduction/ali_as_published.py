@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers.ali import residual_rows
-from hand_eye_calib.solvers.park import squared_translation_residual
+from hand_eye_calib.solvers.dnl import residual_rows
 from hand_eye_calib.solvers.solution import Solution
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -74,7 +73,7 @@ def solve(pairs: MotionPairs) -> Solution:
         converged = bool(np.abs(step).max() < _STEP_TOLERANCE)
     rotation = Rotation.from_quat(np.roll(parameters[:4], -1)).as_matrix()
     T_parent_child = se3.from_rotation_translation(rotation, parameters[4:])
-    objective = squared_translation_residual(pairs, T_parent_child)
+    objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
     return Solution(T_parent_child, objective, converged, iterations, np.ones(len(pairs)))
 
 

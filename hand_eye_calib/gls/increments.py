@@ -30,6 +30,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
 from hand_eye_calib.gls.tuning import TUNING
+from hand_eye_calib.pairing.motion_pairs import motions
 from hand_eye_calib.stats import median
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
@@ -64,12 +65,12 @@ class Streams:
     @cached_property
     def motions_p(self) -> FloatArray:
         """Motions (N - 1, 4, 4) of the parent."""
-        return motions(self.Ts_pw_p)
+        return motions(self.Ts_pw_p[:-1], self.Ts_pw_p[1:])
 
     @cached_property
     def motions_c(self) -> FloatArray:
         """Motions (N - 1, 4, 4) of the child."""
-        return motions(self.Ts_cw_c)
+        return motions(self.Ts_cw_c[:-1], self.Ts_cw_c[1:])
 
     @cached_property
     def twists(self) -> FloatArray:
@@ -148,14 +149,6 @@ def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> Floa
     return smooth + believed * (steps - smooth)
 
 
-def motions(Ts_world_sensor: FloatArray) -> FloatArray:
-    """Motions (N - 1, 4, 4) from each pose to the next."""
-    before, moved = Ts_world_sensor[:-1], Ts_world_sensor[1:].copy()
-    moved[:, :3, 3] -= before[:, :3, 3]
-    moved[:, :3] = np.swapaxes(before[:, :3, :3], 1, 2) @ moved[:, :3]
-    return moved
-
-
 def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
     """Matrices (n, k, 3) times vectors (n, 3)."""
     return (rotations @ vectors[:, :, None])[:, :, 0]
@@ -214,7 +207,7 @@ def linearise(
     Ts_cw_c, has_rates = streams.Ts_cw_c, RATE[0] in columns
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
-    by_child = motions(Ts_cw_c)
+    by_child = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
     if has_rates:
         by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
         by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
@@ -247,7 +240,7 @@ def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
 
 def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray) -> FloatArray:
     """Poses (N, 4, 4) at the origin, freed of a bias (3,), rad/s, of the rates they come from."""
-    rotations = motions(Ts_cw_c)[:, :3, :3]
+    rotations = motions(Ts_cw_c[:-1], Ts_cw_c[1:])[:, :3, :3]
     by_rate = _by_rate_bias(rotations, np.diff(stamps_ns) * 1e-9)
     freed = chained(rotations @ se3.rotation_exp(-by_rate @ bias))
     return se3.from_rotation_translation(freed, np.zeros((len(freed), 3)))

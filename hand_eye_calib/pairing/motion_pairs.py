@@ -272,17 +272,20 @@ def pairs_between(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, i: IntArray, j: IntArray
 ) -> MotionPairs:
     """MotionPairs from the instants i to the instants j, (K,) int arrays."""
-    motions = []
-    for Ts_world_sensor in (Ts_pw_p, Ts_cw_c):
-        start, end = Ts_world_sensor.take(i, axis=0), Ts_world_sensor.take(j, axis=0)
-        # The translation difference is taken before rotating: with map coordinates of 1e6 m,
-        # inverting first costs ten digits.
-        end[:, :3, 3] -= start[:, :3, 3]
-        relative = np.empty_like(end)
-        np.matmul(np.swapaxes(start[:, :3, :3], 1, 2), end[:, :3], out=relative[:, :3])
-        relative[:, 3] = 0.0, 0.0, 0.0, 1.0
-        motions.append(relative)
-    return MotionPairs(motions[0], motions[1], i, j)
+    parent, child = (motions(Ts.take(i, axis=0), Ts.take(j, axis=0)) for Ts in (Ts_pw_p, Ts_cw_c))
+    return MotionPairs(parent, child, i, j)
+
+
+def motions(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Motions (K, 4, 4) from poses to poses, (K, 4, 4) each, of one sensor.
+
+    The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
+    first costs ten digits.
+    """
+    moved = end.copy()
+    moved[:, :3, 3] -= start[:, :3, 3]
+    moved[:, :3] = np.swapaxes(start[:, :3, :3], 1, 2) @ moved[:, :3]
+    return moved
 
 
 def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) -> MotionPairs:

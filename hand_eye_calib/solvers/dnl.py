@@ -1,4 +1,12 @@
-"""DNL: direct non-linear optimisation over all pairs (Välimäki et al. 2023, eq. 4)."""
+"""DNL: direct non-linear optimisation over all pairs (Välimäki et al. 2023, eq. 4); and Ali, which
+minimises the translation residual alone.
+
+That is cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
+robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'
+program computes it: the rotation residual of a motion pair enters only as the norm of a unit
+quaternion, a constant (Välimäki et al. 2023, section 2). The rest is the translation of AX - XB,
+a quadratic form in the same thirteen variables as dnl's cost.
+"""
 
 import numpy as np
 
@@ -16,6 +24,26 @@ def solve(pairs: MotionPairs) -> Solution:
     T, converged, iterations = lowest(Q, pairs)
     objective = float(quadratic_form.costs(coefficients, T).sum())
     return Solution(T, objective, converged, iterations, weights)
+
+
+def solve_ali(pairs: MotionPairs) -> Solution:
+    """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, of K >= 1 pairs."""
+    rows = residual_rows(pairs)
+    T, converged, iterations = lowest(rows.T @ rows, pairs)
+    objective = float((pairs.residuals(T)[0] ** 2).sum())
+    return Solution(T, objective, converged, iterations, np.ones(len(pairs)))
+
+
+def residual_rows(pairs: MotionPairs) -> FloatArray:
+    """Matrix (3 K, 13) that maps ``x = (vec R, t, 1)``, vec row-major, to the residuals
+    ``R_A t + t_A - R t_B - t``.
+    """
+    rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
+    for axis in range(3):
+        rows[:, axis, 3 * axis : 3 * axis + 3] = -pairs.Ts_childi_childj[:, :3, 3]
+    rows[:, :, 9:12] = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    rows[:, :, 12] = pairs.Ts_parenti_parentj[:, :3, 3]
+    return rows.reshape(-1, quadratic_form.DIMENSION)
 
 
 def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool, int]:

@@ -32,7 +32,7 @@ def solve(pairs: MotionPairs) -> Solution:
     target = pairs.Ts_childi_childj[:, :3, 3] @ rotation.T - pairs.Ts_parenti_parentj[:, :3, 3]
     found = np.linalg.lstsq(moved.reshape(-1, 3), target.ravel(), rcond=RANK_TOLERANCE)
     T_parent_child = se3.from_rotation_translation(rotation, found[0])
-    objective = squared_translation_residual(pairs, T_parent_child)
+    objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
     return Solution(T_parent_child, objective, True, 1, np.ones(len(pairs)))
 
 
@@ -47,8 +47,3 @@ def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
     rotvecs_parent = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
     rotvecs_child = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
     return se3.nearest_rotation(rotvecs_parent.T @ rotvecs_child)
-
-
-def squared_translation_residual(pairs: MotionPairs, T_parent_child: FloatArray) -> float:
-    """Sum over the pairs of ``|R_A t + t_A - R t_B - t|^2``, m^2."""
-    return float((pairs.residuals(T_parent_child)[0] ** 2).sum())

@@ -1,7 +1,7 @@
 """The solvers of AX = XB by the name of their method, with the options they take."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 
@@ -10,18 +10,17 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.methods import METHODS, require_backend
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import ali, certificate, dnl, dnlo, park, quadratic_form, zhuang
+from hand_eye_calib.solvers import certificate, dnl, dnlo, park, quadratic_form, zhuang
 from hand_eye_calib.solvers.solution import Solution
 
-# Each has ``solve(pairs)``, or ``solve(pairs, threshold, min_inlier_fraction)`` if it rejects
-# outliers.
-_SOLVERS: dict[str, ModuleType] = {
-    "dnlo": dnlo,
-    "dnl": dnl,
-    "park": park,
-    "taylor": park,
-    "zhuang": zhuang,
-    "ali": ali,
+# Of pairs, and of a threshold and the least share of inliers if they reject outliers.
+_SOLVERS: dict[str, Callable[..., Solution]] = {
+    "dnlo": dnlo.solve,
+    "dnl": dnl.solve,
+    "park": park.solve,
+    "taylor": park.solve,
+    "zhuang": zhuang.solve,
+    "ali": dnl.solve_ali,
 }
 
 
@@ -68,14 +67,14 @@ class Method:
             raise NotEnoughDataError(
                 "no motion pairs: there are too few common poses for the chosen reference"
             )
-        solve, rejection = _SOLVERS[self.name].solve, (self.threshold, self.min_inlier_fraction)
+        solve = _SOLVERS[self.name]
         if self.backend == "ipopt":
             from hand_eye_calib.solvers import ipopt  # takes a second
 
             solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
-        has_outliers = METHODS[self.name].rejects_outliers
-        solution: Solution = solve(pairs, *rejection) if has_outliers else solve(pairs)
-        return solution
+        if METHODS[self.name].rejects_outliers:
+            return solve(pairs, self.threshold, self.min_inlier_fraction)
+        return solve(pairs)
 
     def proved_global(self, pairs: MotionPairs, solution: Solution) -> str:
         """Whether a solution is proved to be the global minimum over the pairs it counts: "yes",
