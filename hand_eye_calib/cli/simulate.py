@@ -2,10 +2,11 @@
 
 import argparse
 import dataclasses
+import json
 from pathlib import Path
 
 from hand_eye_calib.cli.console import with_progress
-from hand_eye_calib.cli.options import at_least
+from hand_eye_calib.cli.options import add_json_argument, at_least
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.simulation.drive import (
     HILLY_DRIVE,
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=at_least(0), default=0, help=seed)
     bag = "also write a bag of every recording, in this storage format"
     add("--bag", choices=("mcap", "sqlite3", "rosbag1"), help=bag)
+    add_json_argument(parser)
     group = parser.add_argument_group("motion")
     group.add_argument(
         "--drive",
@@ -90,7 +92,12 @@ def run(arguments: argparse.Namespace) -> int:
 
             name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
             write_bag(folder / name, streams, arguments.bag)
-    print(f"{counted(len(folders), 'recording')} written to {arguments.out}")
+    if arguments.json:
+        runs = [str(folder) for folder in folders]
+        options = {"drive": dataclasses.asdict(config), "noise": dataclasses.asdict(noise)}
+        print(json.dumps({"runs": runs, "seed": arguments.seed, **options}, indent=2))
+    else:
+        print(f"{counted(len(folders), 'recording')} written to {arguments.out}")
     return 0
 
 
