@@ -44,14 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     web = f"also serve a page for browsers, at port {_PORT} of all addresses by default"
     at = ("", _PORT)
     add("--web", metavar="[HOST:]PORT", nargs="?", const=at, type=_address, help=web)
-    key = "word in the page's address, so that it stays the same. Default: a new one at each start"
-    add("--key", metavar="WORD", default="", help=key)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Show the node until told to end; returns the exit code."""
-    if arguments.key and arguments.web is None:
-        raise ConfigError("--key is for --web")
     from hand_eye_calib.ros.watcher import Watcher
     from hand_eye_calib.watch.board import Board
 
@@ -65,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.web is not None:
             from hand_eye_calib.watch.web import WebServer
 
-            server = WebServer(board, requests.put, arguments.web, key=arguments.key)
+            server = WebServer(board, requests.put, arguments.web)
             stack.callback(server.stop)
             addresses = server.addresses()
             for address in addresses:

@@ -385,11 +385,10 @@ def describe(calibration: Calibration) -> str:
     xyz, rpy = (", ".join(f"{each:.{n}f}" for each in v) for v, n in ((T[:3, 3], 4), (angles, 3)))
     mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
     deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
-    backend = " ipopt" * (calibration.backend == "ipopt")
     return (
         f"{calibration.headline}. {calibration.child_frame} in {calibration.parent_frame}: "
         f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
         f"status {calibration.status.value}; {calibration.method} {calibration.reference}"
-        f"{backend}: {calibration.n_poses} poses, {calibration.n_pairs} pairs, "
+        f": {calibration.n_poses} poses, {calibration.n_pairs} pairs, "
         f"{calibration.n_inliers} inliers"
     )

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.bags.messages import measured_as
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import NodeLog
@@ -163,29 +163,26 @@ class PoseInput:
         self.is_enabled, self.problem, self._sensor_frame = True, "", ""
         self._guard, self._refused = StampGuard(), Counter[str]()
         self._session, self._log, self._on_jump_back = session, log, on_jump_back
-        self._wanted, self._is_watching = "auto", False
+        self._wanted = "auto"
         self._arrived, self._lost = 0, 0
         self._next_number: int | None = None
         self._arrived_s: float | None = None
         self._bad, self._bad_at_s = "", -np.inf
         self._counts = deque([(time.monotonic(), 0, 0)], maxlen=_REPORTS + 1)
-        self._last_stamp_ns: int | None = None
-        self._longest_gap_ns, self._is_new = 0, True
+        self._is_new = True
 
     @property
     def has_poses(self) -> bool:
         """Whether there was a pose in this session."""
         return self._guard.last_ns is not None
 
-    def configure(self, config: CalibratorConfig, is_watching: bool) -> None:
-        """Follow the options; ``is_watching`` if the mount is watched."""
+    def configure(self, config: CalibratorConfig) -> None:
+        """Follow the options."""
         self._wanted = getattr(config, f"{self.name}_measures", "auto")
-        self._is_watching = is_watching
 
     def restart(self, because_of: "PoseInput | None") -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
-        self._last_stamp_ns, self._longest_gap_ns = None, 0
         self._is_new = because_of is None
         if because_of is None:
             self._guard.restart()
@@ -204,10 +201,7 @@ class PoseInput:
         ConfigError
             If they cannot be used.
         """
-        measures = measured_as(type_name, self._wanted, self.topic)
-        if self._is_watching and measures != "poses":
-            raise ConfigError(f"monitor needs poses; {self.topic} has {measures}")
-        return measures
+        return measured_as(type_name, self._wanted, self.topic)
 
     # -------------------------------------------------------------- messages
 
@@ -225,9 +219,6 @@ class PoseInput:
         self._arrived, self._arrived_s = self._arrived + 1, time.monotonic()
         if not self.is_enabled:
             return
-        if self._last_stamp_ns is not None:
-            self._longest_gap_ns = max(self._longest_gap_ns, stamp_ns - self._last_stamp_ns)
-        self._last_stamp_ns = stamp_ns
         last_ns = self._guard.last_ns
         judgement = self._guard.check(stamp_ns, read, self._arrived_s)
         if judgement.jumped_back:
@@ -291,7 +282,6 @@ class PoseInput:
             poses_taken=taken.received,
             refused=refused | dict(sorted(self._refused.items())),
             lost=None if self._next_number is None else self._lost,
-            longest_gap_s=self._longest_gap_ns * 1e-9,
         )
 
     def _judge(

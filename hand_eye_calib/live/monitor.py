@@ -19,11 +19,14 @@ from datetime import datetime
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.assessment.covariance import sigmas_in_parent
 from hand_eye_calib.assessment.floor import floor_of_pairs
 from hand_eye_calib.assessment.moved import (
     UNKNOWN_FROM,
+    Moved,
     log_ratio,
     most_likely,
+    moved,
     noise_covariance,
     residuals_and_jacobians,
     shift_covariance,
@@ -38,8 +41,8 @@ from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.session.compare import SEEN_TARGETS
-from hand_eye_calib.stats import LARGEST_OF_SIX, NINE_TIMES_OUT_OF_TEN, student_weights
-from hand_eye_calib.text import amount, axes_in_words, listing
+from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
+from hand_eye_calib.text import axes_in_words
 
 
 @dataclass(frozen=True)
@@ -106,28 +109,19 @@ LIMITS = BufferLimits(
 
 @dataclass(frozen=True, kw_only=True)
 class Alarm:
-    """The mount has moved since about a stamp of the parent's clock, which was clear at another.
-    The shift (6,), from the installed pose, is along (m) and about (rad) the parent sensor's axes.
+    """The mount has moved, from the installed pose, since about a stamp of the parent's clock; that
+    was clear at another.
     """
 
     since_ns: int
     raised_ns: int
-    shift: FloatArray
-    sigmas: FloatArray
+    shift: Moved
     log_ratio: float
 
     def __str__(self) -> str:
         """Which axes have moved, by how much, since when (local time)."""
-        ratios = np.abs(self.shift) / self.sigmas
-        told = [
-            f"{axes_in_words([axis])} by {amount(axis, shift)} +/- {amount(axis, sigma)}"
-            for axis, shift, sigma, ratio in zip(
-                AXES, self.shift.tolist(), self.sigmas.tolist(), ratios, strict=True
-            )
-            if ratio >= min(LARGEST_OF_SIX, ratios.max())
-        ]
         since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="seconds")
-        return f"the mount has moved: {listing(told)}, since about {since}"
+        return f"the mount has moved: {self.shift.what}, since about {since}"
 
 
 class MountMonitor:
@@ -153,7 +147,6 @@ class MountMonitor:
         self._installed = np.asarray(T_parent_child, dtype=float)
         self._covariance = TUNING.caution * np.asarray(covariance, dtype=float)
         self._wander = np.zeros((6, 6))
-        self._to_parent = np.kron(np.eye(2), self._installed[:3, :3])
         self._noise: FloatArray | None = None
         self._learning: list[tuple[int, MotionPairs]] = []
         self.is_learning = True
@@ -225,18 +218,17 @@ class MountMonitor:
         if len(self._learning) < TUNING.learning_s:
             return
         learned, self._learning = self._learning, []
-        found = [residuals_and_jacobians(each, self._installed) for _, each in learned]
-        residuals, jacobians = (np.concatenate(part) for part in zip(*found, strict=True))
+        parent = np.concatenate([each.Ts_parenti_parentj for _, each in learned])
+        child = np.concatenate([each.Ts_childi_childj for _, each in learned])
+        index = np.arange(len(parent))
+        pairs = MotionPairs(parent, child, index, index + 1)
+        residuals, jacobians = residuals_and_jacobians(pairs, self._installed)
         self.is_learning = False
         self._noise, _ = noise_covariance(residuals)
         for _ in range(2):
             H, S, _ = _information(residuals, jacobians, self._noise)
             shift = most_likely(H, S, TUNING.ridge)
             self._noise, _ = noise_covariance(residuals + jacobians @ shift)
-        parent = np.concatenate([each.Ts_parenti_parentj for _, each in learned])
-        child = np.concatenate([each.Ts_childi_childj for _, each in learned])
-        index = np.arange(len(parent))
-        pairs = MotionPairs(parent, child, index, index + 1)
         speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
         floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed, speed_m_s)
         floor += shift_covariance(1e-3, 1e-4)  # never singular
@@ -282,12 +274,14 @@ class MountMonitor:
         if ratios[best] < (self.alarm.log_ratio if self.alarm else TUNING.threshold):
             return
         covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
+        to_parent = np.kron(np.eye(2), self._installed[:3, :3])
         since_ns, raised_ns = int(self._stamps_ns[lags[best] - 1]), int(self._stamps_ns[0])
         self.alarm = Alarm(
             since_ns=self.alarm.since_ns if self.alarm else since_ns,
             raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
-            shift=self._to_parent @ covariance @ S[best],
-            sigmas=self._sigmas(covariance),
+            shift=moved(
+                to_parent @ covariance @ S[best], to_parent @ covariance @ to_parent.T, np.zeros(6)
+            ),
             log_ratio=float(ratios[best]),
         )
 
@@ -304,10 +298,6 @@ class MountMonitor:
         off = S - (H @ before[..., None])[..., 0]
         reduced = np.linalg.inv(np.eye(6) + H @ (uncertain + self._wander))
         return np.append(lags, len(self._S)), reduced @ H, (reduced @ off[..., None])[..., 0]
-
-    def _sigmas(self, covariance: FloatArray) -> FloatArray:
-        in_parent = self._to_parent @ covariance @ self._to_parent.T
-        return np.asarray(np.sqrt(np.diag(in_parent)))
 
     def visible(self, seconds: float) -> FloatArray:
         """Shifts (6,) along (m) and about (rad) each axis of the parent sensor that so many seconds
@@ -334,7 +324,8 @@ class MountMonitor:
         information = np.linalg.inv(covariance)
         _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ information)
         seen_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
-        return np.repeat(seen_sigmas, 3) * self._sigmas(covariance)
+        sigmas = sigmas_in_parent(self._installed[:3, :3], covariance)
+        return np.asarray(np.repeat(seen_sigmas, 3) * sigmas)
 
 
 def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
@@ -448,8 +439,8 @@ class MountWatch:
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift=by_axis(alarm.shift) if alarm else {},
-            shift_sigma=by_axis(alarm.sigmas) if alarm else {},
+            shift=by_axis(alarm.shift.values) if alarm else {},
+            shift_sigma=by_axis(alarm.shift.sigmas) if alarm else {},
             visible_10min=by_axis(told),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,

@@ -122,10 +122,10 @@ class LiveSession:
         Raises
         ------
         ConfigError
-            If nothing can be calibrated with what the other stream measures.
+            If nothing can be done with that, or with what the other stream measures.
         """
-        if stream not in STREAMS and measures != "poses":
-            raise ConfigError(f"a rig takes poses; {stream} has {measures}")
+        if measures != "poses" and (stream not in STREAMS or not self._is_solved):
+            raise ConfigError(f"a rig and monitor take poses; {stream} has {measures}")
         name = f"{stream}_measures"
         if stream in STREAMS and self._measures.get(name, "poses") != measures:
             measured = self._measures | {name: measures}

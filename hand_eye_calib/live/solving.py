@@ -17,7 +17,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import Any
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
@@ -132,23 +132,21 @@ def _failure(error: Exception) -> Failure:
 def main() -> None:
     """Answer jobs until the standard input ends, which it does with the node, however that ends."""
     os.nice(_NICENESS)
-    # What a library prints goes to standard error instead of the pipes.
-    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    with open(os.devnull, "rb") as nothing:
-        os.dup2(nothing.fileno(), 0)
+    # What a library prints goes to standard error instead of the pipe.
+    outgoing = os.fdopen(os.dup(1), "wb")
     os.dup2(sys.stderr.fileno(), 1)
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
-    threading.Thread(target=_receive, args=(incoming, jobs), daemon=True).start()
+    threading.Thread(target=_receive, args=(jobs,), daemon=True).start()
     while True:
         pickle.dump(answer(jobs.get()), outgoing, pickle.HIGHEST_PROTOCOL)
         outgoing.flush()
 
 
-def _receive(incoming: BinaryIO, jobs: "queue.SimpleQueue[Job]") -> None:
+def _receive(jobs: "queue.SimpleQueue[Job]") -> None:
     """Read jobs in a thread: the end of the node must be noticed during a long solve too."""
     try:
         while True:
-            jobs.put(pickle.load(incoming))
+            jobs.put(pickle.load(sys.stdin.buffer))
     finally:
         os._exit(0)
 
@@ -171,11 +169,11 @@ def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Po
 
 
 class SolvingProcess:
-    """Answers jobs in another process, in the order they were submitted.
+    """Answers one job at a time in another process.
 
     The process is started at once and again when it has died, or was killed because it hung; the
-    job in hand has failed then. It ends with this one, however this one ends. The thread here only
-    waits for the pipes.
+    job in hand has failed then. It ends with this one, however this one ends. The threads here only
+    wait for the pipes.
 
     Parameters
     ----------
@@ -187,17 +185,17 @@ class SolvingProcess:
 
     def __init__(self, on_answer: Callable[[], None], command: str = _SOLVE) -> None:
         self._on_answer, self._command = on_answer, command
-        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._is_stopping = False
         self._start()
-        # A daemon: a disk or a pipe that hangs must not keep the node alive.
-        self._thread = threading.Thread(target=self._run, name="solving", daemon=True)
-        self._thread.start()
+        self._thread = threading.Thread()
+        self._thread.start()  # so that it can be waited for
 
     def submit(self, job: Job) -> None:
-        """Queue a job."""
-        self._jobs.put(job)
+        """Send a job, once the one before is answered."""
+        # A daemon: a pipe that hangs must not keep the node alive.
+        self._thread = threading.Thread(target=self._run, args=(job,), name="solving", daemon=True)
+        self._thread.start()
 
     def answers(self) -> list[Answer]:
         """The answers that nobody has taken, in order."""
@@ -206,7 +204,6 @@ class SolvingProcess:
     def stop(self, timeout_s: float) -> None:
         """Wait for the job in hand, then end the process whatever it does."""
         self._is_stopping = True
-        self._jobs.put(None)
         self._thread.join(timeout_s)
         self._process.kill()
         self._thread.join(_LAST_BREATH_S)  # its pipe has ended
@@ -215,35 +212,24 @@ class SolvingProcess:
     def _start(self) -> None:
         self._process = start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            began_s = time.monotonic()
-            try:
-                found = self._answer(job)
-            except (EOFError, OSError, pickle.UnpicklingError):
-                if self._is_stopping:
-                    return
-                failure = self._restart(time.monotonic() - began_s >= HANGS_AFTER_S)
-                found = Answer(job.session, 0.0, failure=failure)
-            self._answers.put(found)
-            if not self._is_stopping:
-                self._on_answer()
-
-    def _answer(self, job: Job) -> Answer:
-        """What the process answers. Raises EOFError, OSError or UnpicklingError."""
-        to, back = self._process.stdin, self._process.stdout
-        assert to is not None
-        assert back is not None
+    def _run(self, job: Job) -> None:
+        to: Any = self._process.stdin
+        back: Any = self._process.stdout
+        found, began_s = None, time.monotonic()
         killer = threading.Timer(HANGS_AFTER_S, self._process.kill)
         killer.daemon = True
         killer.start()
-        try:
+        with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
             pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
             to.flush()
-            found: Answer = pickle.load(back)
-        finally:
-            killer.cancel()
-        return found
+            found = pickle.load(back)
+        killer.cancel()
+        if found is None and self._is_stopping:
+            return
+        hangs = time.monotonic() - began_s >= HANGS_AFTER_S
+        self._answers.put(found or Answer(job.session, 0.0, failure=self._restart(hangs)))
+        if not self._is_stopping:
+            self._on_answer()
 
     def _restart(self, hangs: bool) -> Failure:
         """Start the process again, which has died or was killed; returns how it ended."""

@@ -134,7 +134,7 @@ class CalibratorNode(Node):
             made = TfInput(self, name, TfSource.parse(frames), parts)
         else:
             made = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), parts)
-        made.configure(self._options.calibrator, options.monitor)
+        made.configure(self._options.calibrator)
         made.is_enabled = options.enabled
         return made
 
@@ -260,7 +260,7 @@ class CalibratorNode(Node):
             self._session.reconfigure(config)
             self._cycle.follow(config.targets)
         for each in self._inputs:
-            each.configure(config, options.monitor)
+            each.configure(config)
         if options.monitor != (self._mount is not None):
             self._session.watch_only(None)
             self._mount = self._watch_mount() if options.monitor else None

@@ -89,15 +89,9 @@ class TopicInput(PoseInput):
         measures = self.measures_as(type_name)
         self._session.set_measures(self.name, measures)
         read = MessageReader(type_name, measures, self._session.origin(self.name))
-
-        def on_message(data: Any, info: dict[str, Any]) -> None:
-            self.receive(read, data, info)
-            for queued in waiting_messages(self._subscription):
-                self.receive(read, *queued)
-
         # rclpy looks at the signature: with two arguments it passes the info as well, which its
         # annotations do not know.
-        callback: Any = on_message
+        callback: Any = partial(self._hear, read)
         try:
             self._subscription = self._node.create_subscription(
                 message_class(type_name),
@@ -115,8 +109,12 @@ class TopicInput(PoseInput):
             ) from error
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
-    def receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
-        """Take a message: the callback of the subscription."""
+    def _hear(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
+        """Take a message, and those that wait: the callback of the subscription."""
+        for each in ((data, info), *waiting_messages(self._subscription)):
+            self._receive(read, *each)
+
+    def _receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
         # With several publishers, or none any more, the numbers of lost messages are not known.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
@@ -142,8 +140,8 @@ class TfInput(PoseInput):
             heard: Any = partial(self._hear, topic)
             self._subscriptions[topic] = node.create_subscription(kind, topic, heard, qos)
 
-    def configure(self, config: CalibratorConfig, is_watching: bool) -> None:
-        super().configure(config, is_watching)
+    def configure(self, config: CalibratorConfig) -> None:
+        super().configure(config)
         self.measures_as("")
         self._stream.max_gap_s = config.max_gap
 

@@ -4,12 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -120,15 +115,8 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
     words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * is_dynamic
     unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
     values = f" Values: {', '.join(words)}." if words else ""
-    descriptor = ParameterDescriptor(
+    return ParameterDescriptor(
         description=f"{meta['doc']}{unit}{values}",
         read_only=meta["read_only"],
         dynamic_typing=is_dynamic,
     )
-    if meta["within"] and not is_dynamic:
-        low, high = map(type(field.default), meta["within"])
-        if isinstance(field.default, float):
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-        else:
-            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
-    return descriptor

@@ -129,9 +129,8 @@ class Robot:
         self._source, self._base_frame = options.installed, options.base_frame
         self._installed: Extrinsic | None = None
         self.problem = ""
-        is_file = self._source not in ("", TF)
         of_tree = partial(stated, frames.pose, STATIC_TOPIC)
-        self._read = open_installed(self._source) if is_file else of_tree
+        self._read = of_tree if self._source in ("", TF) else open_installed(self._source)
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
         """What is installed; None if nothing was given, or it is not known (yet)."""

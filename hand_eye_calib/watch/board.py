@@ -49,11 +49,6 @@ class Tone(Enum):
     BAD = "✗"
     UNKNOWN = "?"
 
-    @property
-    def css(self) -> str:
-        """Its class in the page."""
-        return self.name.lower()
-
 
 @dataclass(frozen=True)
 class Line:
@@ -69,8 +64,8 @@ class Bar:
     """One axis of the parent sensor's frame, such as "about z", against its target.
 
     ``meaning`` is such as "turn", if the axes are those of a vehicle; ``share``, 0 to 1, of the
-    information that the target needs; ``word`` such as "30 s left"; ``against`` such as "± 0.065 of
-    0.3 deg"; ``difference`` from what is installed, empty if not known.
+    information that the target needs; ``word`` such as "30 s left"; ``against`` such as "± 0.065
+    deg of 0.3 deg"; ``difference`` from what is installed, empty if not known.
     """
 
     name: str
@@ -312,8 +307,7 @@ def _bar(axis: str, state: NodeState) -> Bar:
         left = f"{duration(known.seconds_left)} left"
     tone, word = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, left
     wanted = amount(axis, known.target)
-    own = amount(axis, known.sigma).removesuffix(wanted[wanted.rfind(" ") :])
-    against = f"± {own} of {wanted}"
+    against = f"± {amount(axis, known.sigma)} of {wanted}"
     if not math.isfinite(known.sigma):
         tone, word, against = Tone.UNKNOWN, "not seen yet", f"wanted: {wanted}"
     elif known.seconds_left == 0:
@@ -344,7 +338,7 @@ def _values(result: ResultState) -> Iterator[tuple[str, str]]:
 
 def _watched(axis: str, mount: MountState) -> Line:
     """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
-    shift, sigma = mount.shift.get(axis) or 0.0, mount.shift_sigma.get(axis) or 0.0
+    shift, sigma = mount.shift.get(axis) or 0.0, mount.shift_sigma.get(axis) or math.inf
     visible = mount.visible_10min.get(axis)
     if abs(shift) > LARGEST_OF_SIX * sigma:
         tone, text = Tone.BAD, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"

@@ -26,7 +26,6 @@ from hand_eye_calib.live.state import REPORT_PERIOD_S
 from hand_eye_calib.text import AXIS_UNITS
 from hand_eye_calib.watch.board import Bar, Board, Line, Tone, View
 
-PORT = 8765
 # Requests of the page, beside that of an axis measured by hand.
 BUTTONS = ("solve", "save", "reset", "recalibrate", "acknowledge")
 
@@ -74,8 +73,6 @@ class WebServer(ThreadingHTTPServer):
     address : (str, int)
         Host and port; an empty host stands for all addresses of the computer, port 0 for any that
         is free.
-    key : str
-        Empty for a new one.
 
     Raises
     ------
@@ -90,10 +87,9 @@ class WebServer(ThreadingHTTPServer):
         self,
         board: Board,
         ask: Callable[[str], None],
-        address: tuple[str, int] = ("", PORT),
-        key: str = "",
+        address: tuple[str, int],
     ) -> None:
-        self.key = key or secrets.token_urlsafe(6)
+        self.key = secrets.token_urlsafe(6)
         self.board, self.ask = board, ask
         self.stopping = threading.Event()
         self._host, port = address
@@ -107,11 +103,6 @@ class WebServer(ThreadingHTTPServer):
             ) from None
         threading.Thread(target=self.serve_forever, name="web", daemon=True).start()
 
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return int(self.server_address[1])
-
     def addresses(self) -> list[str]:
         """What to type into a browser, that for other computers first."""
         hosts = [self._host or "localhost"]
@@ -119,7 +110,7 @@ class WebServer(ThreadingHTTPServer):
         with probe, contextlib.suppress(OSError):  # of a computer without a network
             probe.connect(("192.0.2.1", 9))  # sends nothing; asks which way it would go
             hosts[:0] = [] if self._host else [str(probe.getsockname()[0])]
-        return [f"http://{host}:{self.port}/?key={self.key}" for host in hosts]
+        return [f"http://{host}:{self.server_port}/?key={self.key}" for host in hosts]
 
     def stop(self) -> None:
         """Close all connections."""
@@ -253,7 +244,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     )
     facts = f'<p class="facts">{escape(view.facts)}</p>' if view.facts else ""
     return (
-        f'<div id="state" class="{view.tone.css}" data-buttons="{" ".join(view.buttons)}" '
+        f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
         f'data-by-hand="{escape(view.by_hand)}">'
         f'<p class="node">{escape(view.node or "no node")}</p>'
         f'<section class="headline"><h1>{_sign(view.tone)} {escape(view.word)}</h1>'
@@ -276,7 +267,7 @@ def _wrapped(tag: str, parts: Iterable[str]) -> list[str]:
 def _bar(bar: Bar) -> str:
     difference = f"from installed: {bar.difference}" if bar.difference else ""
     return (
-        f'<div class="axis {bar.tone.css}"><b>{escape(bar.name)}</b>'
+        f'<div class="axis {bar.tone.name.lower()}"><b>{escape(bar.name)}</b>'
         f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.name)}"></progress>'
         f'<span class="state">{_sign(bar.tone)} {escape(bar.word)}</span>'
         f'<span class="meaning">{escape(bar.meaning)}</span>'
@@ -287,7 +278,7 @@ def _bar(bar: Bar) -> str:
 
 def _line(line: Line) -> str:
     return (
-        f'<p class="line {line.tone.css}">{_sign(line.tone)} <b>{escape(line.name)}</b> '
+        f'<p class="line {line.tone.name.lower()}">{_sign(line.tone)} <b>{escape(line.name)}</b> '
         f"{escape(line.text)}</p>"
     )
 

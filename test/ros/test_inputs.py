@@ -165,7 +165,7 @@ class TestRefusedInput:
     def test_positions_where_the_mount_is_watched(self, start_node, peer):
         node = start_node("-p monitor:=true", "-p installed:=1 0 0 0 0 0")
         peer.publisher(NavSatFix, "child_odom")
-        node.wait_for_log("monitor needs poses; /child_odom has positions")
+        node.wait_for_log("a rig and monitor take poses; child has positions")
         peer.wait_matched(peer.publisher(Odometry, "parent_odom"))
 
     def test_positions_on_both_inputs(self, start_node, peer):

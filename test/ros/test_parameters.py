@@ -22,7 +22,7 @@ def parameter_file(path, **parameters):
     return f"--params-file {path}"
 
 
-def test_every_option_is_a_parameter_with_its_description_and_range(start_node, peer):
+def test_every_option_is_a_parameter_with_its_description(start_node, peer):
     start_node()
     assert set(FIELDS) <= peer.parameter_names()
     for name in ("threshold", "max_pairs", "method", "scale", "parent_frame"):
@@ -32,9 +32,6 @@ def test_every_option_is_a_parameter_with_its_description_and_range(start_node, 
         assert descriptor.read_only == meta["read_only"]
         assert descriptor.dynamic_typing == bool(meta["words"])
         assert peer.parameter(name) == FIELDS[name].default
-    threshold, max_pairs = (FIELDS[name].metadata["within"] for name in ("threshold", "max_pairs"))
-    assert peer.describe("threshold").floating_point_range[0].to_value == threshold[1]
-    assert peer.describe("max_pairs").integer_range[0].from_value == max_pairs[0]
     assert ", ".join(METHODS) in peer.describe("method").description
 
 
@@ -50,7 +47,7 @@ def test_changes_are_applied_or_rejected_with_the_reason(start_node, peer):
     for name, value, reason in [
         ("method", "magic", f"method must be one of {', '.join(METHODS)}"),
         ("reference", "B0", "reference must be auto, A, B<n>"),
-        ("threshold", -1.0, "threshold out of range"),
+        ("threshold", -1.0, "threshold must be "),
         ("threshold", 1, "Wrong parameter type"),
         ("scale", "huge", "scale must be none or "),
         ("scale", -2.0, "scale must be at least"),

@@ -82,7 +82,7 @@ def start_watch(domain, tmp_path):
 def test_a_person_sees_the_session_from_the_first_message_to_done(
     start_node, start_watch, peer, tmp_path
 ):
-    watch = start_watch("--web", "127.0.0.1:0", "--key", "word")
+    watch = start_watch("--web", "127.0.0.1:0")
     watch.wait_for("NO NODE: Nothing heard of a calibrator yet")
     node = start_node(*QUICK, f"-p output_directory:={tmp_path / 'out'}")
     watch.wait_for("CHECK INPUT: No message on /parent_odom yet")
@@ -94,14 +94,15 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     peer.solve(publishers, *parts[2])
     watch.wait_for("✓ DONE: ")
 
-    port = int(watch.wait_for(r"http://127.0.0.1:(\d+)/\?key=word", watch.notes)[1])
+    address = r"http://127.0.0.1:(\d+)/\?key=(\S+)"
+    port, key = watch.wait_for(address, watch.notes).groups()
     page = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-    page.request("POST", "/save?key=word")
+    page.request("POST", f"/save?key={key}")
     assert page.getresponse().status == 200
     watch.wait_for("save: result saved to ")
     assert (tmp_path / "out" / "extrinsic.yaml").exists()
     events = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
-    events.request("GET", "/events?key=word")
+    events.request("GET", f"/events?key={key}")
     shown = events.getresponse().readline().decode()
     assert "pose of camera in lidar" in shown
     assert "DONE" in shown
