@@ -34,10 +34,12 @@ def read_recording(
     paths: Sequence[Path], wanted: Mapping[str, str], options: Mapping[str, Any]
 ) -> Recording:
     """The recording of a journal, of a bag or of the parts of one, with SeveralRecordings if they
-    are not. Sources must be wanted by name if a bag leaves a choice; the options are those that
-    somebody gave.
+    are not; journals are recordings of their own. Sources must be wanted by name if a bag leaves a
+    choice; the options are those that somebody gave.
     """
-    journal = journal_in(paths[0]) if len(paths) == 1 else None
+    journal = next(filter(None, map(journal_in, paths)), None)
+    if journal and len(paths) > 1:
+        raise SeveralRecordings(f"{journal} is a session of its own", [[path] for path in paths])
     if journal is None:
         return _read_bags(paths, wanted, CalibratorConfig.from_options(dict(options)))
     if wanted:
@@ -115,16 +117,13 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Any]) -
     """Give every pose to the engine. The first message that cannot be used is an InputError with
     topic and stamp.
     """
-    # A message without a frame name changes nothing.
-    frames: set[tuple[str, str | None]] = {(stream, None) for stream in topics}
     columns = (poses.streams, poses.sensor_frames, poses.stamps_ns, poses.poses)
     row = 0
     try:
         rows = zip(*(column.tolist() for column in columns), strict=True)
         for row, (stream, frame, stamp_ns, pose) in enumerate(rows):  # noqa: B007
-            if (stream, frame) not in frames:
+            if frame is not None:
                 calibrator.set_frame(stream, frame)
-                frames.add((stream, frame))
             calibrator.add_pose(stream, stamp_ns, pose[:3], pose[3:])
     except InputError as error:
         seconds, nanoseconds = divmod(int(poses.stamps_ns[row]), 1_000_000_000)

@@ -6,7 +6,6 @@ name, for bags and journals alone.
 import argparse
 import dataclasses
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,23 +176,17 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     else:
         from hand_eye_calib.cli import bags
 
-        if len(paths) > 1 and any(map(bags.journal_in, paths)):
-            return _run_together(arguments, [[path] for path in paths])
         try:
             recording = bags.read_recording(paths, sources_from(arguments), options)
         except bags.SeveralRecordings as several:
+            from hand_eye_calib.cli.batch.run import run_together
+
             note(f"{several.reason}; they give one result, as recordings of one rig")
-            return _run_together(arguments, several.groups)
+            return run_together(arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     bag = paths[0] if are_bags else None
     return deliver(calibration, as_given(recording.inputs), arguments, recording.snapshot, bag)
-
-
-def _run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path]]) -> int:
-    from hand_eye_calib.cli.batch.run import run_together
-
-    return run_together(arguments, groups)
 
 
 def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:

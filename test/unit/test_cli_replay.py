@@ -76,6 +76,13 @@ def test_what_was_set_in_a_session_counts_as_set_in_its_replay(tmp_path):
     assert config.given == {"time_offset", "reference"}
 
 
+def test_journals_are_recordings_of_their_own(run, bag, tmp_path):
+    write_session(tmp_path / "live" / "journal", {"reference": "B5"})
+    code, out, err = run(tmp_path / "live", bag, "--reference", "B5", "--json", "--jobs", "1")
+    assert "is a session of its own; they give one result" in err
+    assert (code, len(json.loads(out)["together"]["recordings"])) == (0, 2)
+
+
 def test_what_does_not_go_with_a_journal(run, tmp_path):
     write_session(tmp_path, {})
     code, out, err = run(tmp_path, *STREAMS)
