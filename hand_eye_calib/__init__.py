@@ -38,7 +38,7 @@ _HOMES = {
     "read_trajectory": "io.trajectory_files.reading",
     "save": "io.results",
     "simulate": "simulation.drive",
-    "write_trajectory": "io.trajectory_files.writing",
+    "write_trajectory": "io.trajectory_files.table",
 }
 
 __all__ = [*_HOMES]
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.results import save as save
     from hand_eye_calib.io.stops import read_arm_samples as read_arm_samples
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory as read_trajectory
-    from hand_eye_calib.io.trajectory_files.writing import write_trajectory as write_trajectory
+    from hand_eye_calib.io.trajectory_files.table import write_trajectory as write_trajectory
     from hand_eye_calib.report.plot import plot as plot
     from hand_eye_calib.results.calibration import Calibration as Calibration
     from hand_eye_calib.results.records import Residuals as Residuals

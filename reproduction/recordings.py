@@ -18,7 +18,11 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory, read_trajectory_file
+from hand_eye_calib.io.trajectory_files.reading import (
+    FileOptions,
+    read_trajectory,
+    read_trajectory_files,
+)
 from reproduction.published import KEYFRAMES, KITTI_DRIVES, RECTIFIED
 
 # Parts of a drive, by how many there are.
@@ -310,7 +314,8 @@ def _boreas_poses(path: Path, unit_ns: int) -> Trajectory:
 
 
 def _read(path: Path, columns: str) -> Trajectory:
-    return read_trajectory_file(path, "csv", columns=columns, repair=True)[0]
+    options = FileOptions(format="csv", columns=columns, repair=True)
+    return read_trajectory_files([(path, options)])[0].trajectory
 
 
 def between(

@@ -1,11 +1,14 @@
 """Synthetic motion with a known answer, for tests that need poses rather than a vehicle."""
 
+from pathlib import Path
+
 import numpy as np
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+from hand_eye_calib.io.trajectory_files.reading import FileOptions, read_trajectory_files
+from hand_eye_calib.io.trajectory_files.table import write_trajectory
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 
@@ -94,3 +97,8 @@ def geodetic(positions, origin):
         missing = (positions - place.local(*found.T)) / per_radian_m
         found += missing[:, [1, 0, 2]]
     return *np.degrees(found[:, :2].T), found[:, 2]
+
+
+def read_trajectory_file(path, format="tum", **options):
+    """A file as the command line reads it: with what was repaired and guessed."""
+    return read_trajectory_files([(Path(path), FileOptions(format=format, **options))])[0]

@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write; returns the exit code."""
     from hand_eye_calib.geometry.trajectory import Trajectory
-    from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+    from hand_eye_calib.io.trajectory_files.table import write_trajectory
     from hand_eye_calib.simulation.drive import simulate_drive
 
     config = _DRIVES[arguments.drive]

@@ -235,16 +235,9 @@ def _frames(data: bytes) -> FrameTree:
 def _origin(joint: ElementTree.Element) -> list[float]:
     """x, y, z, roll, pitch and yaw of a joint's origin."""
     origin = joint.find("origin")
-    attributes = {} if origin is None else dict(origin.attrib)
-    try:
-        values = [
-            float(text) for name in ("xyz", "rpy") for text in attributes.pop(name, "0 0 0").split()
-        ]
-    except ValueError:
-        values = []
-    if attributes or len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(
-            f"the origin of joint {joint.get('name', '')!r} is not six numbers, xyz and rpy: "
-            f"{dict(origin.attrib) if origin is not None else {}}"
-        )
+    given = {"xyz": "0 0 0", "rpy": "0 0 0"} | (origin.attrib if origin is not None else {})
+    values = numbers_of(" ".join(given.values()))
+    if len(given) != 2 or len(values) != 6 or not np.isfinite(values).all():
+        name = joint.get("name", "")
+        raise InputError(f"the origin of joint {name!r} is not six numbers, xyz and rpy: {given}")
     return values

@@ -77,7 +77,7 @@ def _copied(url: str, folder: Path) -> Path:
         found = [path] if is_file else system.ls(path, detail=False)
         files = [name for name in found if _name(name).endswith(_SUFFIXES)]
         if not files:
-            raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
+            raise FileNotFoundError(f"expected a bag, files that end in {', '.join(_SUFFIXES)}")
         for name in files:
             # The name's last part only: a store does not choose where things go.
             system.get_file(name, str(folder / _name(name)))
@@ -103,8 +103,6 @@ def _reached(url: str) -> Iterator[tuple[Any, str]]:
             f"{public(url)} needs a package that is not installed: {error}; "
             "pip install 'hand_eye_calib[fleet]', and that of the store"
         ) from None
-    except HandEyeCalibError as error:
-        raise InputError(f"cannot read {public(url)}: {error}") from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".:")
         raise InputError(

@@ -102,11 +102,8 @@ def _stacks(path: str | Path) -> list[dict[str, Any]]:
 def _pair(sample: Any) -> Sequence[Any]:
     """Both poses of a sample."""
     if isinstance(sample, Mapping):
-        names = next((names for names in _NAMES if all(name in sample for name in names)), None)
-        if names is None:
-            known = " or ".join(", ".join(pair) for pair in _NAMES)
-            raise InputError(f"expected poses named {known}; found {', '.join(sample) or 'none'}")
-        return [sample[name] for name in names]
+        found = (names for names in _NAMES if all(name in sample for name in names))
+        sample = [sample[name] for name in next(found, ())]
     if not isinstance(sample, Sequence) or len(sample) != 2:
-        raise InputError("expected two poses")
+        raise InputError(f"expected {_EXPECTED}")
     return sample

@@ -8,7 +8,7 @@ directions come from is in docs/exports.md.
 import json
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,9 +62,9 @@ class Layout(NamedTuple):
     is_inverted: bool | None
     keys: list[str]
     text: str
-    clock: int
-    axes: tuple[str, ...]
-    axes_said: str
+    clock: int = 0
+    axes: tuple[str, ...] = AXES
+    axes_said: str = ""
 
 
 _YAML_ROWS = "%(about)s\ncam0:\n  {key}:\n%(rows)s\n  timeshift_cam_imu: %(shift)s\n"
@@ -88,17 +88,14 @@ _PX4 = (
 FORMATS: dict[str, list[Layout]] = {}
 
 
-def _layout(
-    words: str, text: str, clock: int = 0, axes: tuple[str, ...] = AXES, axes_said: str = ""
-) -> None:
+def _layout(words: str, text: str, **rest: Any) -> None:
     """Add a row to the table; the words are format, target, source and keys. After a colon stands
     which of both a sensor always is.
     """
     name, target, source, *keys = words.split()
     (target, _, place), source = target.partition(":"), source.partition(":")[0]
     is_inverted = place == "child" if place else None
-    layout = Layout(target, source, is_inverted, keys, text, clock, axes, axes_said)
-    FORMATS.setdefault(name, []).append(layout)
+    FORMATS.setdefault(name, []).append(Layout(target, source, is_inverted, keys, text, **rest))
 
 
 _layout(

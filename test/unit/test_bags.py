@@ -348,15 +348,8 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
 
 def test_writing_refuses_what_it_cannot_do(tmp_path, new_bag):
     path = new_bag()
-    new = tmp_path / "new"
-    for message, arguments in (
-        ("exists already", (path, STREAMS)),
-        (r"must be named \.bag", (new, STREAMS, "rosbag1")),
-        (r"must be named \.bag", (tmp_path / "new.bag", STREAMS, "mcap")),
-        ("cannot write bag", (storage_file(path) / "new", STREAMS)),
-    ):
-        with pytest.raises(InputError, match=message):
-            write_bag(*arguments)
+    with pytest.raises(InputError, match="cannot write bag"):
+        write_bag(storage_file(path) / "new", STREAMS)
     assert not {*tmp_path.iterdir()} - {path}
 
 

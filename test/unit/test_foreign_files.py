@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from motions import as_trajectory, geodetic, wandering_poses
+from motions import as_trajectory, geodetic, read_trajectory_file, wandering_poses
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
@@ -17,7 +17,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError, MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import AUTO, read_trajectory_file
+from hand_eye_calib.io.trajectory_files.reading import AUTO
 
 N = 40
 TRUTH = as_trajectory(wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000)

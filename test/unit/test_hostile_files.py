@@ -9,15 +9,21 @@ import xml.dom.minidom
 
 import pytest
 import yaml
-from motions import as_trajectory, child_of, disturbed, wandering_poses, write_pair
+from motions import (
+    as_trajectory,
+    child_of,
+    disturbed,
+    read_trajectory_file,
+    wandering_poses,
+    write_pair,
+)
 from result_making import calibration
 
 from hand_eye_calib.cli.batch.run import stored
 from hand_eye_calib.cli.batch.work import Task
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.results import load_result, save_result
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory_file
-from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+from hand_eye_calib.io.trajectory_files.table import write_trajectory
 
 PARENT = as_trajectory(wandering_poses(30), sensor_frame="lidar")
 CHILD = as_trajectory(

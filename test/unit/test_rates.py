@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from bag_making import JAZZY, fix, imu
-from motions import T_PARENT_CHILD, child_of, planar_poses, wandering_poses
+from motions import T_PARENT_CHILD, child_of, planar_poses, read_trajectory_file, wandering_poses
 from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
@@ -21,7 +21,6 @@ from hand_eye_calib.io.bags.messages import (
     unpack_poses,
 )
 from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory_file
 from hand_eye_calib.results.document import usable_numbers
 
 BIAS = np.array([0.02, -0.01, 0.03])

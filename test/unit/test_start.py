@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from hand_eye_calib.cli.main import COMMANDS, main
-from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+from hand_eye_calib.io.trajectory_files.table import write_trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
 
 # Each takes from a tenth of a second to a second to load.

@@ -73,9 +73,9 @@ def test_files_of_other_tools(written, poses, tmp_path):
     [
         ("", "expected samples of an arm"),
         ("a: 1", "expected samples of an arm"),
-        ("[1, 2]", "sample 1: expected two poses"),
+        ("[1, 2]", "sample 1: expected samples of an arm"),
         ("[[1, 2]]", "sample 1: expected a pose"),
-        ("[{x: 1, y: 2}]", "found x, y"),
+        ("[{x: 1, y: 2}]", "expected samples of an arm"),
         ("[{robot: {}, tracking: {}}]", "translation and rotation"),
         (json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]), "the rotation is not one"),
         (json.dumps([[[0] * 7, [0] * 7]]), "a quaternion of length 0"),
@@ -99,7 +99,7 @@ def test_two_stacks_in_an_npz(as_rows, poses, tmp_path):
     read = read_arm_samples(file)
     np.testing.assert_allclose([read.robot, read.tracking], poses, atol=1e-12)
     np.savez(file, first=np.eye(4))
-    with pytest.raises(InputError, match="found first"):
+    with pytest.raises(InputError, match="expected samples of an arm"):
         read_arm_samples(file)
     file.write_bytes(b"PK and no more")
     with pytest.raises(InputError, match=r"cannot read .*arm\.npz"):

@@ -13,7 +13,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.writer import stamped_messages
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, images_in, read_camera
-from hand_eye_calib.io.trajectory_files.writing import write_trajectory
+from hand_eye_calib.io.trajectory_files.table import write_trajectory
 
 cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")
 

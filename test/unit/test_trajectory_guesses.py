@@ -4,7 +4,7 @@ their units, latitude and longitude, repeated stamps.
 
 import numpy as np
 import pytest
-from motions import as_trajectory, geodetic, planar_poses, wandering_poses
+from motions import as_trajectory, geodetic, planar_poses, read_trajectory_file, wandering_poses
 from published_data import data_folder
 
 import hand_eye_calib as hec
@@ -12,12 +12,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.trajectory_files.reading import (
-    AUTO,
-    FileOptions,
-    read_trajectory_file,
-    read_trajectory_files,
-)
+from hand_eye_calib.io.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
 
 SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
 

@@ -21,18 +21,11 @@ Streams = Mapping[str, tuple[Trajectory, str]]
 def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None:
     """Write trajectories into a new bag, the poses of all topics in the order of their stamps.
 
-    ``path`` is the directory to make, or for rosbag1 the ``.bag`` file; an InputError if it exists.
+    ``path`` is the directory to make, or for rosbag1 the ``.bag`` file; neither may exist.
     ``streams`` are topics with trajectory and message type, Odometry (with the sensor's frame) or
     PoseStamped; stamps are written to both header and bag. ``storage`` is one of STORAGES.
     """
     path = Path(path)
-    if (path.suffix == ".bag") != (storage == "rosbag1"):
-        raise InputError(
-            f"cannot write {path} as {storage}: a rosbag1 file, and nothing else, must be named "
-            ".bag"
-        )
-    if path.exists():
-        raise InputError(f"{path} exists already; remove it or choose another name")
     library = rosbags(1 if storage == "rosbag1" else 2)
     about: dict[str, Any] = {}
     if storage != "rosbag1":

@@ -27,6 +27,7 @@ from hand_eye_calib.io.trajectory_files.table import (
     RATES,
     UNNAMED,
     Table,
+    seconds,
 )
 from hand_eye_calib.stats import median
 
@@ -112,12 +113,6 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
     dropped = f"dropped {n_dropped} whose stamp was there already"
     said = "; ".join([went_back] * (backward > 0) + [dropped] * (n_dropped > 0))
     return keep, [f"{table.path}: {said}"]
-
-
-def seconds(stamp_ns: int) -> str:
-    """A stamp in seconds, with all its digits."""
-    whole, nanoseconds = divmod(abs(int(stamp_ns)), STAMP_UNITS["s"])
-    return f"{'-' if stamp_ns < 0 else ''}{whole}.{nanoseconds:09d}"
 
 
 # ---- poses and rates

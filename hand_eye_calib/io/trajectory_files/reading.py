@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,7 @@ from hand_eye_calib.io.trajectory_files.table import (
     POSITION,
     QUATERNION,
     RATES,
+    TUM_COLUMNS,
     UNNAMED,
     Table,
     named_columns,
@@ -40,7 +41,6 @@ from hand_eye_calib.text import told_apart
 
 #: The format that the lines look like.
 AUTO = "auto"
-TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 # Of the formats whose columns have an order: their names, and what a row is.
 _FORMATS: dict[str, tuple[Sequence[str], str]] = {
@@ -167,7 +167,8 @@ def read_trajectory(
     """
     path = Path(source) if isinstance(source, str | PathLike) else None
     file_of_times = Path(times) if isinstance(times, str | PathLike) else None
-    has_options = format != FileOptions.format or columns is not None or file_of_times is not None
+    is_named = format not in (FileOptions.format, AUTO)
+    has_options = is_named or columns is not None or file_of_times is not None
     if isinstance(source, Trajectory):
         return source
     if topic or tf:
@@ -206,16 +207,6 @@ def _of_bag(path: Path, topic: str | None, tf: str | None, measures: str) -> Tra
     return trajectory
 
 
-def read_trajectory_file(
-    path: str | Path, format: str = FileOptions.format, **options: Any
-) -> FileReading:
-    """Read a text file as :func:`read_trajectory`, with the options of FileOptions, and without
-    warnings.
-    """
-    of_file = FileOptions(format=format, **options)
-    return _read(read_table(path, of_file), of_file)
-
-
 def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
     """Read text files that belong together, with sensors named after the files: those with the same
     columns, which come from one exporter, by one convention of their angles. An InputError if a
@@ -232,16 +223,16 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
     for header in {table.names for table in tables if table.conventions}:
         of_one = [k for k, table in enumerate(tables) if table.names == header]
         conventions = [tables[k].conventions for k in of_one]
-        if len({each[0] for each in conventions}) > 1:
-            common = [way for way in conventions[0] if all(way in each for each in conventions)]
-            if not common:
-                raise InputError(
-                    f"{' and '.join(str(files[k][0]) for k in of_one)} have the same columns, "
-                    "but no convention of their angles fits the motion of all; write quaternions "
-                    "instead, or name the column of one yaw (counterclockwise) and of the other "
-                    "heading (clockwise from north) if that is what they are"
-                )
-            for k in of_one:
+        common = [way for way in conventions[0] if all(way in each for each in conventions)]
+        if not common:
+            raise InputError(
+                f"{' and '.join(str(files[k][0]) for k in of_one)} have the same columns, but no "
+                "convention of their angles fits the motion of all; write quaternions instead, or "
+                "name the column of one yaw (counterclockwise) and of the other heading (clockwise "
+                "from north) if that is what they are"
+            )
+        for k in of_one:
+            if tables[k].conventions[0] != common[0]:
                 read[k] = _read(read_table(*files[k]), files[k][1], pairs[k], common[0])
     names = [path.stem for path, _ in files]
     if len({*names}) < len(names):
@@ -259,10 +250,7 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
     """
     paths = [Path(each) for each in sources if isinstance(each, str | PathLike)]
     if len(paths) < len(sources):
-        return [
-            read_trajectory(each, AUTO if isinstance(each, str | PathLike) else "tum")
-            for each in sources
-        ]
+        return [read_trajectory(each, AUTO) for each in sources]
     readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])
     for text in (text for _, *texts in readings for text in sum(texts, [])):
         warnings.warn(text, UserWarning, stacklevel=3)

@@ -1,5 +1,5 @@
 """The numbers of a trajectory, row by row, before they become poses: what the columns are by their
-names, and what stands in them.
+names, and what stands in them; and rows as they are written.
 """
 
 import re
@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -15,11 +16,15 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io.files import write_atomically
 from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.text import shortened, shown_value
 
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
+TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 # Coefficients of a quaternion whose order is not known.
 UNNAMED = ("q1", "q2", "q3", "q4")
 # The first three rows of a pose's matrix.
@@ -310,3 +315,44 @@ def table_of_object(source: Any, times: Any = None) -> Table:
             )
         table.stamps = [*map(Decimal, stamps.tolist())]
     return table
+
+
+# ---- rows that are written
+
+
+def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a trajectory to a text file in the format tum, which evo reads, too, replacing it if it
+    exists. Reading it back gives the same stamps and poses.
+
+    Parameters
+    ----------
+    path : str or path-like
+    trajectory : Trajectory
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
+    """
+    try:
+        quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
+        values = np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1).tolist()
+        lines = map(tum_line, trajectory.stamps_ns.tolist(), values)
+        write_atomically({Path(path): "\n".join([f"# {TUM_COLUMNS}", *lines, ""])})
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
+    """The line of a pose x y z qx qy qz qw, which keeps every digit."""
+    return f"{seconds(stamp_ns)} {' '.join(map(repr, pose))}"
+
+
+def seconds(stamp_ns: int) -> str:
+    """A stamp in seconds, with all its digits."""
+    whole, nanoseconds = divmod(abs(int(stamp_ns)), STAMP_UNITS["s"])
+    return f"{'-' if stamp_ns < 0 else ''}{whole}.{nanoseconds:09d}"
