@@ -217,12 +217,9 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     found = _saying(found, options, told)
     if "time_offset" not in options or abs(offset_s) <= UNASKED_S:
         return found
-    sizes: dict[str, Any] = {
-        "offset_s": offset_s,
-        "size_s": abs(offset_s),
-        "total_s": round(offset_s, 4),
-    }
-    large = finding("large_time_offset", "child", direction=direction, **sizes)
+    sizes: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
+    sizes |= {"total_s": round(offset_s, 4), "direction": direction}
+    large = finding("large_time_offset", "child", **sizes)
     findings = gravest_first((*found.calibration.findings, large))
     return replace(found, calibration=replace(found.calibration, findings=findings))
 

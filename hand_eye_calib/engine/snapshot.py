@@ -231,12 +231,10 @@ def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) ->
     """The trajectory of a stream in the usual convention, from that of the options."""
     invert, order = getattr(config, f"{stream}_invert"), getattr(config, f"{stream}_quaternion")
     if (invert, order) != ("none", "xyzw"):
-        needs = {"poses"} if invert == "poses" else {"poses", "rotations"}
-        if trajectory.measures not in needs:
-            name = (
-                f"{stream}_invert {invert}" if invert != "none" else f"{stream}_quaternion {order}"
-            )
-            raise ConfigError(f"{name} cannot be: the {stream} measures {trajectory.measures}")
+        kind = trajectory.measures
+        if kind not in ("poses", "rotations") or (invert, kind) == ("poses", "rotations"):
+            options = f"{stream}_invert {invert}, {stream}_quaternion {order}"
+            raise ConfigError(f"{options} cannot be: the {stream} measures {kind}")
         right = se3.put_right(trajectory.poses, invert, order)
         trajectory = replace(trajectory, poses=right)
     is_scaled = stream == "parent" and config.parent_scale != 1.0

@@ -41,6 +41,14 @@ _FACTORS = np.geomspace(1 / 16, 16, 9)
 
 # How the results of a rig belong together: see Together.kind.
 Kind = Literal["single", "agree", "scatter", "one off", "moved", "differ"]
+_SAID = {
+    "single": "One recording: nothing to compare with",
+    "agree": "{all} agree within their standard deviations",
+    "differ": "{both} differ; a third recording shows which is off",
+    "scatter": "{all} scatter {excess} times as much as those of one rig do; none stands out",
+    "one off": "{first} differs from the others: {moves}",
+    "moved": "The mount has moved before {first}: {moves}",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,24 +93,17 @@ class Agreement:
 
     def sentence(self, names: Sequence[str]) -> str:
         """What the comparison of results with these names found."""
-        match self.kind:
-            case "single":
-                return "One recording: nothing to compare with"
-            case "agree":
-                found = f"The {len(names)} recordings agree within their standard deviations"
-            case "differ":
-                found = f"{names[0]} and {names[1]} differ; a third recording shows which is off"
-            case "scatter":
-                found = f"The {len(names)} recordings scatter {self.excess:.1f} times as much as "
-                found += "recordings of one rig do; none stands out"
-            case "one off":
-                found = f"{names[self.apart[0]]} differs from the others: {self._moves()}"
-            case "moved":
-                found = f"The mount has moved before {names[self.apart[0]]}: {self._moves()}"
-        return (
-            f"{found} (chi-square {self.chi2:.1f} with {self.dof} degrees of freedom, "
-            f"p {self.p_value:.2g})"
+        found = _SAID[self.kind].format(
+            all=f"The {len(names)} recordings",
+            both=listing(names),
+            excess=f"{self.excess:.1f}",
+            first=names[self.apart[0]] if self.apart else "",
+            moves=self._moves() if self.apart else "",
         )
+        if self.kind == "single":
+            return found
+        numbers = f"chi-square {self.chi2:.1f}, {self.dof} degrees of freedom, p {self.p_value:.2g}"
+        return f"{found} ({numbers})"
 
     def _moves(self) -> str:
         """By how much those apart differ, by more than two standard deviations; at least one."""
