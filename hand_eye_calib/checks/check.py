@@ -138,7 +138,11 @@ def check_streams(
     is_sound = not any(each.makes_unusable for each in findings)
     lengths = check_lengths(parent) if is_sound else []
     right = explanation.hypothesis.undo(streams)
-    offset = _offset(right, explanation.fit, correlation)
+    if right.interval_s > right.max_gap_s:  # too slow to refine it
+        offset = TimeOffset(correlation.offset_s, right.interval_s, correlation)
+    else:
+        both = right.parent, right.child, correlation, right.max_gap_s, explanation.fit
+        offset = refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right.synchronised, explanation, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
@@ -187,14 +191,6 @@ def _explained(
         return None, [finding("no_turning")]
     doubt = f"the streams agree at no clock offset: {correlation.doubt()}"
     return None, [finding("unrelated", text=doubt)]
-
-
-def _offset(streams: StreamPair, fit: SimilarityFit, correlation: Correlation) -> TimeOffset:
-    """The time offset of streams that agree."""
-    if streams.interval_s > streams.max_gap_s:  # too slow to refine it
-        return TimeOffset(correlation.offset_s, streams.interval_s, correlation)
-    both = streams.parent, streams.child, correlation, streams.max_gap_s, fit
-    return refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
 
 
 def _check_sizes(

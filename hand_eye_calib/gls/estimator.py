@@ -196,7 +196,6 @@ class AdaptiveSolution(ModelSolution):
             rotation_drift_rad_per_pose=float(sigmas[WALK_ROTATION]),
             translation_drift_m_per_pose=float(sigmas[WALK_TRANSLATION]),
             lasting=lasting,
-            heavy_tails=self.heavy_tails,
             systematic=self.systematic,
             misfit=self.misfit,
         )

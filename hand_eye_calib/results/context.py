@@ -13,25 +13,23 @@ class Recorded:
 
     Attributes
     ----------
-    name, verdict, headline : str
+    name, headline : str
     left_out : str
         Why it is no part of the result; empty if it is.
     deviations, sigmas : mapping of str to float
         By axis, m or rad: from the common result, and their standard deviations with the usual
         scatter of recordings; NaN (None in files) if it does not know the axis.
-    time_offset_s, scale, n_poses, stamp_ns
+    time_offset_s, scale, stamp_ns
         As of its own result.
     """
 
     name: str
-    verdict: str
     headline: str
     left_out: str = ""
     deviations: Mapping[str, float] = field(default_factory=dict)
     sigmas: Mapping[str, float] = field(default_factory=dict)
     time_offset_s: float = 0.0
     scale: float = 1.0
-    n_poses: int = 0
     stamp_ns: int = 0
 
 
@@ -45,8 +43,6 @@ class Together:
         single, agree, scatter (more than recordings of one rig do), one off, moved (between two of
         them), or differ (two do, and nobody knows which is wrong).
     sentence : str
-    chi2, dof, p_value : float, int, float
-        Of the hypothesis that all are of one mount.
     scatter : mapping of str to float
         By axis, m or rad: what differs from recording to recording, beyond what each states.
     recordings : tuple of Recorded
@@ -55,9 +51,6 @@ class Together:
 
     kind: str
     sentence: str
-    chi2: float
-    dof: int
-    p_value: float
     scatter: Mapping[str, float]
     recordings: tuple[Recorded, ...]
 

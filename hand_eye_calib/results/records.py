@@ -154,7 +154,6 @@ class Noise:
     translation_drift_m_per_pose: float | None = None
     rotation_drift_rad_per_pose: float | None = None
     lasting: tuple[CorrelatedError, ...] = ()
-    heavy_tails: bool | None = None
     systematic: str = ""
 
 

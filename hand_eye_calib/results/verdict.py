@@ -150,7 +150,7 @@ def headline(result: Result, found: Sequence[Reason]) -> str:
     """The verdict with its gravest reason, or with what is known, in one line."""
     decided, gravest = verdict_of(found), shown(found)
     if not found:
-        return f"{decided.value}: {_known(result)}"
+        return f"{decided.value}: {what_is_known(result)}"
     if gravest[0].rule == "unobservable":
         hidden = listing(gravest[0].axes)
         it = hidden if len(gravest[0].axes) == 1 else "them"
@@ -160,6 +160,23 @@ def headline(result: Result, found: Sequence[Reason]) -> str:
     more = len(gravest) - 1
     rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
     return f"{decided.value}: {gravest[0].sentence}{rest}{note}"
+
+
+def what_is_known(result: Result) -> str:
+    """Axes, and the largest standard deviations of a translation and of a rotation, with the floor,
+    in words.
+    """
+    axes, texts = _axes(result), []
+    for names in (TRANSLATIONS, ROTATIONS):
+        if known := [axis for axis in axes if axis.name in names]:
+            worst = max(known, key=lambda axis: axis.total)
+            texts.append(amount(worst.name, worst.total))
+    if not result.out_of_reach:
+        return f"all six axes are known to {listing(texts)} or better, one standard deviation"
+    return (
+        f"{listing([axis.name for axis in axes])} are known to {listing(texts)} or better, one "
+        f"standard deviation; {listing(result.out_of_reach)} are out of reach of these streams"
+    )
 
 
 def target_of(axis: str, result: Result) -> float:
@@ -304,21 +321,6 @@ def _axes(result: Result) -> list[_Axis]:
         for dof, total in zip(result.observability, result.sigmas_with_floor.tolist(), strict=True)
         if dof.name not in result.out_of_reach
     ]
-
-
-def _known(result: Result) -> str:
-    """The largest standard deviations of a translation and of a rotation, with the floor."""
-    axes, texts = _axes(result), []
-    for names in (TRANSLATIONS, ROTATIONS):
-        if known := [axis for axis in axes if axis.name in names]:
-            worst = max(known, key=lambda axis: axis.total)
-            texts.append(amount(worst.name, worst.total))
-    if not result.out_of_reach:
-        return f"all six axes are known to {listing(texts)} or better, one standard deviation"
-    return (
-        f"{listing([axis.name for axis in axes])} are known to {listing(texts)} or better, one "
-        f"standard deviation; {listing(result.out_of_reach)} are out of reach of these streams"
-    )
 
 
 _NEVER, _CARE = Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE

@@ -15,7 +15,8 @@ from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.context import AxisProgress, Progress
 from hand_eye_calib.results.status import AXES
-from hand_eye_calib.text import angle, axes_in_words, duration, length
+from hand_eye_calib.results.verdict import what_is_known
+from hand_eye_calib.text import axes_in_words, duration
 
 # An axis is known if its standard deviation is below this share of its target ...
 _SHARE = 0.7
@@ -165,7 +166,7 @@ class Goal:
         if calibration.status.failure:
             return f"No usable result: {calibration.status.failure}."
         if self.best is not None:
-            return f"Done: {_precision(self.best)}. Stop and save."
+            return f"Done: {what_is_known(self.best)}. Stop and save."
         motion, called = helpful_motion([axis], seen), axes_in_words([axis])
         if stuck:
             return f"This motion will not determine {called} well enough: {motion}."
@@ -180,12 +181,3 @@ def _least_motion_s(calibration: Calibration) -> float:
     lasting = calibration.noise.lasting if calibration.noise else ()
     slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
     return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
-
-
-def _precision(calibration: Calibration) -> str:
-    sigmas = calibration.sigmas_with_floor
-    told = []
-    for kind, of_kind, say in (("translation", slice(3), length), ("rotation", slice(3, 6), angle)):
-        if not {*AXES[of_kind]} & {*calibration.out_of_reach}:
-            told.append(f"{kind} known to {say(sigmas[of_kind].max())}")
-    return f"{', '.join(told)} (one sigma)"

@@ -169,23 +169,18 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     records = tuple(
         Recorded(
             name=name,
-            verdict=each.verdict.value,
             headline=each.headline,
             left_out=unfit.get(name, ""),
             deviations=_by_axis(beside[name][0]),
             sigmas=_by_axis(beside[name][1]),
             time_offset_s=each.time_offset_s,
             scale=each.scale,
-            n_poses=each.n_poses,
             stamp_ns=each.stamp_ns,
         )
         for name, each in results.items()
     )
     record = Together(
         kind=found.kind,
-        chi2=found.chi2,
-        dof=found.dof,
-        p_value=found.p_value,
         sentence=found.sentence(names),
         scatter=_by_axis(found.scatter),
         recordings=records,

@@ -68,9 +68,7 @@ FLOOR = np.diag([0.03, 0, 0, 0, 0, 0]) ** 2
 
 
 def several(kind):
-    return Together(
-        kind=kind, sentence=kind, chi2=1.0, dof=6, p_value=0.9, scatter={}, recordings=()
-    )
+    return Together(kind=kind, sentence=kind, scatter={}, recordings=())
 
 
 # Rule to a result in which it alone applies.
