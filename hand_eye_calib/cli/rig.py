@@ -65,8 +65,8 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
 
 def as_lines(rig: "RigCalibration") -> list[str]:
-    """What a person needs to see of a rig: tree, extrinsics, closure."""
-    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", "", *rig.tree(), ""]
+    """What a person needs to see of a rig: extrinsics, closure."""
+    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", ""]
     for each in rig.calibrations:
         first, *others = verdict_lines(each)
         lines += [f"{each.child_frame} in {each.parent_frame}: {first}", *others]

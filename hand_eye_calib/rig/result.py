@@ -13,7 +13,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.stats import CHI2
-from hand_eye_calib.text import angle, length
+from hand_eye_calib.text import angle, length, listing
 
 _FORMAT = "hand_eye_calib/rig"
 _VERSION = 1
@@ -117,7 +117,7 @@ class RigCalibration:
         return replace(found, calibrations=calibrations)
 
     def __repr__(self) -> str:
-        return "\n".join(self.tree())
+        return f"{self.verdict.value}: {listing(self.sensors)}"
 
     @property
     def verdict(self) -> Verdict:
@@ -185,18 +185,6 @@ class RigCalibration:
             in_first = self._own[before] + self._own[after]
         to_second = se3.adjoint(se3.inverse(self.Xs[after]))
         return to_second @ in_first @ to_second.T
-
-    def tree(self) -> list[str]:
-        """The sensors and where they are, one a line."""
-        lines = [self.sensors[0]]
-        for each in self.calibrations:
-            x, y, z = each.T_parent_child[:3, 3]
-            roll, pitch, yaw = np.degrees(se3.rotation_to_rpy(each.T_parent_child[:3, :3]))
-            lines.append(
-                f"`- {each.child_frame}: x {x:.3f} y {y:.3f} z {z:.3f} m, "
-                f"roll {roll:.2f} pitch {pitch:.2f} yaw {yaw:.2f} deg, {each.verdict.value}"
-            )
-        return lines
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain values."""

@@ -88,7 +88,7 @@ def files(rig, tmp_path, monkeypatch):
     return ["lidar.txt", "front.txt", "rear.txt"]
 
 
-def test_the_command_prints_and_saves_a_tree(files, capsys, tmp_path):
+def test_the_command_prints_and_saves_all_sensors(files, capsys, tmp_path):
     assert main(["calibrate", *files, "--out", "rig", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["sensors"] == ["lidar", "front", "rear"]
@@ -110,10 +110,13 @@ def test_a_sensor_may_have_the_name_of_a_file(found, tmp_path):
     assert len([each for each in tmp_path.iterdir() if each.is_dir()]) == 2
 
 
-def test_a_person_sees_the_tree_and_whether_pairs_close(found):
+def test_a_person_sees_all_sensors_and_whether_pairs_close(found):
     lines = as_lines(found)
     assert lines[0] == f"{found.verdict.value}: 3 sensors"
-    assert lines[4].startswith("`- rear: x")
+    assert [line.split(":")[0] for line in lines if " in lidar:" in line] == [
+        "front in lidar",
+        "rear in lidar",
+    ]
     assert any(line.startswith("  lidar - front - rear closes: off by") for line in lines)
 
 
