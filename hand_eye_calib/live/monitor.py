@@ -147,7 +147,7 @@ class MountMonitor:
         self._installed = np.asarray(T_parent_child, dtype=float)
         self._covariance = TUNING.caution * np.asarray(covariance, dtype=float)
         self._wander = np.zeros((6, 6))
-        self._noise: FloatArray | None = None
+        self._noise = np.zeros((6, 6))
         self._learning: list[tuple[int, MotionPairs]] = []
         self.is_learning = True
         self._tail = PosePairs.empty()
@@ -175,11 +175,11 @@ class MountMonitor:
             if not _is_motion(motions, self._noise):
                 continue
             self.seconds += 1
-            if self._noise is None:
+            if self.is_learning:
                 self._learn(stamp_ns, motions)
             else:
                 self._take(stamp_ns, motions)
-            if self._noise is not None:
+            if not self.is_learning:
                 self._judge()
             raised = raised or (None if before else self.alarm)
         return raised
@@ -239,7 +239,6 @@ class MountMonitor:
 
     def _take(self, stamp_ns: int, motions: MotionPairs) -> None:
         """Add the information of a second whatever the scale in it, and follow the noise."""
-        assert self._noise is not None
         residuals, jacobians = residuals_and_jacobians(motions, self._installed)
         by_scale = np.zeros((len(motions), 6, 1))  # of its logarithm
         by_scale[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
@@ -311,7 +310,6 @@ class MountMonitor:
         H /= len(self._S)
         # Of that, what the rotation noise of a motion seems to tell of a translation: rotations
         # that never took place reveal nothing.
-        assert self._noise is not None
         turns, precision = se3.skew(np.eye(3)), np.linalg.inv(self._noise)[:3, :3]
         seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
         H[:3, :3] -= self._motions_per_s * seeming
@@ -328,12 +326,12 @@ class MountMonitor:
         return np.asarray(np.repeat(seen_sigmas, 3) * sigmas)
 
 
-def _is_motion(motions: MotionPairs, noise: FloatArray | None) -> bool:
+def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:
     """Whether the sensors move: where they stand, noise would look like information."""
     parent = motions.Ts_parenti_parentj
     rotation = np.median(se3.rotation_angle(parent[:, :3, :3]))
     distance = np.median(np.linalg.norm(parent[:, :3, 3], axis=1))
-    of_noise = 0.0 if noise is None else np.sqrt(np.trace(noise[3:, 3:]) / 3)
+    of_noise = np.sqrt(np.trace(noise[3:, 3:]) / 3)
     least = max(TUNING.least_rotation_rad, TUNING.least_of_noise * float(of_noise))
     return bool(rotation > least or distance > TUNING.least_motion_m)
 

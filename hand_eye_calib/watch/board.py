@@ -22,7 +22,7 @@ from hand_eye_calib.live.state import (
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.stats import LARGEST_OF_SIX
-from hand_eye_calib.text import amount, duration, fixed, listing, two_digits
+from hand_eye_calib.text import amount, duration, fixed, two_digits
 
 # A node that has said nothing for so long (s) is silent.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
@@ -248,12 +248,10 @@ def _of_done(state: NodeState, moved: str, sentence: str) -> str:
 
 
 def _moved(comparison: Comparison | None) -> str:
-    """The axes that have moved against what is installed, and by how much."""
-    if comparison is None or comparison.verdict != "moved" or not comparison.differences:
+    """What has moved against what is installed, and by how much."""
+    if comparison is None or comparison.verdict != "moved":
         return ""
-    rows = comparison.differences[0].axes
-    axes = [axis for axis in AXES if axis in rows and rows[axis].verdict == "moved"]
-    return listing([f"{_NAMES[axis]} {_signed(axis, rows[axis].difference)}" for axis in axes])
+    return comparison.sentence.removeprefix("moved: ").replace("+/-", "±")
 
 
 def _of_end(state: NodeState) -> tuple[Tone, str, str]:
@@ -293,10 +291,6 @@ def _ago(mount: MountState) -> str:
 # ------------------------------------------------------------------------ axes
 
 
-def _signed(axis: str, value: float) -> str:
-    return f"{'+' * (value >= 0)}{amount(axis, value)}"
-
-
 def _bar(axis: str, state: NodeState) -> Bar:
     at = state.progress
     assert at is not None
@@ -317,7 +311,8 @@ def _bar(axis: str, state: NodeState) -> Bar:
     difference = ""
     if at.comparison is not None and at.comparison.differences:
         row = at.comparison.differences[0].axes[axis]
-        difference = f"{_signed(axis, row.difference)} ± {amount(axis, row.sigma)}"
+        sign = "+" * (row.difference >= 0)
+        difference = f"{sign}{amount(axis, row.difference)} ± {amount(axis, row.sigma)}"
         difference = difference if math.isfinite(row.sigma) else "unknown"
     is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
     meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""

@@ -200,12 +200,12 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         first="a", second="b", verdict="moved", sentence="", chi2=1.0, axes=axes
     )
     comparison = Comparison(
-        sentence="z has moved by 3 cm", verdict="moved", differences=(difference,)
+        sentence="moved: z by +3 cm +/- 4 mm", verdict="moved", differences=(difference,)
     )
     done = {"at": {"done": True, "sentence": "Done: known. Stop and save."}}
     view = view_of(state(comparison=comparison, **done))
     assert (view.word, view.tone, view.buttons[0]) == ("DONE", Tone.ACT, "save")
-    assert view.sentence.startswith("camera HAS MOVED: along x +3.1 cm, along y")
+    assert view.sentence.startswith("camera HAS MOVED: z by +3 cm ± 4 mm. Save.")
     assert view.sentence.endswith("Save.")
     saved = view_of(replace(state(**done), saved=SAVED))
     assert saved.sentence.startswith("Done: known. Saved at ")
@@ -214,7 +214,7 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     assert (saved.result[-1].name, saved.result[-1].tone) == ("saved", Tone.GOOD)
     assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
     assert view.reasons == ("a: b", "c: d")
-    assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "z has moved by 3 cm")
+    assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "moved: z by +3 cm ± 4 mm")
     assert view.bars[2].difference == "+3.1 cm ± 4 mm"
     assert view.bars[5].difference == "unknown"
     assert "nothing to compare with" in view_of(state()).result[1].text
