@@ -58,9 +58,7 @@ def solve(pairs: MotionPairs) -> Solution:
     start_gradient = np.abs(_derivatives(_IDENTITY, rows)[1]).max()
     rows *= np.sqrt(min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny)))
     parameters, shift = _IDENTITY, 0.0
-    converged, iterations = False, 0
-    while iterations < _MAX_ITERATIONS and not converged:
-        iterations += 1
+    for _ in range(_MAX_ITERATIONS):
         value, gradient, hessian = _derivatives(parameters, rows)
         step, shift = _descent_step(gradient, hessian, shift)
         length = 1.0
@@ -71,10 +69,12 @@ def solve(pairs: MotionPairs) -> Solution:
             length /= 2
         parameters = parameters + length * step
         converged = bool(np.abs(step).max() < _STEP_TOLERANCE)
+        if converged:
+            break
     rotation = Rotation.from_quat(np.roll(parameters[:4], -1)).as_matrix()
     T_parent_child = se3.from_rotation_translation(rotation, parameters[4:])
     objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
-    return Solution(T_parent_child, objective, converged, iterations, np.ones(len(pairs)))
+    return Solution(T_parent_child, objective, converged, np.ones(len(pairs)))
 
 
 def _descent_step(

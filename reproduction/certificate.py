@@ -101,7 +101,7 @@ def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
 
 def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatArray]:
     value = float(quadratic_form.minimise(Q, T_parent_child[None, :3, :3])[1][0])
-    Ts, values, _, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
+    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
     for T, other in zip(Ts, values, strict=True):
         if other > value * (1 + _HIGHER) + 1e-9 * np.trace(Q):
             yield T

@@ -170,7 +170,7 @@ class NoiseModel:
         """The model with processes that last, and log levels to start a search at."""
         shortest = TUNING.first_tau * self.interval_s
         longest = max(TUNING.last_tau * self.duration_s, shortest)
-        first = dict(zip(PARTS, whole(levels) + np.log(TUNING.first_variance), strict=True))
+        first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
         first["scale"] = TUNING.first_scale
         starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]

@@ -31,7 +31,7 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     lower = np.linalg.cholesky(matrices)
     pivots = np.diagonal(lower, axis1=1, axis2=2)
-    if len(lower) < TUNING.many:
+    if len(lower) < TUNING.few:
         inverse: FloatArray = np.linalg.inv(lower)
     else:
         inverse = np.zeros_like(lower)
@@ -63,7 +63,7 @@ class Factor:
         # block, and that times its coupling to the block before and, if there is one, behind.
         self._levels: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.log_determinant = 0.0
-        while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > TUNING.dense:
+        while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > TUNING.few:
             (inverse, logarithms), n_behind = (
                 inverse_roots(diagonal[1::2]),
                 (len(diagonal) - 1) // 2,

@@ -152,15 +152,16 @@ def solve(
 @dataclass(frozen=True, kw_only=True)
 class _State:
     """Where the search stands. The child's poses are its ``positions`` (N, 3), bridged where they
-    are left out, with the orientations known so far. ``parameters`` are (9,), of which the scale is
-    known to ``scale_sigma`` beforehand. ``boost`` (n,) are factors of the walk's variance, above
-    1 at jumps; those around positions that are ``worse`` (N,) are far less precise than the best.
+    are left out, with the orientations known so far. ``X`` is (I, l). ``parameters`` are (9,); the
+    lever arm and those that are asked for are known to ``sigmas`` (9,) beforehand. ``boost`` (n,)
+    are factors of the walk's variance, above 1 at jumps; those around positions that are ``worse``
+    (N,) are far less precise than the best.
     """
 
     positions: FloatArray
     streams: Streams
-    lever_arm: FloatArray
-    scale_sigma: float
+    X: FloatArray
+    sigmas: FloatArray
     parameters: FloatArray
     model: NoiseModel
     levels: FloatArray
@@ -171,13 +172,14 @@ class _State:
     @classmethod
     def first(cls, streams: Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
         """Where it begins."""
-        stamps_s, n = streams.stamps_s, len(streams) - 1
+        stamps_s, n, sigmas = streams.stamps_s, len(streams) - 1, np.array(TUNING.of_positions)
+        sigmas[3] = TUNING.any_scale if with_scale else sigmas[3]
         interval_s, duration_s = float(np.median(np.diff(stamps_s))), float(stamps_s[-1])
         state = cls(
             positions=streams.Ts_cw_c[:, :3, 3],
             streams=streams,
-            lever_arm=lever_arm,
-            scale_sigma=TUNING.any_scale if with_scale else TUNING.scale,
+            X=se3.from_rotation_translation(np.eye(3), lever_arm),
+            sigmas=sigmas,
             parameters=np.zeros(RESPONSE + 1),
             model=NoiseModel((), "sensors", interval_s, duration_s),
             levels=np.zeros(0),
@@ -193,11 +195,6 @@ class _State:
         levels[ROTATION], levels[WALK_ROTATION] = TUNING.any_rotation, TUNING.rotation_walk[1]
         streams = bridged(streams, state.X, worse)
         return replace(state, streams=streams, levels=levels, worse=worse)
-
-    @property
-    def X(self) -> FloatArray:
-        """The lever arm as a transform (4, 4)."""
-        return se3.from_rotation_translation(np.eye(3), self.lever_arm)
 
     @property
     def left_out(self) -> BoolArray:
@@ -231,11 +228,8 @@ class _State:
         """State space of all poses: without a rotation to estimate, with orientations that may be
         anything, and with a walk that is the odometry's.
         """
-        sigmas = [TUNING.lever_arm_m] * 3 + [self.scale_sigma] + [TUNING.direction] * 3
-        sigmas += [TUNING.time_s, TUNING.response]
-        values = np.r_[self.lever_arm, self.parameters[[*_SHARED, RESPONSE]]]
-        n = len(values)
-        known = known_products(range(n), values, np.array(sigmas) ** -2.0, n + 1)
+        values = np.r_[self.X[:3, 3], self.parameters[[*_SHARED, RESPONSE]]]
+        known = known_products(range(len(values)), values, self.sigmas**-2.0, len(values) + 1)
         space = (model or self.model).state_space(
             self.streams,
             self.linearised(),
@@ -302,12 +296,13 @@ class _State:
         turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
-        parameters = self.parameters.copy()
+        X, parameters = self.X.copy(), self.parameters.copy()
+        X[:3, 3] += step[:3]
         parameters[_SHARED] += step[3:]
         return replace(
             self,
             streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
-            lever_arm=self.lever_arm + step[:3],
+            X=X,
             parameters=parameters,
         )
 
@@ -346,7 +341,7 @@ def _solution(
     # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
     lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
     return LeverArmSolution(
-        lever_arm=state.lever_arm + normal.step[:3],
+        lever_arm=state.X[:3, 3] + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
         response=(float(-parameters[RESPONSE]), float(sigmas[RESPONSE])),
         **parts_of(parameters, sigmas, first_scale),

@@ -335,7 +335,7 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     kept = sample(len(problem.streams), tuning.most_poses)
     # No white noise and no walk is so small that the search cannot hear it.
     levels, total = fit.levels.copy(), whole(fit.levels)
-    levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible_white))
+    levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible))
     levels[3:5] = np.maximum(levels[3:5], total + np.log(tuning.audible_walk))
     model, levels = fit.model.with_lasting(LASTING, levels)
     found, information = reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))

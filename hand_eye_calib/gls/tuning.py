@@ -113,15 +113,14 @@ class Tuning:
     least_information: float = 0.3
     # Time constants are between an interval and this share of the recording.
     longest_share: float = 0.25
-    # The search begins at this share of the white and walking noise, at this level of a scale that
-    # drifts, and at a time constant between so many intervals and this share of the recording; no
-    # white noise and no walk is smaller than these shares of the whole then.
-    first_variance: float = 0.1
+    # The search begins at this share of the white and walking noise, below which no white noise is
+    # then, nor a walk below this share of the whole; at this level of a scale that drifts, and at a
+    # time constant between so many intervals and this share of the recording.
+    audible: float = 0.1
+    audible_walk: float = 1e-3
     first_scale: float = -10.0
     first_tau: float = 10.0
     last_tau: float = 0.06
-    audible_white: float = 0.1
-    audible_walk: float = 1e-3
     # Those that are fixed to the body last on all scales (flicker). A recording hardly shows those
     # about as long as itself, and X takes their mean: this share of the variance of those found.
     unseen_share: float = 0.05
@@ -160,15 +159,11 @@ class Tuning:
     # Level (rad^2) of orientations that may be anything; bounds and start of that of their walk.
     any_rotation: float = math.log(100.0)
     rotation_walk: tuple[float, float, float] = (math.log(1e-12), math.log(1e-6), math.log(0.1))
-    # Standard deviations beforehand: of the lever arm (m), of the time offset (s), of the scale of
-    # the odometry, known or not, of its direction (rad), and of what the positions answer to
-    # acceleration (s^2).
-    lever_arm_m: float = 10.0
-    time_s: float = 1.0
-    scale: float = 0.01
+    # Standard deviations beforehand: of the lever arm (m), of the scale of the odometry, of its
+    # direction (rad: 0.15 deg), of the time offset (s), and of what the positions answer to
+    # acceleration (s^2); and of a scale that is not known.
+    of_positions: tuple[float, ...] = (*[10.0] * 3, 0.01, *[math.radians(0.15)] * 3, 1.0, 0.002)
     any_scale: float = 1.0
-    direction: float = math.radians(0.15)
-    response: float = 0.002
     # Accelerations are those over this time (s), where no gap makes it longer by this factor.
     accelerating_s: float = 0.2
     near: float = 2.5
@@ -199,10 +194,9 @@ class Tuning:
     free: float = 1.0
 
     # -- Speed --
-    # The blocks that are left when they have so few rows together are one dense matrix; so many
+    # The blocks that are left when they have so few rows together are one dense matrix; as many
     # triangular matrices are inverted row by row, all at once: half the time of LAPACK.
-    dense: int = 64
-    many: int = 64
+    few: int = 64
 
 
 TUNING = Tuning()

@@ -43,7 +43,7 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
     T_parent_child : (4, 4) array
         Near a local minimum.
     """
-    Ts, values, _, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
+    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
     # The form of S in R = rotation S, so that S is the identity at the minimum.
     turn = np.eye(10)
     turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))

@@ -21,17 +21,17 @@ def solve(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |A X - X B|_F^2`` over X, of K >= 1 pairs."""
     coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
     Q = quadratic_form.weighted_sum(coefficients, weights)
-    T, converged, iterations = lowest(Q, pairs)
+    T, converged = lowest(Q, pairs)
     objective = float(quadratic_form.costs(coefficients, T).sum())
-    return Solution(T, objective, converged, iterations, weights)
+    return Solution(T, objective, converged, weights)
 
 
 def solve_ali(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, of K >= 1 pairs."""
     rows = residual_rows(pairs)
-    T, converged, iterations = lowest(rows.T @ rows, pairs)
+    T, converged = lowest(rows.T @ rows, pairs)
     objective = float((pairs.residuals(T)[0] ** 2).sum())
-    return Solution(T, objective, converged, iterations, np.ones(len(pairs)))
+    return Solution(T, objective, converged, np.ones(len(pairs)))
 
 
 def residual_rows(pairs: MotionPairs) -> FloatArray:
@@ -46,13 +46,11 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
     return rows.reshape(-1, quadratic_form.DIMENSION)
 
 
-def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool, int]:
-    """The lowest minimum (4, 4) of a form (13, 13) of pairs, whether the iteration settled there,
-    and its steps.
-    """
-    Ts, values, converged, iterations = quadratic_form.minimise(Q, start_rotations(pairs))
+def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
+    """The lowest minimum (4, 4) of a form (13, 13) of pairs, and whether the search settled."""
+    Ts, values, converged = quadratic_form.minimise(Q, start_rotations(pairs))
     best = int(np.argmin(values))
-    return Ts[best], bool(converged[best]), iterations
+    return Ts[best], bool(converged[best])
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:

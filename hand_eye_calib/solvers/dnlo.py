@@ -88,9 +88,8 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
     coefficients = quadratic_form.coefficients(pairs)
     weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
     Q = quadratic_form.weighted_sum(coefficients, weights)
-    converged, iterations = False, 0
-    while not converged and iterations < _MAX_ROUNDS:
-        iterations += 1
+    converged = False
+    for _ in range(_MAX_ROUNDS):
         T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
         # Without a predicted decrease, no pass over the pairs is needed.
         converged = bool(quadratic_form.decrease(Q, T, T_new) < _CONVERGED * objective)
@@ -106,7 +105,9 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
                 coefficients[changed], weights_new[changed] - weights[changed]
             )
             T, weights, objective = T_new, weights_new, objective_new
-    return Solution(T, float(objective), converged, iterations, weights)
+        if converged:
+            break
+    return Solution(T, float(objective), converged, weights)
 
 
 def solve_without(

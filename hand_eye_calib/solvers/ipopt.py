@@ -33,9 +33,9 @@ def solve_dnl(pairs: MotionPairs) -> Solution:
     """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
     pose = casadi.MX.sym("pose", 6)
     problem = {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))}
-    T_parent_child, settled, steps = _minimum(problem, 0)
+    T_parent_child, settled = _minimum(problem, 0)
     objective = float(dnl.pair_costs(pairs, T_parent_child).sum())
-    return Solution(T_parent_child, objective, settled, steps, np.ones(len(pairs)))
+    return Solution(T_parent_child, objective, settled, np.ones(len(pairs)))
 
 
 def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
@@ -51,7 +51,7 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
         "f": casadi.dot(alpha, costs) + threshold * casadi.sum1(1 - alpha),
         "g": casadi.sum1(alpha),
     }
-    T_parent_child, settled, steps = _minimum(
+    T_parent_child, settled = _minimum(
         problem,
         n_pairs,
         lbx=np.r_[np.full(6, -np.inf), np.zeros(n_pairs)],
@@ -60,19 +60,19 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
         ubg=np.inf,
     )
     weights, objective = dnlo.truncate(dnl.pair_costs(pairs, T_parent_child), threshold, floor)
-    return Solution(T_parent_child, float(objective), settled, steps, weights)
+    return Solution(T_parent_child, float(objective), settled, weights)
 
 
 def _minimum(
     problem: dict[str, _Expression], n_weights: int, **bounds: Any
-) -> tuple[FloatArray, bool, int]:
-    """X (4, 4), whether Ipopt settled, and its iterations, from the identity and weights 1."""
+) -> tuple[FloatArray, bool]:
+    """X (4, 4) and whether Ipopt settled, from the identity and weights 1."""
     solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
     # At zero the rotation angle has no derivative.
     answer = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
-    pose, stats = np.array(answer["x"]).ravel()[:6], solver.stats()
+    pose = np.array(answer["x"]).ravel()[:6]
     T_parent_child = se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
-    return T_parent_child, bool(stats["success"]), int(stats["iter_count"])
+    return T_parent_child, bool(solver.stats()["success"])
 
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:

@@ -33,7 +33,7 @@ def solve(pairs: MotionPairs) -> Solution:
     found = np.linalg.lstsq(moved.reshape(-1, 3), target.ravel(), rcond=RANK_TOLERANCE)
     T_parent_child = se3.from_rotation_translation(rotation, found[0])
     objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
-    return Solution(T_parent_child, objective, True, 1, np.ones(len(pairs)))
+    return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
 
 
 def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:

@@ -129,9 +129,7 @@ def expand(condensed: FloatArray) -> FloatArray:
     return condensed.take(_TRIANGLE, axis=-1)
 
 
-def minimise(
-    Q: FloatArray, rotation_start: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray, int]:
+def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Minimise ``x^T Q x`` over SE(3), from several rotations or for several forms at once.
 
     The translation is eliminated exactly. The rest is a quadratic function of the nine entries of
@@ -144,8 +142,8 @@ def minimise(
 
     Returns
     -------
-    (B, 4, 4), (B,), (B,) bool arrays, int
-        Transforms, the forms there, whether the iteration settled, and its steps.
+    (B, 4, 4), (B,), (B,) bool arrays
+        Transforms, the forms there, and whether the iteration settled.
     """
     rotation = np.array(rotation_start, dtype=float)
     Q = np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
@@ -154,9 +152,9 @@ def minimise(
     value, gradient, hessian = _derivatives(reduced, rotation)
     damping = np.zeros(len(rotation))
     converged = np.zeros(len(rotation), dtype=bool)
-    iterations = 0
-    while iterations < _MAX_NEWTON_STEPS and not converged.all():
-        iterations += 1
+    for _ in range(_MAX_NEWTON_STEPS):
+        if converged.all():
+            break
         step, length, scale = _newton_step(gradient, hessian, damping)
         trial = rotation @ se3.rotation_exp(step)
         trial_value, trial_gradient, trial_hessian = _derivatives(reduced, trial)
@@ -177,7 +175,7 @@ def minimise(
     vectors = np.append(rotation.reshape(-1, 9), np.ones((len(rotation), 1)), axis=1)
     translation = -(to_translation @ vectors[:, :, None])[:, :, 0]
     Ts = se3.from_rotation_translation(rotation, translation)
-    return Ts, value + constant, converged, iterations
+    return Ts, value + constant, converged
 
 
 def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:

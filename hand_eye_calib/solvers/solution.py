@@ -18,8 +18,6 @@ class Solution:
         The method's own cost at X.
     converged : bool
         Whether the iteration settled. If not, X is the best point it reached.
-    iterations : int
-        Iterations of the method's main loop.
     weights : (K,) array
         Weight of each motion pair; 1 for all with methods that do not reject outliers.
     """
@@ -27,5 +25,4 @@ class Solution:
     T_parent_child: FloatArray
     objective: float
     converged: bool
-    iterations: int
     weights: FloatArray

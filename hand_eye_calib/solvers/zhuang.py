@@ -41,31 +41,31 @@ def solve(pairs: MotionPairs) -> Solution:
     settle or settled in a false minimum.
     """
     residual_of_products = _condense(pairs)
-    parameters, objective, settled, iterations = _gauss_newton(residual_of_products, np.zeros(6))
+    parameters, objective, settled = _gauss_newton(residual_of_products, np.zeros(6))
     near_park = _parameters(park.solve(pairs).T_parent_child)
-    _, elsewhere, _, _ = _gauss_newton(residual_of_products, near_park)
+    _, elsewhere, _ = _gauss_newton(residual_of_products, near_park)
     rounding = _ROUNDING**2 * float((residual_of_products**2).sum())
     lowest = objective <= elsewhere / (1 - _LOWER) + rounding
     T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])
-    return Solution(T_parent_child, objective, settled and lowest, iterations, np.ones(len(pairs)))
+    return Solution(T_parent_child, objective, settled and lowest, np.ones(len(pairs)))
 
 
 def _gauss_newton(
     residual_of_products: FloatArray, parameters: FloatArray
-) -> tuple[FloatArray, float, bool, int]:
-    """Iterate from (z, t) (6,): the last (z, t), its cost, whether the iteration settled, and its
-    number of steps.
+) -> tuple[FloatArray, float, bool]:
+    """Iterate from (z, t) (6,): the last (z, t), its cost, and whether the iteration
+    settled.
     """
-    settled, iterations = False, 0
-    while iterations < _MAX_ITERATIONS and not settled:
-        iterations += 1
+    for _ in range(_MAX_ITERATIONS):
         products, derivative = _products(parameters)
         rows, values = residual_of_products @ derivative, -residual_of_products @ products
         step = np.linalg.lstsq(rows, values, rcond=park.RANK_TOLERANCE)[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
+        if settled:
+            break
     residuals = residual_of_products @ _products(parameters)[0]
-    return parameters, float(residuals @ residuals), settled, iterations
+    return parameters, float(residuals @ residuals), settled
 
 
 def _condense(pairs: MotionPairs) -> FloatArray:

@@ -31,7 +31,7 @@ def form_of(pairs, solution):
 
 def false_minimum(Q, T_parent_child):
     """The highest local minimum from rotations by pi beside the global one, and how much higher."""
-    Ts, values, _, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
+    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
     T = Ts[np.argmax(values)]
     return T, float(quadratic_form.decrease(Q, T, T_parent_child))
 

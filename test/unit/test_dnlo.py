@@ -72,6 +72,5 @@ def test_ipopt_and_the_fast_backend_agree(method, jumpy_pairs):
     fast = Method(method, min_inlier_fraction=0.3).solve(jumpy_pairs)
     ipopt = Method(method, min_inlier_fraction=0.3, backend="ipopt").solve(jumpy_pairs)
     assert fast.objective <= ipopt.objective * (1 + 1e-9)
-    assert ipopt.iterations > 0
     if abs(fast.objective - ipopt.objective) < 1e-6 * ipopt.objective:
         np.testing.assert_allclose(fast.T_parent_child, ipopt.T_parent_child, atol=1e-5)

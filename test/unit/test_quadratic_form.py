@@ -25,7 +25,7 @@ def test_condensed_costs_are_the_matrix_costs(pairs):
 
 def test_the_minimum_is_where_no_small_step_goes_down(pairs):
     Q = quadratic_form.expand(quadratic_form.condense(pairs).sum(axis=0))
-    Ts, values, converged, _ = quadratic_form.minimise(Q, dnl.start_rotations(pairs))
+    Ts, values, converged = quadratic_form.minimise(Q, dnl.start_rotations(pairs))
     T = Ts[np.argmin(values)]
 
     def total(xi):
