@@ -12,7 +12,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.poses import PoseTable
+from hand_eye_calib.io.bags.messages import PoseTable
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.sources import Source
 from hand_eye_calib.io.transforms import TfSource

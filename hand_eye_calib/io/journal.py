@@ -26,8 +26,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import other_names
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.files import open_regular
-from hand_eye_calib.io.limits import LONGEST_LINE
+from hand_eye_calib.io.files import LONGEST_LINE, open_regular
 from hand_eye_calib.io.trajectory_files.table import tum_line
 
 _FORMAT = "hand_eye_calib/journal"

@@ -12,8 +12,7 @@ from typing import Any
 import yaml
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.files import read_text
-from hand_eye_calib.io.limits import DEEPEST_YAML, LARGEST_YAML, LONGEST_NAME
+from hand_eye_calib.io.files import DEEPEST_YAML, LARGEST_YAML, LONGEST_NAME, read_text
 from hand_eye_calib.plain import plain
 from hand_eye_calib.text import shortened
 

@@ -20,7 +20,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
 
 if TYPE_CHECKING:  # what reads bags is not needed to play poses
-    from hand_eye_calib.io.bags.poses import PoseTable
+    from hand_eye_calib.io.bags.messages import PoseTable
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)

@@ -11,7 +11,7 @@ import pytest
 
 from hand_eye_calib.cli.main import COMMANDS, main, module_of
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.io import limits
+from hand_eye_calib.io import files
 from hand_eye_calib.option import option_name
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,7 +22,7 @@ PAGES = {
 }
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 FEWEST_WORDS, MOST_WORDS = 700, 900
-LIMITS = ROOT / "hand_eye_calib" / "io" / "limits.py"
+LIMITS = ROOT / "hand_eye_calib" / "io" / "files.py"
 HINT = "PYTHONPATH=. python test/unit/test_readme.py writes it"
 
 
@@ -96,7 +96,7 @@ def test_parameter_tables_have_no_other_rows():
 
 
 def limits_table():
-    """The Markdown table of ``io/limits.py``: its sections, comments and values."""
+    """The Markdown table of ``io/files.py``: its sections, comments and values."""
     lines, section, text = ["| Of | What | Limit |", "| --- | --- | ---: |"], "", []
     for line in LIMITS.read_text(encoding="utf-8").splitlines():
         if line.startswith("# ---- "):
@@ -105,7 +105,7 @@ def limits_table():
             text.append(line.removeprefix("#:").strip())
         elif found := re.match(r"([A-Z][A-Z_]*) = ", line):
             what = " ".join(text).rstrip(".")
-            lines.append(f"| {section} | {what} | {readable(what, getattr(limits, found[1]))} |")
+            lines.append(f"| {section} | {what} | {readable(what, getattr(files, found[1]))} |")
             text = []
     return "\n".join(lines)
 

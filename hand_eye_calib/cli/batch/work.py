@@ -27,7 +27,7 @@ from hand_eye_calib.cli.options import Options
 from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
 from hand_eye_calib.io import remote
-from hand_eye_calib.io.limits import limit_memory
+from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import told_apart

@@ -9,23 +9,23 @@ Messages of all other types are decoded by libraries. A new type is a row in the
 import json
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, printable, required
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import RateIntegrator
-from hand_eye_calib.io.bags.poses import PoseTable
+from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory
 from hand_eye_calib.io.bags.storage import MessageKind
+from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.limits import LONGEST_NAME
 from hand_eye_calib.io.trajectory_files.table import TWIST
 from hand_eye_calib.io.transforms import PoseFields
 
@@ -193,6 +193,65 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
             f"measure {' or '.join(possible)}; asked for are {wanted}"
         )
     return wanted
+
+
+# ---- poses in columns
+
+
+@dataclass(frozen=True)
+class PoseTable:
+    """N poses of streams, "parent" or "child", in columns (N,), in the order of bag time.
+
+    ``stamps_ns`` are of the headers, ``bag_ns`` when the messages were recorded; frames are None if
+    the message type does not carry them; ``poses`` (N, 7) are x y z qx qy qz qw.
+    """
+
+    streams: NDArray[np.object_]
+    stamps_ns: IntArray
+    world_frames: NDArray[np.object_]
+    sensor_frames: NDArray[np.object_]
+    poses: FloatArray
+    bag_ns: IntArray
+
+    @classmethod
+    def of(cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None) -> Self:
+        """Poses of no stream yet, whose stamps (N,) count as bag times; frames are one for all, or
+        (N,). Of messages that are no poses, ``poses`` are what is unpacked of them.
+        """
+        stamps_ns = np.array(stamps_ns, dtype=np.int64)
+        stream, world, sensor = (
+            np.broadcast_to(np.array(each, dtype=object), stamps_ns.shape)
+            for each in ("", world, sensor)
+        )
+        return cls(stream, stamps_ns, world, sensor, np.asarray(poses), stamps_ns)
+
+    def recorded(self, stream: str, bag_ns: Any) -> Self:
+        """The same of a stream, at bag times (N,)."""
+        streams = np.full(len(self), stream, dtype=object)
+        return replace(self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64))
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __getitem__(self, index: Any) -> Self:
+        """A part of the table: any slice, mask or index array."""
+        return type(self)(*(column[index] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, tables: Iterable["PoseTable"]) -> "PoseTable":
+        """The rows of one or more tables in the order of bag time."""
+        columns = zip(*(vars(table).values() for table in tables), strict=True)
+        whole: Any = [*map(np.concatenate, columns)]
+        table, is_sorted = cls(*whole), (np.diff(whole[-1]) >= 0).all()
+        return table if is_sorted else table[np.argsort(whole[-1], kind="stable")]
+
+    def trajectory(self) -> Trajectory:
+        """Poses of one stream in the order of stamps; of those with equal stamps the first."""
+        stamps_ns, first = np.unique(self.stamps_ns, return_index=True)
+        poses = self[first]
+        positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
+        frames = poses.sensor_frames[0] or "", poses.world_frames[0]
+        return Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)
 
 
 # ---- messages that a library decodes

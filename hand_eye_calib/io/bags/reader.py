@@ -17,11 +17,10 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import messages, sources
-from hand_eye_calib.io.bags.messages import Run
-from hand_eye_calib.io.bags.poses import PoseTable
+from hand_eye_calib.io.bags.messages import PoseTable, Run
 from hand_eye_calib.io.bags.sources import Reading, Source, is_static
 from hand_eye_calib.io.bags.storage import open_bags
-from hand_eye_calib.io.limits import LONGEST_NAME
+from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.target_images import Target, camera_of, read_camera
 from hand_eye_calib.io.transforms import TfSource, TfStream
 

@@ -15,12 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
-from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, Run, ns_of, pose_row
-from hand_eye_calib.io.bags.poses import PoseTable, are_believable
+from hand_eye_calib.io.bags.messages import (
+    MALFORMED,
+    MessageReader,
+    PoseTable,
+    Run,
+    ns_of,
+    pose_row,
+)
 from hand_eye_calib.io.bags.scans import ScanOdometry, scan_of
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
@@ -28,6 +34,9 @@ from hand_eye_calib.io.trajectory_files.table import TWIST, Table
 from hand_eye_calib.io.transforms import TfSource, TfStream
 
 Source = str | TfSource
+# A delay against the bag's time (s) is of a wrong stamp if it is so much farther from both
+# neighbours than these are from each other and than the usual step: computers delay for less.
+_JUMP_S = 0.5
 _NOTHING = PoseTable.of([], np.empty((0, 7)))
 
 
@@ -82,6 +91,22 @@ class TopicReading(Reading):
                 "were left out"
             )
         return table
+
+
+def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
+    """Mask (N,) of the stamps (N,) that can be right, of messages in the order of the recording.
+
+    A single stamp that jumps away from the bag's own time (N,) and back is wrong: with it, a
+    recording of minutes would last for years.
+    """
+    if len(stamps_ns) < 3:
+        return np.ones(len(stamps_ns), dtype=bool)
+    delays_s = np.asarray(bag_ns - stamps_ns, dtype=float) * 1e-9
+    # At both ends the two neighbours are on one side.
+    delays_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
+    steps_s, across_s = np.abs(np.diff(delays_s)), np.abs(delays_s[2:] - delays_s[:-2])
+    off_s = np.minimum(steps_s[:-1], steps_s[1:])
+    return np.asarray(off_s <= _JUMP_S + across_s + np.median(steps_s[1:-1]))
 
 
 class JoinedReading(Reading):

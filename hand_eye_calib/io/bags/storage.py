@@ -22,7 +22,7 @@ from urllib.parse import quote
 import numpy as np
 
 from hand_eye_calib.errors import InputError, MissingDependencyError, printable, required
-from hand_eye_calib.io.limits import BLOCK_BYTES, LONGEST_NAME, reading_memory
+from hand_eye_calib.io.files import BLOCK_BYTES, LONGEST_NAME, reading_memory
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}

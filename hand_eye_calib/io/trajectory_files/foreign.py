@@ -21,7 +21,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.limits import LONGEST_NAME
+from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.trajectory_files.table import MATRIX, POSITION, QUATERNION, Table
 from hand_eye_calib.text import shortened
 

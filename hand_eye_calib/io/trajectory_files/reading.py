@@ -19,8 +19,7 @@ from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
-from hand_eye_calib.io.files import read_bytes, read_text
-from hand_eye_calib.io.limits import LONGEST_LINE
+from hand_eye_calib.io.files import LONGEST_LINE, read_bytes, read_text
 from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import (

@@ -18,8 +18,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.files import write_atomically
-from hand_eye_calib.io.limits import LONGEST_NAME
+from hand_eye_calib.io.files import LONGEST_NAME, write_atomically
 from hand_eye_calib.text import shortened, shown_value
 
 POSITION = ("x", "y", "z")
