@@ -24,6 +24,7 @@ from hand_eye_calib.assessment.lever_arm import (
     weighted_products,
 )
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import sigmas_in_parent
 from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
 from hand_eye_calib.gls.normal import NormalEquations, answers_without
@@ -328,12 +329,6 @@ def widened_by_halves(
         return model
     error = model @ away
     return model + (excess - 1.0) / float(error @ away) * np.outer(error, error)
-
-
-def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (6,) along and about the parent's axes."""
-    to_parent = np.kron(np.eye(2), rotation_parent_child)
-    return np.sqrt(np.maximum(np.diag(to_parent @ covariance @ to_parent.T), 0.0))
 
 
 def judged(axis: str, sigma: float) -> DofObservability:

@@ -107,8 +107,6 @@ class Moved:
     verdicts : tuple of Change
         Per axis.
     verdict : Change
-    chi2 : float
-        Squared distance in units of the covariance; 6 on average if nothing has moved.
     """
 
     values: FloatArray
@@ -116,7 +114,6 @@ class Moved:
     visible: FloatArray
     verdicts: tuple[Change, ...]
     verdict: Change
-    chi2: float
 
     def axes(self, change: Change) -> list[str]:
         """Names of the axes with this verdict."""
@@ -177,7 +174,7 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
         for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
     )
     verdict = Change.MOVED if chi2 > CHI2[0.001][6] else Change.of_all(verdicts)
-    return Moved(values, sigmas, visible, verdicts, verdict, chi2)
+    return Moved(values, sigmas, visible, verdicts, verdict)
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:

@@ -18,9 +18,9 @@ from hand_eye_calib.assessment.covariance import (
     UNKNOWN_SIGMAS,
     Assessment,
     judged,
-    sigmas_in_parent,
 )
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import sigmas_in_parent
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
 

@@ -78,8 +78,6 @@ class CheckResult:
     ----------
     findings : tuple of Finding
         The gravest first.
-    correlation : Correlation
-        Of the angular rates of both streams.
     fit : SimilarityFit or None
         The fit under the hypothesis that holds; None if none does.
     offset : TimeOffset or None
@@ -87,7 +85,6 @@ class CheckResult:
     """
 
     findings: tuple[Finding, ...]
-    correlation: Correlation = Correlation()
     fit: SimilarityFit | None = None
     offset: TimeOffset | None = None
 
@@ -126,12 +123,12 @@ def check_streams(
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
-        return CheckResult(gravest_first([*findings, *flat]), correlation)
+        return CheckResult(gravest_first([*findings, *flat]))
     start = known[0] if known else None
     explanation, found = _explained(aligned, correlation, start, is_frozen=bool(frozen))
     findings += found
     if explanation is None:
-        return CheckResult(gravest_first(findings), correlation)
+        return CheckResult(gravest_first(findings))
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
@@ -148,7 +145,7 @@ def check_streams(
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
         findings += _check_agreeing(right, streams, fit, known)
-    return CheckResult(gravest_first(findings), correlation, explanation.fit, offset)
+    return CheckResult(gravest_first(findings), explanation.fit, offset)
 
 
 def _on_one_clock(

@@ -236,8 +236,8 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         reason = f"auto: dnlo, because the user set reference {config.reference}"
         return replace(dnlo, method_reason=reason)
     # What the user set is not estimated; of a clock whose offset is to be, this is the last step.
-    known = {"scale": config.is_known("scale"), "time": config.is_known("time_offset")}
-    known["time"] &= not is_clock_free
+    is_time_known = config.is_known("time_offset") and not is_clock_free
+    known = {"scale": config.is_known("scale"), "time": is_time_known}
     solution = adaptive_estimator.solve(
         pose_pairs.stamps_ns,
         pose_pairs.Ts_pw_p,

@@ -8,6 +8,7 @@ it finds for the rotation does not depend on the rest. Of both: the time offset.
 
 import contextlib
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -195,16 +196,12 @@ def _rotation(
     The noise is fitted to increments of up to some seconds. What a bias does to these is linear
     only for what is left of it after a first solve.
     """
-    systematic = SYSTEMATIC_OF_RATES if has_rates else SYSTEMATIC_OF_ROTATIONS
-    first = None
-    if has_rates:
-        first = adaptive_estimator.solve(
-            stamps_ns, Ts_pw_p, Ts_cw_c, systematic, quick=True, is_clock_free=True
-        )
-        Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
-    solution = adaptive_estimator.solve(stamps_ns, Ts_pw_p, Ts_cw_c, systematic, is_clock_free=True)
-    if first is None:
-        return solution, Ts_cw_c
+    solve = partial(adaptive_estimator.solve, stamps_ns, Ts_pw_p, is_clock_free=True)
+    if not has_rates:
+        return solve(Ts_cw_c, SYSTEMATIC_OF_ROTATIONS), Ts_cw_c
+    first = solve(Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True)
+    Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
+    solution = solve(Ts_cw_c, SYSTEMATIC_OF_RATES)
     parameters = solution.parameters.copy()
     parameters[RATE] += first.parameters[RATE]
     return replace(solution, parameters=parameters), Ts_cw_c

@@ -20,7 +20,7 @@ from hand_eye_calib.checks.check import (
 )
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.snapshot import CONVENTIONS, MOST_MOVED_S, UNASKED_S, Snapshot
+from hand_eye_calib.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import PosePairs
@@ -33,7 +33,10 @@ Options: TypeAlias = Mapping[str, Any]
 
 # Findings whose options are certain; and options that repair a stream: the second solve proves it.
 _MENDED = ("time_offset", "scale", "units")
-_REPAIRS = (*CONVENTIONS["parent"], *CONVENTIONS["child"])
+_REPAIRS = (
+    *("parent_invert", "parent_quaternion", "parent_scale"),
+    *("child_invert", "child_quaternion"),
+)
 
 # Positions alone are paired anew from this offset (s) on: their model knows it better than speeds
 # do.

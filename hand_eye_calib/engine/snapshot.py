@@ -23,12 +23,6 @@ from hand_eye_calib.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
-#: Options that say in which convention a stream was written.
-CONVENTIONS = {
-    "parent": ("parent_invert", "parent_quaternion", "parent_scale"),
-    "child": ("child_invert", "child_quaternion"),
-}
-
 # Options that have no meaning for streams that are no poses but with these values.
 _OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
 

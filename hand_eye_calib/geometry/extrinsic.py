@@ -43,6 +43,13 @@ class Extrinsic:
         return np.r_[self.T_parent_child[:3, 3], rpy]
 
 
+def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (6,) along and about the parent's axes."""
+    to_parent = np.kron(np.eye(2), rotation_parent_child)
+    variances = np.diag(to_parent @ covariance @ to_parent.T)
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+
 def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
     """Standard deviations (3,) of roll, pitch and yaw, rad, to first order.
 

@@ -19,7 +19,6 @@ from datetime import datetime
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import sigmas_in_parent
 from hand_eye_calib.assessment.floor import floor_of_pairs
 from hand_eye_calib.assessment.moved import (
     UNKNOWN_FROM,
@@ -34,7 +33,7 @@ from hand_eye_calib.assessment.moved import (
 )
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.geometry.extrinsic import Extrinsic, sigmas_in_parent
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis

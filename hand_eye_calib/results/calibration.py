@@ -11,7 +11,7 @@ import numpy as np
 
 from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import inverse_covariance
+from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, usable_numbers, values_of
 from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
@@ -33,7 +33,6 @@ __all__ = [
     "DofObservability",
     "DofVerdict",
     "Finding",
-    "Reason",
     "Residuals",
     "SolveStatus",
     "Verdict",
@@ -114,8 +113,7 @@ class Calibration(Result):
         """
         T, Z, turn = self.T_parent_child, self.T_world_world, self.T_child_parent[:3, :3]
         covariance = inverse_covariance(T, self.covariance)
-        axes = np.kron(np.eye(2), turn)
-        sigmas = np.sqrt(np.maximum(np.diag(axes @ covariance @ axes.T), 0.0))
+        sigmas = sigmas_in_parent(turn, covariance)
         if self.unobservable():
             sigmas[sigmas > UNKNOWN_M] = np.inf
         known = (DofVerdict.UNOBSERVABLE, DofVerdict.OBSERVED)

@@ -112,7 +112,6 @@ class Difference:
     second: str
     verdict: str
     sentence: str
-    chi2: float
     axes: Mapping[str, AxisDifference]
 
 

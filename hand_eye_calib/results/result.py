@@ -10,7 +10,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import sigmas_rpy
+from hand_eye_calib.geometry.extrinsic import sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.results.records import (
     ClockRate,
     CrossCheck,
@@ -256,9 +256,7 @@ class Result:
         """(6,) array: common-mode standard deviations along (m) and about (rad) the axes of the
         parent sensor's frame.
         """
-        to_parent = np.kron(np.eye(2), self.T_parent_child[:3, :3])
-        variances = np.diag(to_parent @ self.floor @ to_parent.T)
-        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+        return sigmas_in_parent(self.T_parent_child[:3, :3], self.floor)
 
     @property
     def sigmas_with_floor(self) -> FloatArray:

@@ -20,7 +20,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -39,8 +38,7 @@ _LEVEL = 0.01
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
 
-# How the results of a rig belong together: see Together.kind.
-Kind = Literal["single", "agree", "scatter", "one off", "moved", "differ"]
+# What is said of results by how they belong together: see Together.kind.
 _SAID = {
     "single": "One recording: nothing to compare with",
     "agree": "{all} agree within their standard deviations",
@@ -57,7 +55,7 @@ class Agreement:
 
     Attributes
     ----------
-    kind : Kind
+    kind : str
     apart : tuple of int
         Indices of the results that do not belong to the others: the one that is off, or all since
         the mount has moved.
@@ -79,7 +77,7 @@ class Agreement:
         Standard deviations of each, with the usual scatter.
     """
 
-    kind: Kind
+    kind: str
     apart: tuple[int, ...]
     T_parent_child: FloatArray
     covariance: FloatArray
@@ -223,7 +221,7 @@ def _without_unknown(covariance: FloatArray) -> FloatArray:
 
 def _explanation(
     errors: FloatArray, weights: FloatArray, level: float
-) -> tuple[Kind, BoolArray, float, int, float]:
+) -> tuple[str, BoolArray, float, int, float]:
     """How the results belong together, and which of them are apart; chi-square, its degrees of
     freedom and p-value of all together.
 
@@ -236,7 +234,6 @@ def _explanation(
     each = np.swapaxes(design, 1, 2) @ weights @ design, _ranks(weights)
     all_chi2, all_dof = _left(*(one.sum(axis=0) for one in each))
     p_value = float(chdtrc(all_dof, all_chi2)) if all_dof else 1.0
-    kind: Kind
     kind, apart = "differ" if p_value < _LEVEL else "agree", number < 0
     if len(number) < 3:
         kind = kind if len(number) == 2 else "single"

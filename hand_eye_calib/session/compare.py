@@ -115,7 +115,6 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
         second=second_name,
         verdict=found.verdict.value,
         sentence=found.sentence,
-        chi2=found.chi2,
         axes={
             axis: AxisDifference(difference=value, sigma=sigma, visible=visible, verdict=verdict)
             for axis, (value, sigma, visible, verdict) in zip(AXES, rows, strict=True)

@@ -196,9 +196,7 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
 def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     differs = AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
     axes = dict.fromkeys(AXES, differs) | {"yaw": replace(differs, sigma=INF)}
-    difference = Difference(
-        first="a", second="b", verdict="moved", sentence="", chi2=1.0, axes=axes
-    )
+    difference = Difference(first="a", second="b", verdict="moved", sentence="", axes=axes)
     comparison = Comparison(
         sentence="moved: z by +3 cm +/- 4 mm", verdict="moved", differences=(difference,)
     )
