@@ -105,12 +105,10 @@ def _read_bags(
         for stream, source in sources.items():
             if not calibrator.frame(stream):
                 calibrator.set_frame(stream, str(source).strip("/"))
-        warnings = list(bag.warnings)
-        files = bag.files
-    for text in warnings:
-        note(text)
-    inputs = {"bag": str(bag), **calibrator.inputs(sources)}
-    return Recording(calibrator.snapshot(), inputs, files, tuple(warnings))
+        for text in bag.warnings:
+            note(text)
+        inputs = {"bag": str(bag), **calibrator.inputs(sources)}
+        return Recording(calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings))
 
 
 def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Any]) -> None:

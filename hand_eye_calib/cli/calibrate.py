@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import STREAMS, note, print_result, waiting_for
+from hand_eye_calib.cli.console import note, print_result, waiting_for
 from hand_eye_calib.cli.options import (
     add_config_arguments,
     add_input_arguments,
@@ -142,8 +142,8 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise ConfigError("--dask and --vehicle are for --batch")
     if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
-    named = [f"{stream}_topic" for stream in STREAMS]
-    others = [name for name in (*named, "batch", "list") if getattr(arguments, name)]
+    never = ("parent_topic", "child_topic", "batch", "list")
+    others = [name for name in never if getattr(arguments, name)]
     if arguments.topics and others:
         raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
 

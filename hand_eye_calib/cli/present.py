@@ -22,7 +22,7 @@ from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown
-from hand_eye_calib.text import axes_in_words, listing
+from hand_eye_calib.text import listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
@@ -121,7 +121,9 @@ def as_lines(
         by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
-    details = list(_details(calibration) if with_details else _comparisons(calibration))
+    details = list(_comparisons(calibration))
+    if with_details:
+        details += [f"{name}: {value}" for name, value in summary(calibration).items()]
     lines += ["Details"] * bool(details)
     return lines + [line for detail in details for line in wrapped(detail, "  ", "    ")]
 
@@ -190,22 +192,6 @@ def transform_lines(
         named = zip("xyzw", transform["quat_xyzw"] or (), strict=False)
         quaternion = " ".join(f"{name} {value:.6f}" for name, value in named)
         yield f"  quaternion {quaternion or 'unknown'}"
-
-
-# --------------------------------------------------------------------- details
-
-
-def _details(calibration: Calibration) -> Iterator[str]:
-    groups: dict[str, list[str]] = {}
-    for dof in calibration.observability:
-        word = {"prior": "mostly from the prior"}.get(dof.verdict.value, dof.verdict.value)
-        word = "out of reach" if dof.name in calibration.out_of_reach else word
-        groups.setdefault(word, []).append(dof.name)
-    told = "; ".join(f"{axes_in_words(names)} {words}" for words, names in groups.items())
-    yield f"along and about the axes of {calibration.parent_frame}: {told}"
-    yield from _comparisons(calibration)
-    for name, value in summary(calibration).items():
-        yield f"{name}: {value}"
 
 
 def _comparisons(calibration: Calibration) -> Iterator[str]:

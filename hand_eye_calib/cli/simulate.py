@@ -2,10 +2,9 @@
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 
-from hand_eye_calib.cli.console import with_progress
+from hand_eye_calib.cli.console import print_result, with_progress
 from hand_eye_calib.cli.options import add_json_argument, at_least
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.simulation.drive import (
@@ -92,12 +91,9 @@ def run(arguments: argparse.Namespace) -> int:
 
             name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
             write_bag(folder / name, streams, arguments.bag)
-    if arguments.json:
-        runs = [str(folder) for folder in folders]
-        options = {"drive": dataclasses.asdict(config), "noise": dataclasses.asdict(noise)}
-        print(json.dumps({"runs": runs, "seed": arguments.seed, **options}, indent=2))
-    else:
-        print(f"{counted(len(folders), 'recording')} written to {arguments.out}")
+    document = {"runs": [*map(str, folders)], "seed": arguments.seed}
+    told = f"{counted(len(folders), 'recording')} written to {arguments.out}"
+    print_result([told], document | {"drive": config, "noise": noise} if arguments.json else None)
     return 0
 
 

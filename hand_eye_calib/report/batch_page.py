@@ -16,10 +16,10 @@ from hand_eye_calib.report.figures import Drawn
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.report.style import (
     BAD,
-    BAND,
     GRID,
     INK,
     LOOK,
+    PARENT,
     as_svg,
     page_style,
 )
@@ -89,7 +89,7 @@ def _trend(result: Calibration, number: int) -> Drawn:
         panel.set_title(told, loc="left")
         panel.axhline(0, color=GRID, lw=0.8)
         if np.isfinite(band):
-            panel.axhspan(-band, band, color=BAND, alpha=0.15, lw=0)
+            panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
         for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
             look: dict[str, Any] = {"fmt": fmt, "color": colour, "ms": 3.2, "elinewidth": 0.8}
             panel.errorbar(at[group], values[group], sigmas[group], **look)

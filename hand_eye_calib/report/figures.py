@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.engine.evidence import Evidence, StreamView
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.report.plot import draw_views, said_of_views
 from hand_eye_calib.report.style import (
     BAD,
@@ -124,23 +123,22 @@ def _figure(
 
 @page_style()
 def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
-    tracks = evidence
-    shown = _downsample(len(tracks.times_s))
-    factor, unit = _time_axis(tracks.times_s[-1])
+    shown = _downsample(len(evidence.times_s))
+    factor, unit = _time_axis(evidence.times_s[-1])
     # A camera moves in its x and z: x and y would be a view from the side.
-    across = int(np.argmin(np.ptp(tracks.parent, axis=0)))
+    across = int(np.argmin(np.ptp(evidence.parent, axis=0)))
     first, second = (axis for axis in range(3) if axis != across)
     figure, (plane, side) = _figure(4.1, 1, 2, bottom=0.85)
     names = [calibration.parent_frame, calibration.child_frame]
     is_reversed = calibration.measured == "positions" and not evidence.has_positions_of_parent
     through = 0 if is_reversed else 1  # whose path is computed through the result
     labels = [name + ", through the result" * (n == through) for n, name in enumerate(names)]
-    paths = ((tracks.parent, PARENT, 3.2), (tracks.child, CHILD, 1.1))
+    paths = ((evidence.parent, PARENT, 3.2), (evidence.child, CHILD, 1.1))
     for (points, colour, width), label in zip(paths, labels, strict=True):
         look: dict[str, Any] = {"color": colour, "lw": width}
         plane.plot(points[shown, first], points[shown, second], label=plain_label(label), **look)
-        side.plot(tracks.times_s[shown] * factor, points[shown, across], **look)
-    plane.plot(*tracks.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
+        side.plot(evidence.times_s[shown] * factor, points[shown, across], **look)
+    plane.plot(*evidence.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
     axes = [f"{axis} (m)" for axis in "xyz"]
     is_level = across == 2
     plane.set(title="From above" if is_level else "In the plane of motion")
@@ -151,9 +149,9 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     if high - low < 0.5:  # rounding is no relief
         side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
     figure.legend(loc="lower center", ncols=3, borderaxespad=0)
-    apart = np.linalg.norm(tracks.parent - tracks.child, axis=1)
-    furthest_s = tracks.times_s[int(np.argmax(apart))]
-    path_m = float(np.linalg.norm(np.diff(tracks.parent, axis=0), axis=1).sum())
+    apart = np.linalg.norm(evidence.parent - evidence.child, axis=1)
+    furthest_s = evidence.times_s[int(np.argmax(apart))]
+    path_m = float(np.linalg.norm(np.diff(evidence.parent, axis=0), axis=1).sum())
     said = (
         f"The path of {names[1 - through]}, {length(path_m)} long, and the same path "
         f"computed from the poses of {names[through]} and the result. Half of the time "
@@ -178,10 +176,8 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
         times = (residuals.end_ns - first_ns) * 1e-9
         factor, unit = _time_axis(float(times.max()))
         times, label = times * factor, f"time ({unit})"
-        uses_reference = METHODS[calibration.method].uses_reference
-        what = f"motion pairs ({calibration.reference if uses_reference else 'B1'})"
-        if calibration.measured == "positions":
-            what = "distances from one position to the next"
+        is_of_positions = calibration.measured == "positions"
+        what = "distances from one position to the next" if is_of_positions else "motion pairs"
     figure, panels = _figure(1.2 + 1.6 * len(sizes), len(sizes), 1, bottom=0.8, sharex=True)
     for panel, (name, values) in zip(panels, sizes.items(), strict=True):
         to_unit, of_axis = UNITS[name]

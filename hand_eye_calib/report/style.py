@@ -18,17 +18,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from hand_eye_calib.errors import printable
 
 # Colours as drawn on a page, each with the name of the page's own colour that replaces it.
-INK, MUTED, GRID, PAPER = "#1b1f24", "#5c6670", "#d9dee3", "#fefefd"
-PARENT, CHILD, BAD, BAND, GREEN = "#0072b2", "#d98300", "#c8452f", "#0072b3", "#009e73"
+INK, MUTED, GRID = "#1b1f24", "#5c6670", "#d9dee3"
+PARENT, CHILD, BAD, GREEN = "#0072b2", "#d98300", "#c8452f", "#009e73"
 _VARIABLES = {
     INK: "ink",
     MUTED: "muted",
     GRID: "grid",
-    PAPER: "card",
     PARENT: "parent",
     CHILD: "child",
     BAD: "bad",
-    BAND: "parent",
     GREEN: "good",
 }
 
@@ -73,12 +71,10 @@ _STYLE: dict[str, Any] = {
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.grid": True,
-    "axes.axisbelow": True,
     "grid.color": GRID,
     "grid.linewidth": 0.5,
     "legend.frameon": False,
     "lines.linewidth": 1.5,
-    "lines.markersize": 3.2,
     "path.simplify_threshold": 0.3,
     # The same figure gives the same file.
     "svg.hashsalt": "hand_eye_calib",

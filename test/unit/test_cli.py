@@ -110,7 +110,6 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag,
     truth = np.concatenate([TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]])
     np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=1e-3)
     assert re.search(r"  yaw +\S+ \+/- \d\S* deg$", out, flags=re.MULTILINE)
-    assert "axes of lidar: x, y, z and the rotations about x, y and z observed\n" in out
     assert "\nNext\n" not in out
     assert "\nTo publish it (USE)\n  ros2 run tf2_ros static_transform_publisher" in out
 
@@ -181,8 +180,6 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     assert (code, err) == (3, "")
     assert re.search(r"^  z +unknown ", out, flags=re.MULTILINE)
     assert out.startswith("USE WITH CARE: all but z; measure z by hand\n")
-    told = " ".join(out.split())
-    assert "x, y and the rotations about x, y and z observed; z unobservable " in told
     command = next(line for line in out.splitlines() if "static_transform_publisher" in line)
     assert " --z MEASURE_Z_BY_HAND --qx " in command
     assert "\nTo publish it (USE WITH CARE, once you have put in MEASURE_Z_BY_HAND)\n" in out
@@ -191,7 +188,6 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     code, out, err = run(*shlex.split(again))
     assert (code, err) == (0, "")
     assert "MEASURE_Z_BY_HAND" not in out
-    assert "z mostly from the prior" in " ".join(out.split())
 
 
 # ---- what is printed
