@@ -353,7 +353,6 @@ class SolveCycle:
         return ProgressState(
             level=Level.WARN if result is None or progress.will_not_get_there else Level.OK,
             text=progress.sentence,
-            has_result=result is not None,
             progress=progress,
             comparison=comparison,
         )

@@ -98,7 +98,6 @@ class ProgressState(Part):
     installed is only a sentence while it cannot be made.
     """
 
-    has_result: bool
     progress: Progress
     comparison: Comparison | None
 

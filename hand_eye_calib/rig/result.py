@@ -28,8 +28,6 @@ _MOST_SHARED = 0.9
 # Variance (m^2, rad^2) that no answer is better than: that of poses without noise is zero.
 _ROUNDING = 1e-16
 
-_GRAVITY = (Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE, Verdict.USE)
-
 
 @dataclass(frozen=True)
 class Closure:
@@ -122,7 +120,7 @@ class RigCalibration:
     @property
     def verdict(self) -> Verdict:
         """The gravest verdict of all extrinsics."""
-        return min((each.verdict for each in self.calibrations), key=_GRAVITY.index)
+        return max((each.verdict for each in self.calibrations), key=[*Verdict].index)
 
     @cached_property
     def Xs(self) -> FloatArray:

@@ -230,7 +230,7 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
     if at.progress.done:
         moved = _moved(at.comparison)
         return Tone.ACT if moved else Tone.GOOD, "DONE", _of_done(state, moved, sentence)
-    if not at.has_result:
+    if _result_of(state) is None:
         return Tone.BUSY, "START", sentence
     if at.level >= Level.WARN:
         return Tone.ACT, "CHANGE THE MOTION", sentence

@@ -83,7 +83,7 @@ def inputs(parent=Level.OK, child=Level.OK):
 def state(node=NODE, at=None, axes=None, **parts):
     """The state of a node that goes on, with another progress, or other parts."""
     at = replace(AT, **{"axes": AT.axes | (axes or {}), **(at or {})})
-    fields = {"level": Level.OK, "has_result": True, "comparison": None}
+    fields = {"level": Level.OK, "comparison": None}
     fields |= {name: parts.pop(name) for name in fields if name in parts}
     progress = ProgressState(text=at.sentence, progress=at, **fields)
     made = {"extrinsic": EXTRINSIC, "progress": progress}
@@ -119,7 +119,7 @@ ERROR = {"level": Level.ERROR}
         (state(), 9.0, Tone.BAD, "SILENT", "The node has said nothing for 9 s."),
         (state(), 0.5, Tone.BUSY, "GO ON", "Go on for about 25 s"),
         (state(level=Level.WARN), 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
-        (state(has_result=False), 0.5, Tone.BUSY, "START", "Go on"),
+        (state(extrinsic=replace(EXTRINSIC, result=None)), 0.5, Tone.BUSY, "START", "Go on"),
         (
             state(at={"done": True, "is_faulty": True, "sentence": "Stop: feet."}),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Stop: "),
