@@ -189,9 +189,8 @@ def simulate_drive(
     n_child = max(2, round(config.poses * config.child_rate / config.parent_rate))
     parent_times_s = np.arange(config.poses) / config.parent_rate
     child_times_s = config.child_delay + np.arange(n_child) / config.child_rate
-    Ts_pw_p, Ts_pw_p_at_child = _vehicle_poses(
-        config, motion_rng, _LEAD_S + parent_times_s, _LEAD_S + child_times_s
-    )
+    track = _ground_track(config, motion_rng, _LEAD_S + np.r_[parent_times_s, child_times_s])
+    Ts_pw_p, Ts_pw_p_at_child = np.split(_poses_on_terrain(config, *track), [config.poses])
     rotation = se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))[:3, :3]
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
@@ -212,28 +211,15 @@ def simulate_drive(
     return SimulatedDrive(parent, child, T_parent_child, T_pw_cw)
 
 
-def _vehicle_poses(
-    config: DriveConfig, rng: np.random.Generator, *times_s: FloatArray
-) -> list[FloatArray]:
-    """Poses (N, 4, 4) of the vehicle on one drive, for each of several arrays of times since its
-    start.
+def _ground_track(
+    config: DriveConfig, rng: np.random.Generator, times_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time since the start;
+    each yaw rate lasts for its hold time.
     """
-    duration = max(times[-1] for times in times_s)
-    holds = np.full(int(duration // config.hold_time) + 2, config.hold_time)
+    holds = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
     holds[0] = _FIRST_HOLD_S
     yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds))
-    return [
-        _poses_on_terrain(config, *_ground_track(config, yaw_rates, holds, times))
-        for times in times_s
-    ]
-
-
-def _ground_track(
-    config: DriveConfig, yaw_rates: FloatArray, holds: FloatArray, times_s: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time; each yaw rate
-    lasts for its hold time.
-    """
     starts = np.cumsum(holds) - holds
     headings = np.cumsum(yaw_rates * holds) - yaw_rates * holds
     arcs = _arc(config.speed, headings, yaw_rates, holds)
@@ -260,9 +246,7 @@ def _poses_on_terrain(
 ) -> FloatArray:
     """Poses (N, 4, 4) of the vehicle on the ground at positions (N, 2) with headings (N,)."""
     x, y = positions.T
-    z, slope_x, slope_y = surface(
-        x, y, config.terrain_height, config.terrain_scale, config.terrain_limit
-    )
+    z, slope_x, slope_y = surface(config, x, y)
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     if config.attitude == "published":
@@ -278,14 +262,13 @@ def _poses_on_terrain(
     return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 
-def surface(
-    x: FloatArray, y: FloatArray, height: float, scale: float, limit: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def surface(config: DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
     """Height (N,) of the ground, m, and its slopes (N,) along x and y, at places (N,), m.
 
-    ``height`` and ``scale`` are metres per unit of :func:`_peaks` and of its arguments; arguments
-    beyond +/- ``limit`` are mirrored back, so that a long drive stays on the hills.
+    Its height and scale are metres per unit of :func:`_peaks` and of its arguments; arguments
+    beyond +/- its limit are mirrored back, so that a long drive stays on the hills.
     """
+    height, scale, limit = config.terrain_height, config.terrain_scale, config.terrain_limit
     (u, sign_u), (v, sign_v) = _mirrored(x / scale, limit), _mirrored(y / scale, limit)
     peaks, along_u, along_v = _peaks(u, v)
     slope = height / scale

@@ -95,7 +95,7 @@ def published_runs(folder, level):
 def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder):
     for parent, _ in published_runs(published_folder, "noise/noise_0.000000"):
         x, y = parent[:, 0, 3], parent[:, 1, 3]
-        z, slope_x, slope_y = surface(x, y, 0.1, 1.0, 5.0)
+        z, slope_x, slope_y = surface(DriveConfig(), x, y)
         np.testing.assert_allclose(parent[:, 2, 3], z, atol=1e-12)
         normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
