@@ -28,6 +28,7 @@ from hand_eye_calib.gls.increments import (
     Streams,
 )
 from hand_eye_calib.gls.noise_model import (
+    JITTER,
     N_FAST,
     PARTS,
     ROTATION,
@@ -139,8 +140,6 @@ class AdaptiveSolution(ModelSolution):
         Of the poses' white errors; other than 1 where tails are heavy.
     is_drowned : bool
         Whether single poses are noisier than the rotation between them: only some were used.
-    heavy_tails : bool
-        Whether white errors are weighed as of Student's t distribution.
     metres_per_pose : float
         Path of the parent from pose to pose.
     """
@@ -149,7 +148,6 @@ class AdaptiveSolution(ModelSolution):
     cov_parent_child_in_child: FloatArray
     unseen: FloatArray
     weights: FloatArray
-    heavy_tails: bool
     metres_per_pose: float
     is_drowned: bool = False
 
@@ -214,10 +212,12 @@ class AdaptiveSolution(ModelSolution):
             drift = f"{length(by_m)} and {angle(by_rad)} after 1 m, ten times that after 100 m"
         else:
             lasting = tuple(slow for slow in lasting if slow.part == "rotation")
+        jitter_ms = 1e3 * float(sigmas[JITTER])
         return [
             f"Noise: {white} per axis of each pose (both sensors together).",
             f"Drift: {drift}.",
             *map(_slow_in_words, lasting),
+            *[f"stamps jitter by {jitter_ms:.2g} ms"] * (jitter_ms > TUNING.notable_jitter_ms),
         ]
 
     def _systematic_in_words(self) -> list[str]:
@@ -371,7 +371,6 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         **parts_of(np.where(is_there, final.parameters, 0.0), np.where(is_there, sigmas, 0.0)),
         jumps=fit.outliers.jumps,
         spikes=fit.outliers.spikes,
-        heavy_tails=fit.has_heavy_tails and "tails" not in problem.without,
         misfit=misfit,
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
         part_products=posterior.part_products(),

@@ -149,6 +149,8 @@ class Tuning:
     unknown_m: float = 0.2
     # What is beyond so many standard deviations is there.
     plain: float = 3.0
+    # Stamps that jitter by less are not worth a sentence (ms).
+    notable_jitter_ms: float = 0.1
     # Parts of a recording for the jackknife.
     n_parts: int = 20
 
