@@ -192,8 +192,7 @@ def _unusual() -> Iterator[Hypothesis]:
     for order, signs in itertools.product(
         itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     ):
-        matrix = np.zeros((3, 3))
-        matrix[range(3), order] = signs
+        matrix = np.diag(signs) @ np.eye(3)[list(order)]
         n_changed = int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
         parts = zip(order, signs, strict=True)
         detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in parts)
