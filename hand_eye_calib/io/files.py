@@ -21,6 +21,8 @@ LARGEST = 512 << 20
 
 # ---- bags
 
+#: A compressed file may unpack to this many times its own size.
+LARGEST_RATIO = 256
 #: Bytes of the name of a topic, a type or a frame.
 LONGEST_NAME = 1_024
 #: A block of messages is passed on when it has reached this many bytes.

@@ -5,6 +5,7 @@ A bag is copied by fsspec to a temporary folder, read there, and the copy remove
 """
 
 import json
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -43,8 +44,9 @@ def expanded(pattern: str) -> list[str]:
 def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
     """Paths of the same bags on this machine, and what puts the URLs back into plain values that
     name the copies; what is remote is copied for as long as the block lasts. Errors raised in the
-    block name the URLs. An InputError if a store cannot be reached or there is no bag; a
-    MissingDependencyError if what a store needs is not installed.
+    block name the URLs. An InputError if a store cannot be reached, there is no bag, or it would
+    fill more than half of the disk; a MissingDependencyError if what a store needs is not
+    installed.
     """
     if not any(map(is_url, paths)):
         yield [*paths], lambda value: value
@@ -74,13 +76,20 @@ def _copied(url: str, folder: Path) -> Path:
     folder.mkdir()
     with _reached(url) as (system, path):
         is_file = _name(path).endswith(_SUFFIXES)
-        found = [path] if is_file else system.ls(path, detail=False)
-        files = [name for name in found if _name(name).endswith(_SUFFIXES)]
+        found = [system.info(path) | {"name": path}] if is_file else system.ls(path, detail=True)
+        files = [about for about in found if _name(about["name"]).endswith(_SUFFIXES)]
         if not files:
-            raise FileNotFoundError(f"expected a bag, files that end in {', '.join(_SUFFIXES)}")
-        for name in files:
+            raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
+        # Half of the free space is left to the copies of other processes.
+        largest = shutil.disk_usage(folder).free // 2
+        if sum(about.get("size") or 0 for about in files) > largest:
+            raise InputError(
+                f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
+                f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
+            )
+        for about in files:
             # The name's last part only: a store does not choose where things go.
-            system.get_file(name, str(folder / _name(name)))
+            system.get_file(about["name"], str(folder / _name(about["name"])))
         return folder / _name(path) if is_file else folder
 
 
@@ -103,6 +112,8 @@ def _reached(url: str) -> Iterator[tuple[Any, str]]:
             f"{public(url)} needs a package that is not installed: {error}; "
             "pip install 'hand_eye_calib[fleet]', and that of the store"
         ) from None
+    except HandEyeCalibError as error:
+        raise InputError(f"cannot read {public(url)}: {error}") from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".:")
         raise InputError(

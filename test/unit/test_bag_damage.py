@@ -312,3 +312,10 @@ def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, kind):
     assert "takes more memory than any bag should" in errors[0]
     assert mib < MOST_MIB
     assert "Traceback" not in done.stderr
+
+
+def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(zstd.compress(bytes(300 * MIB)))
+    with pytest.raises(InputError, match="unpacks to more than 256 times .* not believable"):
+        PoseBag(path)

@@ -12,6 +12,8 @@ import select
 import signal
 import subprocess
 import sys
+import tempfile
+import types
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -301,10 +303,19 @@ def test_a_bag_at_a_url_is_replayed_alone(run, tmp_path, memory, monkeypatch):
     assert (code, "/hand_eye_calib_" in err) == (1, False)
 
 
+def test_a_remote_bag_may_not_fill_the_disk(tmp_path, memory, monkeypatch):
+    monkeypatch.setattr(remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000))
+    _, (found,) = outcomes_of("memory://fleet/run0/drive")
+    assert found["error"] == (
+        "cannot read memory://fleet/run0/drive: it is larger than 1e-05 GB, half of the free space "
+        f"of {tempfile.gettempdir()}; set TMPDIR to a folder with more space"
+    )
+
+
 def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
     class Hostile:
         def ls(self, path, detail):
-            return ["bag/../../../../outside.mcap"]
+            return [{"name": "bag/../../../../outside.mcap", "type": "file"}]
 
         def get_file(self, name, target):
             copied.append(target)

@@ -2,7 +2,6 @@
 rosbag1) and mcap.
 """
 
-import shutil
 import struct
 import sys
 import tempfile
@@ -22,7 +21,7 @@ from urllib.parse import quote
 import numpy as np
 
 from hand_eye_calib.errors import InputError, MissingDependencyError, printable, required
-from hand_eye_calib.io.files import BLOCK_BYTES, LONGEST_NAME, reading_memory
+from hand_eye_calib.io.files import BLOCK_BYTES, LARGEST_RATIO, LONGEST_NAME, reading_memory
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
@@ -333,10 +332,15 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
 
 def _unpack(file: Path, target: Path) -> str:
     """Unpack a file that is compressed as a whole, as far as it goes; what is lost."""
-    zstd = _zstd()
+    zstd, most = _zstd(), LARGEST_RATIO * file.stat().st_size
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
         try:
-            shutil.copyfileobj(packed, unpacked)
+            for piece in iter(lambda: packed.read(BLOCK_BYTES), b""):
+                if unpacked.tell() + unpacked.write(piece) > most:
+                    raise InputError(
+                        f"cannot read bag {file}: its content unpacks to more than "
+                        f"{LARGEST_RATIO} times its size, which is not believable"
+                    )
         except (EOFError, zstd.ZstdError) as error:
             return f"its compression is damaged ({_reason_of(error)})"
     return ""
