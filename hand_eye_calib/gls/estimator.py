@@ -41,7 +41,7 @@ from hand_eye_calib.gls.stages import STAGES, Fit, Problem, is_settled, start
 from hand_eye_calib.gls.tuning import TUNING, Tuning
 from hand_eye_calib.results.records import CorrelatedError, Noise
 from hand_eye_calib.stats import median
-from hand_eye_calib.text import angle, length
+from hand_eye_calib.text import angle, counted, length
 
 # Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
 _SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
@@ -96,17 +96,14 @@ class ModelSolution:
 
     def events(self, stamps_ns: IntArray) -> list[str]:
         """Jumps and outliers in words, with the times (s) of the first."""
-        said, found = (
-            [],
-            {
-                "jumps of a trajectory, just before": stamps_ns[1:][self.jumps],
-                "poses wrong by themselves and left out, at": stamps_ns[self.spikes],
-            },
-        )
-        for what, at_ns in found.items():
-            if count := len(at_ns):
-                first = ", ".join(f"{each * 1e-9:.3f}" for each in at_ns[:5].tolist())
-                said.append(f"{count} {what} {first}{' ...' if count > 5 else ''} s")
+        said, stamps_s = [], stamps_ns * 1e-9
+        for times_s, what, told in (
+            (stamps_s[1:][self.jumps], "jump", " of a trajectory, just before"),
+            (stamps_s[self.spikes], "outlier pose", ", left out, at"),
+        ):
+            if count := len(times_s):
+                first = ", ".join(f"{each:.3f}" for each in times_s[:5].tolist())
+                said.append(f"{counted(count, what)}{told} {first}{' ...' if count > 5 else ''} s")
         return said
 
 

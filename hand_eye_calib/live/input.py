@@ -169,7 +169,8 @@ class PoseInput:
         self._arrived_s: float | None = None
         self._bad, self._bad_at_s = "", -np.inf
         self._counts = deque([(time.monotonic(), 0, 0)], maxlen=_REPORTS + 1)
-        self._is_new = True
+        self._last_stamp_ns: int | None = None
+        self._longest_gap_ns, self._is_new = 0, True
 
     @property
     def has_poses(self) -> bool:
@@ -183,6 +184,7 @@ class PoseInput:
     def restart(self, because_of: "PoseInput | None") -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
+        self._last_stamp_ns, self._longest_gap_ns = None, 0
         self._is_new = because_of is None
         if because_of is None:
             self._guard.restart()
@@ -219,6 +221,9 @@ class PoseInput:
         self._arrived, self._arrived_s = self._arrived + 1, time.monotonic()
         if not self.is_enabled:
             return
+        if self._last_stamp_ns is not None:
+            self._longest_gap_ns = max(self._longest_gap_ns, stamp_ns - self._last_stamp_ns)
+        self._last_stamp_ns = stamp_ns
         last_ns = self._guard.last_ns
         judgement = self._guard.check(stamp_ns, read, self._arrived_s)
         if judgement.jumped_back:
@@ -282,6 +287,7 @@ class PoseInput:
             poses_taken=taken.received,
             refused=refused | dict(sorted(self._refused.items())),
             lost=None if self._next_number is None else self._lost,
+            longest_gap_s=self._longest_gap_ns * 1e-9,
         )
 
     def _judge(

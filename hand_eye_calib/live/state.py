@@ -114,6 +114,7 @@ class InputState(Part):
     poses_taken: int
     refused: Mapping[str, int]
     lost: int | None
+    longest_gap_s: float
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -130,7 +130,7 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     assert found.inputs["parent"].level is Level.ERROR
 
 
-def test_repeated_stamps_and_rates_are_counted_and_disabled_is_said(start_node, peer, state):
+def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_node, peer, state):
     start_node(*RELIABLE_INPUTS)
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -140,6 +140,7 @@ def test_repeated_stamps_and_rates_are_counted_and_disabled_is_said(start_node, 
     parent = state(lambda each: each.inputs["parent"].refused["repeated stamp"] == 5)
     parent = parent.inputs["parent"]
     assert (parent.messages, parent.poses_taken) == (55, 50)
+    assert parent.longest_gap_s == pytest.approx(1.1)
     assert parent.rate_hz > 0
     assert peer.set_enabled(False).success
     disabled = "not accepting poses: call ~/set_enabled"

@@ -72,7 +72,7 @@ SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six 
 
 def inputs(parent=Level.OK, child=Level.OK):
     texts = ["20.0 Hz", "/odom has been silent for 3 s", "/odom: bad quaternion"]
-    figures = {"rate_hz": 0.0}
+    figures = dict.fromkeys(("rate_hz", "longest_gap_s"), 0.0)
     figures |= dict.fromkeys(("messages", "poses_taken", "lost"), 0)
     return {
         name: InputState(level=level, text=texts[level], topic="/odom", refused={}, **figures)
