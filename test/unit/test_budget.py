@@ -13,22 +13,22 @@ from source_code import SOURCE, imports_of, room_of
 
 ROOT = SOURCE.parent
 
-# What may not be exceeded: the sizes of today, which may only be lowered. The goals are: 30,000
-# lines, 19,000 of code, 400 constants, 10 functions above 50 lines, 450 functions in 50 files
-# entered by ``calibrate a b``, 19,000 lines of tests.
+# What may not be exceeded: the sizes of today, which may only be lowered, but lines, constants and
+# long functions, which have goals of 30,000, 400 and 10. Goals still ahead: 19,000 lines of code,
+# 450 functions in 50 files entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
-    "lines": 30_960,
-    "lines of code": 20_080,
-    "numeric constants": 640,
+    "lines": 29_560,
+    "lines of code": 19_190,
+    "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
     "rooms": 30,
     "floors": 17,
     "arrows between rooms": 186,
-    "functions entered by calibrate": 660,
-    "files entered by calibrate": 71,
+    "functions entered by calibrate": 548,
+    "files entered by calibrate": 62,
     "lines of reproduction": 6_950,
-    "lines of tests": 19_700,
+    "lines of tests": 19_280,
     "words of documentation": 35_000,
 }
 
