@@ -24,7 +24,8 @@ from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, NoiseConfig, simulate_drive
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction import clean_recordings
 from reproduction.fault_cases import GROUPS, Fault
 from reproduction.recordings import real_rigs

@@ -39,8 +39,9 @@ _SAME_M, _SAME_RAD, _MAX_SIGMA_RAD = 0.005, float(np.radians(0.3)), float(np.rad
 _WITHIN = 3.0
 
 # Upper bounds of the lever arm (m; two standard deviations above its length). Hardly two sensors
-# fit closer than the second; of other orientations, none are closer than the first.
-_SAME_POSITION_M, _NEARLY_M = 0.002, 0.012
+# fit closer than the second, or, with axes that are parallel by no accident, than the third; of
+# other orientations, none are closer than the first.
+_SAME_POSITION_M, _NEARLY_M, _PARALLEL_M = 0.002, 0.012, 0.03
 
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
@@ -129,10 +130,12 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     """Finding about an extrinsic, or a translation, of zero."""
     distance_m, sigma_m = float(np.linalg.norm(T_parent_child[:3, 3])), float(sigmas[:3].max())
     upper_m = distance_m + 2 * sigma_m
-    if upper_m > _NEARLY_M or sigmas[3:].max() > _MAX_SIGMA_RAD:
-        return []
     angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
-    if angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max()):
+    is_parallel = angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max())
+    near_m = _PARALLEL_M if is_parallel else _NEARLY_M
+    if upper_m > near_m or sigmas[3:].max() > _MAX_SIGMA_RAD:
+        return []
+    if is_parallel:
         key, size = "same_frame", f"{length(distance_m)} and {angle(angle_rad)}"
         is_same = distance_m < max(_SAME_M, _WITHIN * sigma_m)
     else:

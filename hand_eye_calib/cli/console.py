@@ -13,7 +13,6 @@ from typing import TypeVar
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import printable
 from hand_eye_calib.option import option_name
-from hand_eye_calib.plain import json_text
 
 _Item = TypeVar("_Item")
 
@@ -118,7 +117,12 @@ def print_result(lines: Iterable[str], document: object = None) -> None:
     """Print what a command found: its document as JSON, if there is one; otherwise as text, on a
     terminal with the verdict that it begins with in its colour.
     """
-    text = "\n".join(map(printable, lines)) if document is None else json_text(document)
+    if document is None:
+        text = "\n".join(map(printable, lines))
+    else:
+        from hand_eye_calib.plain import json_text
+
+        text = json_text(document)
     verdict, colon, rest = text.partition(":")
     if sys.stdout.isatty() and verdict in _STYLES:
         text = f"{_STYLES[verdict]}{verdict}\x1b[0m{colon}{rest}"

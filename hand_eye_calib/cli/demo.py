@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.console import note, print_result, waiting_for
 from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, REALISTIC
+from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from hand_eye_calib.cli.demo import DRIVE, TOPICS
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.ros.player import play
-from hand_eye_calib.simulation.drive import REALISTIC, simulate_drive
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import REALISTIC
 
 # How long a hang takes to fail a test; the demo takes about 5 s.
 PATIENCE_S = 300.0

@@ -9,7 +9,7 @@ import pytest
 from source_code import PACKAGE, SOURCE, imports_of, room_of
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.simulation.drive import NoiseConfig
+from hand_eye_calib.simulation.options import NoiseConfig
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.

@@ -27,7 +27,7 @@ LIMITS = {
     "arrows between rooms": 186,
     "functions entered by calibrate": 548,
     "files entered by calibrate": 62,
-    "lines of reproduction": 6_950,
+    "lines of reproduction": 6_960,
     "lines of tests": 19_280,
     "words of documentation": 35_000,
 }

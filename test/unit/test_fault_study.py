@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, simulate_drive
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE
 from reproduction import clean_recordings, faults
 from reproduction.fault_cases import LATER
 

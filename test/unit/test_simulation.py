@@ -15,15 +15,14 @@ from hand_eye_calib.cli import simulate as simulate_command
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files.reading import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.simulation.drive import (
+from hand_eye_calib.simulation.drive import simulate_drive, surface
+from hand_eye_calib.simulation.options import (
     HILLY_DRIVE,
     MIXTURE,
     PUBLISHED_DRIVE,
     REALISTIC,
     DriveConfig,
     NoiseConfig,
-    simulate_drive,
-    surface,
 )
 
 # --- the drive ------------------------------------------------------------------------

@@ -24,7 +24,8 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.drive import MIXTURE, PUBLISHED_DRIVE, NoiseConfig, simulate_drive
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 
 
 def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):

@@ -14,7 +14,8 @@ from hand_eye_calib.checks.streams import check_stream
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, REALISTIC, NoiseConfig, simulate_drive
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
 from reproduction.fault_cases import FAULTS, SILENT
 
 # Seen by a solve or with no effect at that severity: too little noise, or a part of the tilt.

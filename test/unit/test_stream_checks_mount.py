@@ -9,7 +9,8 @@ from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change, possible_s
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import synchronise
-from hand_eye_calib.simulation.drive import HILLY_DRIVE, NoiseConfig, simulate_drive
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.fault_cases import heading_drift
 
 SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]

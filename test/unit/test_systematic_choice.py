@@ -10,7 +10,8 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.motion_pairs import PosePairs
-from hand_eye_calib.simulation.drive import MIXTURE, DriveConfig, add_noise, simulate_drive
+from hand_eye_calib.simulation.drive import add_noise, simulate_drive
+from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
 
 
 def mixture(number):
