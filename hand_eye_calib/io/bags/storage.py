@@ -21,7 +21,13 @@ from urllib.parse import quote
 import numpy as np
 
 from hand_eye_calib.errors import InputError, MissingDependencyError, printable, required
-from hand_eye_calib.io.files import BLOCK_BYTES, LARGEST_RATIO, LONGEST_NAME, reading_memory
+from hand_eye_calib.io.files import (
+    BLOCK_BYTES,
+    LARGEST,
+    LARGEST_RATIO,
+    LONGEST_NAME,
+    reading_memory,
+)
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
@@ -241,8 +247,10 @@ class McapFile(Storage):
                 if file.read(_RECORD.size)[0] == opcode.Opcode.CHUNK:
                     chunk = records.Chunk.read(data_stream.ReadDataStream(file))
                     zstd = stream_reader.zstandard.ZstdDecompressor().decompressobj()
-                    lz4 = stream_reader.lz4.LZ4FrameDecompressor()
-                    unpackers = {"zstd": zstd.decompress, "lz4": lz4.decompress}
+                    # Before 1.6 the module has the package of that name instead of its part.
+                    lz4 = getattr(stream_reader.lz4, "frame", stream_reader.lz4)
+                    of_lz4 = lz4.LZ4FrameDecompressor()
+                    unpackers = {"zstd": zstd.decompress, "lz4": of_lz4.decompress}
                     unpack = unpackers.get(chunk.compression, bytes)
                     rest = _WholeReads(BytesIO(unpack(chunk.data)))
                     yield from stream_reader.StreamReader(rest, skip_magic=True).records
@@ -272,7 +280,8 @@ class _WholeReads(BufferedReader):
     """
 
     def read(self, size: int | None = -1) -> bytes:
-        data = super().read(size)
+        # A damaged length is not worth the memory: before 1.6 the library believes it.
+        data = super().read(size) if (size or 0) < LARGEST else b""
         if len(data) < (size or 0):
             raise EOFError("it ends in the middle of a record")
         return data
