@@ -18,7 +18,7 @@ ROOT = SOURCE.parent
 # 450 functions in 50 files entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
     "lines": 29_560,
-    "lines of code": 19_190,
+    "lines of code": 19_200,
     "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
