@@ -59,6 +59,11 @@ def quantile(values: ArrayLike, share: float) -> float:
     return float(parted[low] + (rank - low) * (parted[high] - parted[low]))
 
 
+def robust_sigma(vectors: FloatArray) -> float:
+    """Standard deviation per axis of vectors (K, 3), of which some may be far off."""
+    return median(np.linalg.norm(vectors, axis=1)) / MEDIAN_LENGTH
+
+
 def student_weights(squared: FloatArray, dimension: int = 6) -> FloatArray:
     """Weights of vectors of a dimension, with these squared lengths in standard deviations, as of
     Student's t distribution: 1 on average, small for outliers.

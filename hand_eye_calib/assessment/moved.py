@@ -38,9 +38,9 @@ from hand_eye_calib.results.status import AXES
 from hand_eye_calib.stats import (
     CHI2,
     LARGEST_OF_SIX,
-    MEDIAN_LENGTH,
     NINE_TIMES_OUT_OF_TEN,
     median,
+    robust_sigma,
     student_weights,
 )
 from hand_eye_calib.text import amount, angle, length, listing
@@ -259,8 +259,7 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariance (6, 6) of residuals (K, 6) whose noise is Student's t, and the weight (K,) of
     each: 1 on average, small for jumps.
     """
-    lengths = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2).T
-    sigmas = np.repeat([median(part) / MEDIAN_LENGTH for part in lengths], 3)
+    sigmas = np.repeat([robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3)
     covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
     for _ in range(_ROUNDS):
         squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)

@@ -103,7 +103,7 @@ def check_agreement(
     speeds, speed = _speeds(pose_pairs)
     drift = slow.fit("drift")
     tried = [(drift.share, _world_drift(drift, pose_pairs, speed))]
-    tried += [_rotation_gain(slow.fit("gain"), axes)]
+    tried += [_rotation_gain(slow, axes)]
     tried += [_turned(slow, stream) for stream in (*_STREAMS, "both")]
     tried += [_axis_gain(slow, stream) for stream in _STREAMS]
     if change:
@@ -145,11 +145,12 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     return [finding(key, "both", severity, size=size, translation_m=distance_m)]
 
 
-def _rotation_gain(fitted: Fitted, axes: FloatArray) -> _Suspect:
+def _rotation_gain(slow: Regression, axes: FloatArray) -> _Suspect:
     """A gain of the child's rotations about an axis."""
+    fitted, biases = slow.fit("gain"), slow.biases("gain")
     sigmas, least, *_ = LIMITS["rotation_gain"]
-    limits = np.maximum(sigmas * fitted.sigmas, _BIASES * fitted.biases)
-    powers = 1.0 / fitted.biases
+    limits = np.maximum(sigmas * fitted.sigmas, _BIASES * biases)
+    powers = 1.0 / biases
     ratios = np.abs(fitted.values) / np.maximum(limits, least)
     ratios = np.where(powers > _LITTLE**2 * powers[0], ratios, 0.0)
     k = int(np.argmax(ratios))
@@ -191,8 +192,8 @@ def _axis_gain(slow: Regression, stream: str) -> _Suspect:
     """A coordinate of a stream that has another scale than the others."""
     fitted = slow.fit(f"axes_{stream}", without="scale")
     k, off, sigma = _odd_one(fitted)
-    of_noise = fitted.biases[k]
-    of_drift = _DRIFT**2 * of_noise / slow.fit("scale", without="scale").biases[0]
+    of_noise = slow.biases(f"axes_{stream}")[k]
+    of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
     if abs(off) < _BIASES * (of_noise + of_drift):
         return fitted.share, None
     size = off if fitted.share > _SOME else min(abs(off), LIMITS["axis_scale"][-1])

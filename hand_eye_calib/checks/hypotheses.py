@@ -34,7 +34,7 @@ from hand_eye_calib.pairing.motion_pairs import (
     pairs_over,
     synchronise,
 )
-from hand_eye_calib.stats import MEDIAN_LENGTH, median
+from hand_eye_calib.stats import median, robust_sigma
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
 # so many at most, and in closed form.
@@ -302,7 +302,7 @@ def _left_unexplained(pairs: MotionPairs) -> float:
         turned = se3.rotation_exp(angle * axis)
         column = -(moved @ turned.T)[:, :, None]
         x, left_m = _fit_robustly(np.concatenate([chords, column], axis=2), -A[:, :3, 3])
-        left_rad = _deviation(a - b @ (turned @ rotation).T)
+        left_rad = robust_sigma(a - b @ (turned @ rotation).T)
         size_m = min(np.linalg.norm(A[:, :3, 3]), max(x[3], 0.0) * np.linalg.norm(moved))
         size_rad = np.linalg.norm(a)
         shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (size_rad + 1e-12)))
@@ -319,13 +319,9 @@ def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, flo
         products = flat.T @ flat
         x = np.linalg.pinv(products[:-1, :-1], rcond=1e-12, hermitian=True) @ products[:-1, -1]
         left = rows @ x - target
-        sigma = _deviation(left)
+        sigma = robust_sigma(left)
         weights = 1.0 / (1.0 + (left**2).sum(axis=1) / (6.0 * sigma + 1e-12) ** 2)
     return x, sigma
-
-
-def _deviation(vectors: FloatArray) -> float:
-    return median(np.linalg.norm(vectors, axis=1)) / MEDIAN_LENGTH
 
 
 def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:

@@ -25,7 +25,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
-from hand_eye_calib.stats import MEDIAN_LENGTH, median
+from hand_eye_calib.stats import median, robust_sigma
 
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
@@ -39,13 +39,11 @@ _TUNING, _ROUNDS = 3.0, 4
 @dataclass(frozen=True)
 class Fitted:
     """What a group of m columns is fitted with: values and standard deviations (m,), by the
-    jackknife over blocks of time; by how much noise of the columns, if it is as large as that of
-    the rows, may push values; and the share of the squared residuals that the group takes away.
+    jackknife over blocks of time; and the share of the squared residuals that the group takes away.
     """
 
     values: FloatArray
     sigmas: FloatArray
-    biases: FloatArray
     share: float
 
 
@@ -94,13 +92,20 @@ class Regression:
         names = [*(name for name in self._base if name != without), *groups]
         return [column for name in names for column in self._where[name]]
 
+    def biases(self, group: str) -> FloatArray:
+        """By how much (m,) noise of the columns of a group, if it is as large as that of the rows,
+        may push its values.
+        """
+        at = self._where[group]
+        powers = np.maximum(self._blocks.sum(axis=0)[at, at], 1e-300)
+        return np.asarray(self._sigma**2 * self._weight / powers)
+
     def fit(self, group: str, without: str = "") -> Fitted:
         """Fit a group beside the base, or beside what is left of it."""
         total, before = self._blocks.sum(axis=0), self._columns(without=without)
         known = [*before, *self._where[group]]
         left_out = _solved(total - self._blocks, known)[:, len(before) :]
         spread = left_out - left_out.mean(axis=0)
-        powers = np.maximum(total[self._where[group], self._where[group]], 1e-300)
         costs = [
             float(total[-1, -1] - total[indices, -1] @ _solved(total, indices))
             for indices in (before, known)
@@ -108,7 +113,6 @@ class Regression:
         return Fitted(
             values=_solved(total, known)[len(before) :],
             sigmas=np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0)),
-            biases=self._sigma**2 * self._weight / powers,
             share=1.0 - costs[1] / max(costs[0], 1e-300),
         )
 
@@ -277,8 +281,7 @@ def _regression(
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
     unexplained = displaced - _times(parent.chords, T_parent_child[:3, 3])
     unit_t, unit_r = (
-        max(median(np.linalg.norm(v, axis=1)) / MEDIAN_LENGTH, least)
-        for v, least in ((unexplained, 1e-7), (turned, 1e-8))
+        max(robust_sigma(v), least) for v, least in ((unexplained, 1e-7), (turned, 1e-8))
     )
     of_mount = {
         "lever": (parent.chords, np.zeros_like(parent.chords)),

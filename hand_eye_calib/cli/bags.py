@@ -15,6 +15,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import PoseTable
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.sources import Source
+from hand_eye_calib.io.trajectory_files.table import seconds
 from hand_eye_calib.io.transforms import TfSource
 
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
@@ -52,7 +53,6 @@ def read_recording(
 
 def source_of(text: str) -> Source:
     """The topic, or the frames, that a text names."""
-
     return TfSource.parse(text) if ":" in text.partition("?")[0] else text
 
 
@@ -93,7 +93,6 @@ def read_sources(
 def _read_bags(
     paths: Sequence[Path], wanted: Mapping[str, str], config: CalibratorConfig
 ) -> Recording:
-
     with PoseBag(*paths) as bag:
         sources, measures = select(bag, wanted, config)
         refuse_recordings(paths, sources.values())
@@ -124,10 +123,8 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Any]) -
                 calibrator.set_frame(stream, frame)
             calibrator.add_pose(stream, stamp_ns, pose[:3], pose[3:])
     except InputError as error:
-        seconds, nanoseconds = divmod(int(poses.stamps_ns[row]), 1_000_000_000)
-        raise InputError(
-            f"{topics[poses.streams[row]]}, stamp {seconds}.{nanoseconds:09d}: {error}"
-        ) from error
+        at = seconds(poses.stamps_ns[row])
+        raise InputError(f"{topics[poses.streams[row]]}, stamp {at}: {error}") from error
 
 
 def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> None:
@@ -159,7 +156,6 @@ class _Part(NamedTuple):
 
     @classmethod
     def of(cls, path: Path, sources: Collection[Source]) -> Self:
-
         has = set()
         with PoseBag(path) as bag:
             for source in sources:

@@ -126,7 +126,7 @@ def compare_answers(
     if len(halves) == 2:
         between, allowed = _apart(*halves)
         # The whole is the mean of both halves: its standard deviation is half of that of their
-        # difference. They do not state the floor and, of another method, errors that last.
+        # difference. They do not state the floor and, of another method, time-correlated errors.
         of_halves = between / 2
         is_same = halves[0].method == calibration.method
         beside = floor if is_same else calibration.sigmas_with_floor

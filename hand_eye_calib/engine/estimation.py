@@ -47,7 +47,7 @@ class Solved:
     stamps_ns, config, scale, time_offset
         What was solved; the time offset if it was estimated.
     floor : (6, 6) array
-        Common-mode uncertainty; None if it is only to be compared with a result.
+        Common-mode uncertainty; zeros if it is only to be compared with a result.
     """
 
     solution: Solution | AdaptiveSolution

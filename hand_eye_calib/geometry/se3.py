@@ -87,6 +87,12 @@ def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
     return quats.reshape(rotations.shape[:-2] + (4,))
 
 
+def to_rows(transforms: ArrayLike) -> FloatArray:
+    """x y z qx qy qz qw (..., 7) of transforms (..., 4, 4), as files and messages have them."""
+    Ts = np.asarray(transforms, dtype=float)
+    return np.concatenate([Ts[..., :3, 3], to_quat_xyzw(Ts)], axis=-1)
+
+
 def rotation_from_rpy(rpy: ArrayLike) -> FloatArray:
     """Rotation matrices (..., 3, 3) of roll, pitch and yaw (..., 3), rad, about the fixed axes x, y
     and z in this order (REP 103, URDF).

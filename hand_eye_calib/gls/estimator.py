@@ -2,7 +2,7 @@
 along with it.
 
 Instead of choosing which poses to compare, all evidence is weighed as the noise of these very
-trajectories asks for: white noise favours long baselines, drift short ones, errors that last
+trajectories asks for: white noise favours long baselines, drift short ones, time-correlated errors
 neither, and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
 """
 
@@ -267,7 +267,7 @@ def solve(
     systematic : sequence of str
         Systematic errors in the model.
     quick : bool
-        Stop at white noise, drift and outliers: neither errors that last nor heavy tails.
+        Stop at white noise, drift and outliers: neither time-correlated errors nor heavy tails.
     is_clock_free : bool
         The clock offset was estimated from these poses: it is not known beforehand.
     without : collection of str

@@ -1,9 +1,9 @@
 """The noise of two trajectories: which errors there are, how strong, and how they enter.
 
 Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
-stamps that jitter), the motions a random walk, and errors that last are first-order Gauss-Markov
-processes, fixed to the child's body or to the parent's world. Each has one variance for translation
-and one for rotation. A scale that drifts is one more.
+stamps that jitter), the motions a random walk, and time-correlated errors are first-order
+Gauss-Markov processes, fixed to the child's body or to the parent's world. Each has one variance
+for translation and one for rotation. A scale that drifts is one more.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1
 
 
 class Slow(NamedTuple):
-    """A process of errors that last: ``kind`` body or world, ``part`` translation or rotation; or
-    both scale.
+    """A process of time-correlated errors: ``kind`` body or world, ``part`` translation or
+    rotation; or both scale.
     """
 
     kind: str

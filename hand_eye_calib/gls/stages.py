@@ -158,10 +158,8 @@ class Fit:
         """After a step of xi and of these parameters; X as it is if noise alone makes a step so
         long, along a direction that the motion hardly shows.
         """
-        parameters, is_long = (
-            self.parameters.copy(),
-            np.linalg.norm(step[:3]) >= TUNING.longest_step_m,
-        )
+        is_long = np.linalg.norm(step[:3]) >= TUNING.longest_step_m
+        parameters = self.parameters.copy()
         parameters[columns] += step[6:]
         T = self.T if is_long else self.T @ se3.exp(step[:6])
         return replace(self, T=T, parameters=parameters)
@@ -330,7 +328,7 @@ def tails(problem: Problem, fit: Fit) -> Fit:
 
 
 def lasting(problem: Problem, fit: Fit) -> Fit:
-    """Errors that last, if the data ask for them."""
+    """Time-correlated errors, if the data ask for them."""
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning.most_poses)
     # No white noise and no walk is so small that the search cannot hear it.

@@ -1,4 +1,4 @@
-"""Exact likelihood of increments under white errors, random walks and errors that last.
+"""Exact likelihood of increments under white errors, random walks and time-correlated errors.
 
 The increments of the common error c obey, see :mod:`~hand_eye_calib.gls.increments`,
 

@@ -106,7 +106,7 @@ class Tuning:
     strides: tuple[int, ...] = (3, 10, 30)
     fewest_strides: int = 50
 
-    # -- Errors that last --
+    # -- Time-correlated errors --
     # They are part of the model if that lowers the loss by so much: two levels each, by Akaike and
     # more. One whose level the data say less about than this makes no difference.
     least_gain: float = 4.0

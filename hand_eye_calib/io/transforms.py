@@ -169,7 +169,7 @@ def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
 
 def _row(T: FloatArray) -> _Row:
     """x y z qx qy qz qw of a pose (4, 4)."""
-    return *T[:3, 3].tolist(), *se3.to_quat_xyzw(T).tolist()
+    return tuple(se3.to_rows(T).tolist())
 
 
 def _matrices(rows: ArrayLike) -> FloatArray:

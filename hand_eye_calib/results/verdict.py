@@ -91,7 +91,7 @@ class Rule(NamedTuple):
 # and than this share of the target; other references that are about as certain also if they scatter
 # by so many of its own standard deviations and so many targets: that they are uncertain themselves
 # does not excuse a large scatter. However far, they never forbid a result: they know less of the
-# noise than the method that gave it, and state no errors that last.
+# noise than the method that gave it, and state no time-correlated errors.
 CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
 
 # Smallest share of the motion pairs that are inliers in a recording whose noise is understood; of

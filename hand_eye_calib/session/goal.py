@@ -1,8 +1,8 @@
 """When to stop recording: how far each axis is from its target, how long it still takes, which
 motion helps most, and whether this motion gets there at all.
 
-A standard deviation that once falls below the target is no reason to stop: errors that last have
-not shown yet in a short recording. The rule was measured on recordings with known truth,
+A standard deviation that once falls below the target is no reason to stop: time-correlated errors
+have not shown yet in a short recording. The rule was measured on recordings with known truth,
 docs/session.md.
 """
 
@@ -23,7 +23,7 @@ _SHARE = 0.7
 # ... or what the common-mode floor leaves of it, of the variance at least this share, ...
 _LEAST_ROOM = 0.25
 # ... at two results in a row, after so many seconds of motion, and so many correlation times of
-# errors that last.
+# time-correlated errors.
 _MIN_MOTION_S, _CORRELATION_TIMES = 30.0, 10.0
 
 # Times left (s) that a person is told: they only shrink, by one step at a result. A motion that

@@ -1,5 +1,5 @@
-"""DNL: direct non-linear optimisation over all pairs (Välimäki et al. 2023, eq. 4); and Ali, which
-minimises the translation residual alone.
+"""DNL: direct non-linear optimisation over all pairs (Välimäki et al. 2023, eq. 4); and Ali, of the
+translation residual alone.
 
 That is cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
 robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'

@@ -150,7 +150,7 @@ class ScanOdometry:
                     "registered; use the odometry of a lidar SLAM"
                 )
             Ts, *times = (np.array(each) for each in zip(*self._found, strict=True))
-            rows, about = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)], (self._frame, self._n_failed)
+            rows, about = se3.to_rows(Ts), (self._frame, self._n_failed)
             found = rows, *times, *map(np.array, about)
             self.kept = dict(zip(_KEPT, found, strict=True))
             with suppress(OSError):  # the folder may be read-only

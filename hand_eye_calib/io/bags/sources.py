@@ -203,8 +203,7 @@ class ImageReading(Reading):
     def table(self) -> PoseTable:
         found = self._finder.found()
         self.notes.append(f"{self.topics[0]}: {found}")
-        Ts = se3.inverse(found.Ts_camera_target)
-        poses = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
+        poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
         table = PoseTable.of(self._stamps_ns, poses, "target", self._frame)
         return table.recorded(self.stream, self._bag_ns)
 
@@ -254,19 +253,15 @@ class FieldReading(Reading):
             topic = self.topics[0]
             raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
         stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
-        poses = (
-            np.c_[poses_of(table)]
-            if table.measures != "twists"
-            else _integrated(stamps_ns, table.values())
-        )
+        are_twists = table.measures == "twists"
+        poses = _integrated(stamps_ns, table.values()) if are_twists else np.c_[poses_of(table)]
         return PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
     """Poses (N, 7) of velocities (N, 6), m/s and rad/s, in the sensor's own frame."""
     steps = (twists[1:] + twists[:-1]) / 2 * (np.diff(stamps_ns) * 1e-9)[:, None]
-    poses = chained(se3.exp(steps))
-    return np.c_[poses[:, :3, 3], se3.to_quat_xyzw(poses)]
+    return se3.to_rows(chained(se3.exp(steps)))
 
 
 class TransformReading(Reading):
@@ -290,8 +285,7 @@ class TransformReading(Reading):
             raise InputError(f"{frames}: {self._source.describe_missing()}")
         bag_ns, stamps_ns, rows = zip(*self._found, strict=True)
         moving = {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
-        Ts = self._source.composed(moving)
-        poses = np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)]
+        poses = se3.to_rows(self._source.composed(moving))
         return PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
 
 

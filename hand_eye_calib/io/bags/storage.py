@@ -246,14 +246,21 @@ class McapFile(Storage):
                 file.seek(position)
                 if file.read(_RECORD.size)[0] == opcode.Opcode.CHUNK:
                     chunk = records.Chunk.read(data_stream.ReadDataStream(file))
-                    zstd = stream_reader.zstandard.ZstdDecompressor().decompressobj()
-                    # Before 1.6 the module has the package of that name instead of its part.
-                    lz4 = getattr(stream_reader.lz4, "frame", stream_reader.lz4)
-                    of_lz4 = lz4.LZ4FrameDecompressor()
-                    unpackers = {"zstd": zstd.decompress, "lz4": of_lz4.decompress}
-                    unpack = unpackers.get(chunk.compression, bytes)
-                    rest = _WholeReads(BytesIO(unpack(chunk.data)))
+                    rest = _WholeReads(BytesIO(_unpacked(chunk)))
                     yield from stream_reader.StreamReader(rest, skip_magic=True).records
+
+
+def _unpacked(chunk: Any) -> Any:
+    """The content of an mcap chunk, as far as it goes if that is cut off."""
+    from mcap import stream_reader
+
+    if chunk.compression == "zstd":
+        return stream_reader.zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
+    if chunk.compression == "lz4":
+        # Before 1.6 the module has the package of that name instead of its part.
+        lz4 = getattr(stream_reader.lz4, "frame", stream_reader.lz4)
+        return lz4.LZ4FrameDecompressor().decompress(chunk.data)
+    return chunk.data
 
 
 def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:

@@ -65,14 +65,12 @@ def stamped_messages(
 
     zero, no_covariance = make("Vector3", 0.0, 0.0, 0.0), np.zeros(36)
     twist = make("TwistWithCovariance", make("Twist", zero, zero), no_covariance)
-    quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
-    rows = zip(trajectory.stamps_ns, trajectory.poses[:, :3, 3], quats_xyzw, strict=True)
-    for number, (stamp_ns, position, quat_xyzw) in enumerate(rows):
+    rows = zip(trajectory.stamps_ns, se3.to_rows(trajectory.poses).tolist(), strict=True)
+    for number, (stamp_ns, row) in enumerate(rows):
         stamp = types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), STAMP_UNITS["s"]))
         sequence = {"seq": number} if is_ros1 else {}
         head = {"stamp": stamp, "frame_id": trajectory.world_frame, **sequence}
-        rotation = make("Quaternion", *quat_xyzw.tolist())
-        pose = make("Pose", make("Point", *position.tolist()), rotation)
+        pose = make("Pose", make("Point", *row[:3]), make("Quaternion", *row[3:]))
         parts: tuple[Any, ...] = (pose,)
         if message_type == "nav_msgs/msg/Odometry":
             with_covariance = make("PoseWithCovariance", pose, no_covariance)

@@ -338,9 +338,8 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
     """
     try:
-        quats_xyzw = se3.to_quat_xyzw(trajectory.poses)
-        values = np.concatenate([trajectory.poses[:, :3, 3], quats_xyzw], axis=1).tolist()
-        lines = map(tum_line, trajectory.stamps_ns.tolist(), values)
+        poses = se3.to_rows(trajectory.poses).tolist()
+        lines = map(tum_line, trajectory.stamps_ns.tolist(), poses)
         write_atomically({Path(path): "\n".join([f"# {TUM_COLUMNS}", *lines, ""])})
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from None
