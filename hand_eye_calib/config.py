@@ -21,7 +21,7 @@ from hand_eye_calib.text import (
 )
 
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
-# As of results/exports.py.
+# As of results/layouts.yaml.
 EXPORT_FORMATS = (
     *("autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins", "orbslam3"),
     *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),

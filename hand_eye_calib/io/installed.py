@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.config import EXPORT_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
@@ -20,7 +21,7 @@ from hand_eye_calib.io.files import read_bytes
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.yaml_files import read_yaml
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.exports import FORMATS, arranged
+from hand_eye_calib.results.exports import arranged, formats
 from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.text import parse_pose
 
@@ -28,7 +29,9 @@ from hand_eye_calib.text import parse_pose
 _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
-_EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(FORMATS)
+_EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(
+    EXPORT_FORMATS
+)
 
 
 def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
@@ -122,7 +125,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
         frames.add(str(parent).lstrip("/"), str(child).lstrip("/"), pose_of(*pose))
     if frames.edges:
         return frames.pose(parent_frame, child_frame)
-    for layouts in FORMATS.values():
+    for layouts in formats().values():
         fitting = [
             each for each in layouts if each.keys and any(_at(node, each.keys) for _, node in nodes)
         ]

@@ -1,4 +1,4 @@
-"""Extrinsics in the files of other programs: a row per format says in whose frame the numbers are.
+"""Extrinsics in the files of other programs, whose layouts are in ``layouts.yaml``.
 
 Which way round a transform goes is what people get wrong most often. So each file says by the names
 of the frames what its numbers map, and whether the calibration was inverted for it. Where the
@@ -8,15 +8,18 @@ directions come from is in docs/exports.md.
 import json
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import yaml
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import AXES, TRANSLATIONS
+from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import axes_in_words
 from hand_eye_calib.version import package_version
 
@@ -45,166 +48,34 @@ class Layout(NamedTuple):
         What the sensors are; empty for any.
     is_inverted : bool or None
         Whether the target is the child; None if both are possible.
-    keys : list of str
+    keys : sequence of str
         What a reader looks for: a pose, or translation and rotation.
     text : str
         The file, with ``%(name)s`` where numbers and names go.
     clock : int
         ``t_target = t_source + clock * shift``; 0 if the file has no shift.
-    axes : tuple of str
+    axes : sequence of str
         Axes that must be known.
     axes_said : str
         What the file says of its axes.
     """
 
-    target: str
-    source: str
-    is_inverted: bool | None
-    keys: list[str]
-    text: str
+    target: str = ""
+    source: str = ""
+    is_inverted: bool | None = None
+    keys: Sequence[str] = ()
+    text: str = ""
     clock: int = 0
-    axes: tuple[str, ...] = AXES
+    axes: Sequence[str] = AXES
     axes_said: str = ""
 
 
-_YAML_ROWS = "%(about)s\ncam0:\n  {key}:\n%(rows)s\n  timeshift_cam_imu: %(shift)s\n"
-_OPENCV = (
-    "%%YAML:1.0\n---\n%(about)s\n{key}: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: {dt}\n"
-    "   data: [ %(matrix)s ]\n"
-)
-_LIO = "    extrinsic_T: [ %(t)s ]\n    extrinsic_R: [ %(R)s ]\n"
-_DLIO = "%(about)s\ndlio:\n  extrinsics:\n    {key}:\n      t: [ %(t)s ]\n      R: [ %(R)s ]\n"
-_KITTI = "comment: %(about)s\nR: %(R_plain)s\nT: %(t_plain)s\n"
-_STAMPED = (
-    "  translation: {x: %(x)s, y: %(y)s, z: %(z)s}\n"
-    "  rotation: {x: %(qx)s, y: %(qy)s, z: %(qz)s, w: %(qw)s}\n"
-)
-_PX4 = (
-    "%(about)s\nparam set EKF2_{kind}_POS_X %(x)s\nparam set EKF2_{kind}_POS_Y %(y_frd)s\n"
-    "param set EKF2_{kind}_POS_Z %(z_frd)s\n"
-)
-
-#: The layouts of each format.
-FORMATS: dict[str, list[Layout]] = {}
-
-
-def _layout(words: str, text: str, **rest: Any) -> None:
-    """Add a row to the table; the words are format, target, source and keys. After a colon stands
-    which of both a sensor always is.
-    """
-    name, target, source, *keys = words.split()
-    (target, _, place), source = target.partition(":"), source.partition(":")[0]
-    is_inverted = place == "child" if place else None
-    FORMATS.setdefault(name, []).append(Layout(target, source, is_inverted, keys, text, **rest))
-
-
-_layout(
-    "autoware :parent :child",
-    "%(about)s\n%(target)s:\n  %(source)s:\n    x: %(x)s\n    y: %(y)s\n    z: %(z)s\n"
-    "    roll: %(roll)s\n    pitch: %(pitch)s\n    yaw: %(yaw)s\n",
-)
-_layout(
-    "fast_lio imu lidar extrinsic_T extrinsic_R",
-    "%(about)s\ncommon:\n    time_offset_lidar_to_imu: %(shift)s\nmapping:\n"
-    "    extrinsic_est_en: false\n" + _LIO,
-    clock=1,
-)
-_layout(
-    "fast_livo2 imu lidar extrinsic_T extrinsic_R",
-    "%(about)s\nextrin_calib:\n" + _LIO + "time_offset:\n    imu_time_offset: %(shift)s\n",
-    clock=1,
-)
-_layout(
-    "fast_livo2 camera lidar Pcl Rcl",
-    "%(about)s\nextrin_calib:\n    Rcl: [ %(R)s ]\n    Pcl: [ %(t)s ]\n"
-    "time_offset:\n    img_time_offset: %(shift)s\n",
-    clock=-1,
-)
-_layout(
-    "lio_sam lidar imu extrinsicTrans extrinsicRot",
-    "%(about)s\nlio_sam:\n  extrinsicTrans: [ %(t)s ]\n  extrinsicRot: [ %(R)s ]\n"
-    "  extrinsicRPY: [ %(R)s ]  # the orientation of the IMU is that of its axes\n",
-)
-_layout("kalibr camera imu T_cam_imu", _YAML_ROWS.format(key="T_cam_imu"), clock=-1)
-_layout(
-    "kalibr camera:child camera:parent T_cn_cnm1",
-    "%(about)s\n# %(source)s is cam0, %(target)s is cam1.\ncam1:\n  T_cn_cnm1:\n%(rows)s\n",
-)
-_layout(
-    "openvins imu camera T_imu_cam", "%%YAML:1.0\n\n" + _YAML_ROWS.format(key="T_imu_cam"), clock=1
-)
-_layout(
-    "vins imu camera body_T_cam0",
-    _OPENCV.format(key="body_T_cam0", dt="d") + "td: %(shift)s\n",
-    clock=1,
-)
-_layout("orbslam3 imu camera IMU.T_b_c1", _OPENCV.format(key="IMU.T_b_c1", dt="f"))
-_layout("orbslam3 imu camera Tbc", "")  # read in files of an older version
-_layout(
-    "orbslam3 camera:parent camera:child Stereo.T_c1_c2",
-    _OPENCV.format(key="Stereo.T_c1_c2", dt="f"),
-)
-_layout(
-    "apollo :parent :child",
-    "%(about)s\nheader:\n  seq: 0\n  stamp: {secs: 0, nsecs: 0}\n  frame_id: %(target)s\n"
-    "child_frame_id: %(source)s\ntransform:\n" + _STAMPED,
-)
-_layout("dlio base lidar baselink2lidar.t baselink2lidar.R", _DLIO.format(key="baselink2lidar"))
-_layout("dlio base imu baselink2imu.t baselink2imu.R", _DLIO.format(key="baselink2imu"))
-_layout(
-    "glim lidar imu T_lidar_imu",
-    '{\n  "sensors": {\n    "comment": %(about)s,\n'
-    '    "T_lidar_imu": [ %(t)s, %(xyzw)s ]\n  }\n}\n',
-)
-_layout(
-    "msa :parent :child",
-    "%(about)s\n%(source)s:\n  parent: %(target)s\n  child: %(source)s\n"
-    "  value: [ %(t)s, %(xyzw)s ]\n",
-)
-_FRD = "x forward, y right, z down, from axes of %(target)s forward, left, up."
-_layout(
-    "px4 :parent gnss:child",
-    _PX4.format(kind="GPS"),
-    axes=TRANSLATIONS,
-    axes_said=f"{_FRD} Since PX4 1.18: SENS_GPS0_OFFX, SENS_GPS0_OFFY, SENS_GPS0_OFFZ.",
-)
-_layout(
-    "px4 :parent :child",
-    _PX4.format(kind="EV") + "%(ev_delay)s\n",
-    axes=TRANSLATIONS,
-    axes_said=_FRD,
-)
-_layout("kitti camera lidar T R", _KITTI)
-_layout("kitti lidar imu T R", _KITTI)
-_layout(
-    "nuscenes :parent :child translation rotation",
-    '[\n  {\n    "comment": %(about)s,\n    "channel": %(source)s,\n'
-    '    "translation": [ %(t)s ],\n    "rotation": [ %(wxyz)s ]\n  }\n]\n',
-)
-_layout(
-    "colmap :child :parent cam_from_rig_translation cam_from_rig_rotation",
-    '[\n  {\n    "cameras": [\n      { "image_prefix": %(source)s, "ref_sensor": true },\n'
-    '      {\n        "comment": %(about)s,\n        "image_prefix": %(target)s,\n'
-    '        "cam_from_rig_rotation": [ %(wxyz)s ],\n'
-    '        "cam_from_rig_translation": [ %(t)s ]\n      }\n    ]\n  }\n]\n',
-)
-_layout(
-    "driveworks :parent :child nominalSensor2Rig_FLU.t nominalSensor2Rig_FLU.roll-pitch-yaw",
-    '{\n  "rig": {\n    "sensors": [\n      {\n        "comment": %(about)s,\n'
-    '        "name": %(source)s,\n        "nominalSensor2Rig_FLU": {\n'
-    '          "roll-pitch-yaw": [ %(rpy_deg)s ],\n          "t": [ %(t)s ]\n'
-    "        }\n      }\n    ]\n  }\n}\n",
-    axes_said="The axes of %(source)s must be x forward, y left, z up.",
-)
-_layout(
-    "easy_handeye2 :parent :child",
-    "%(about)s\nparameters:\n  name: hand_eye_calib\n  calibration_type: %(eye)s\n"
-    "  robot_base_frame: %(robot)s\n  robot_effector_frame: %(effector)s\n"
-    "  tracking_base_frame: %(source)s\n  tracking_marker_frame: marker\n"
-    "  freehand_robot_movement: true\ntransform:\n" + _STAMPED,
-)
-_layout("opencv :parent :child T_parent_child", _OPENCV.format(key="T_parent_child", dt="d"))
-_layout("numpy :parent :child", "%(about)s\n%(plain_rows)s\n")
+@cache
+def formats() -> dict[str, list[Layout]]:
+    """The layouts of each format."""
+    text = Path(__file__).with_name("layouts.yaml").read_text(encoding="utf-8")
+    rows = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return {name: [Layout(**each) for each in found] for name, found in rows.items()}
 
 
 def role_of(frame: str) -> str:
@@ -240,12 +111,12 @@ def export_text(result: Result, name: str, headline: str, is_usable: bool) -> st
     """A calibration in the format of another program, unless it is not usable; ``headline`` is its
     verdict. See :meth:`~hand_eye_calib.results.calibration.Calibration.export`.
     """
-    if name not in FORMATS:
-        raise ConfigError(f"unknown format {name!r}; known are {', '.join(FORMATS)}")
+    if name not in formats():
+        raise ConfigError(f"unknown format {name!r}; known are {', '.join(formats())}")
     if not is_usable:
         raise InputError(f"nothing is written: {headline}")
     frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
-    layout, is_inverted, is_certain = arranged(FORMATS[name], *frames)
+    layout, is_inverted, is_certain = arranged(formats()[name], *frames)
     if layout.is_inverted is False and not layout.target:  # the vehicle or robot, if it is known
         frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
     if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:

@@ -17,7 +17,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.installed import open_installed
 from hand_eye_calib.io.results import save_result
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.exports import FORMATS, arranged, role_of
+from hand_eye_calib.results.exports import arranged, formats, role_of
 
 OFFSET_S = 0.0125
 POINT = np.array([0.3, -1.2, 2.5, 1.0])
@@ -147,8 +147,8 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_d
 
 
 def test_every_format_is_tried():
-    assert {name for name, *_ in CASES} | {"px4"} == {*FORMATS}
-    assert tuple(FORMATS) == EXPORT_FORMATS
+    assert {name for name, *_ in CASES} | {"px4"} == {*EXPORT_FORMATS}
+    assert tuple(formats()) == EXPORT_FORMATS
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_px4_has_its_own_axes_and_a_delay():
 
 def test_an_axis_that_is_not_known_is_refused():
     flat = result("base_link", "lidar", **unknown("z"))
-    for name in FORMATS:
+    for name in EXPORT_FORMATS:
         with pytest.raises(InputError, match="does not determine z; .* --prior"):
             flat.export(name)
     with pytest.raises(ConfigError, match="unknown format 'kalbir'; known are autoware"):
@@ -206,7 +206,7 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
         assert role_of(frame) == "camera"
     assert (role_of("base_link"), role_of("odom")) == ("base", "")
     # The name of one of both decides.
-    assert arranged(FORMATS["kalibr"], "cam0", "b")[1] is False
+    assert arranged(formats()["kalibr"], "cam0", "b")[1] is False
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_every_format_is_on_a_page():
     pages = {page.stem: page.read_text() for page in DOCS.glob("*.md")}
     assert pages.keys() == PAGES.keys()
     rows = re.findall(r"(?m)^\| (\w+) \|", "".join(pages.values()))
-    assert {*rows, "autoware", "px4"} - {"Format"} == {*FORMATS}
+    assert {*rows, "autoware", "px4"} - {"Format"} == {*EXPORT_FORMATS}
     assert all("**If it is inverted**" in text for text in pages.values())
 
 
