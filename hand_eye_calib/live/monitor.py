@@ -119,7 +119,7 @@ class Alarm:
 
     def __str__(self) -> str:
         """Which axes have moved, by how much, since when (local time)."""
-        since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="seconds")
+        since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="minutes")
         return f"the mount has moved: {self.shift.what}, since about {since}"
 
 

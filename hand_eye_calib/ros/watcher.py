@@ -86,12 +86,9 @@ class Watcher:
 
     def _look(self) -> None:
         """Listen to nodes that are new: anybody may have a topic of that name. And note the topics
-        with poses, for a person whose input has none.
+        with poses, but those of such nodes, for a person whose input has none.
         """
         found = self._node.get_topic_names_and_types()
-        poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in POSE_TYPES]
-        told = tuple(self._told(*each) for each in poses[:_MOST])
-        self._board.topics = told or ("none is published here",)
         for topic, types in found:
             name, _, last = topic.rpartition("/")
             is_one = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
@@ -99,12 +96,17 @@ class Watcher:
                 self._heard.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
+        poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in POSE_TYPES]
+        poses = [each for each in poses if each[0].rpartition("/")[0] not in self._heard]
+        told = tuple(self._told(*each) for each in poses[:_MOST])
+        self._board.topics = told or ("none is published here",)
 
     def _told(self, topic: str, kind: str) -> str:
         publishers = self._node.get_publishers_info_by_topic(topic)
         qos = {each.qos_profile.reliability.name.lower().replace("_", " ") for each in publishers}
-        told = f"{kind}, {counted(len(publishers), 'publisher')}, {' and '.join(sorted(qos))}"
-        return f"{topic} ({told.removesuffix(', ')})"
+        count = counted(len(publishers), "publisher")
+        told = (kind.rpartition("/")[2], count, " and ".join(sorted(qos)))
+        return f"{topic} ({', '.join(filter(None, told))})"
 
     def _take(self, name: str, message: String) -> None:
         state = state_of(message.data)

@@ -22,21 +22,21 @@ from hand_eye_calib.live.state import (
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.stats import LARGEST_OF_SIX
-from hand_eye_calib.text import amount, duration, fixed, two_digits
+from hand_eye_calib.text import amount, duration, fixed, two_digits, with_sigma
 
 # A node that has said nothing for so long (s) is silent.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 MOVED = "MOUNT MOVED"
-_ADVICE = " Check it. Then recalibrate, or acknowledge; a reset ends the alarm."
+_ADVICE = " Check it, then recalibrate or acknowledge."
 
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
 
-# Names of the axes, and what they mean on a vehicle: x is forward, z is up.
+# Names of the axes, and what they mean on a vehicle (REP 103).
 _AXES = [f"{how} {axis}" for how in ("along", "about") for axis in "xyz"]
 _NAMES = dict(zip(AXES, _AXES, strict=True))
-_WORDS = ("forward", "sideways", "height", "tilt to a side", "nose up or down", "turn")
+_WORDS = ("forward", "left", "up", "tilt to a side", "nose up or down", "turn")
 _ON_A_VEHICLE = dict(zip(AXES, _WORDS, strict=True))
 
 
@@ -168,18 +168,21 @@ def _view(state: NodeState, silent_s: float) -> View:
     if state.has_ended:
         head = _of_end(state)
     elif is_old:
-        text = f"The node has said nothing for {silent_s:.0f} s. What is below is older than that."
+        text = f"No word from the node for {silent_s:.0f} s. If it has died, start it again"
+        text += ", with journal:=resume." if state.journal else "."
         head = Tone.BAD, "SILENT", text
     saved_in = state.saved.directory if state.saved else ""
-    view = View(state.node, *head, health=tuple(_health(state, is_old)), saved_in=saved_in)
+    health = () if state.has_ended else tuple(_health(state, is_old))
+    view = View(state.node, *head, health=health, saved_in=saved_in)
     if state.mount is not None:
         asked = ("recalibrate", "acknowledge", "reset") if view.word == MOVED else ()
         watched = tuple(_watched(axis, state.mount) for axis in AXES)
-        return replace(view, facts=_ago(state.mount), watched=watched, buttons=asked)
-    buttons = ("solve", "save", "reset")
-    if view.word == "DONE" and not state.saved:
-        buttons = ("save", "solve", "reset")
+        facts = _ago(state.mount) + "; a reset ends the alarm" * bool(asked)
+        return replace(view, facts=facts, watched=watched, buttons=asked)
+    buttons: tuple[str, ...] = ("reset",)
     if result := _result_of(state):
+        is_wanted = view.word == "DONE" and not state.saved
+        buttons = ("save", "solve", "reset") if is_wanted else ("solve", "save", "reset")
         title = f"pose of {result.child_frame} in {result.parent_frame}"
         view = replace(view, title=title, values=tuple(_values(result)), reasons=result.reasons)
     if at := state.progress:
@@ -267,9 +270,10 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
 
 
 def _sentence(text: str) -> str:
-    """With a capital and a full stop, unless it begins with a name such as ``/lidar``."""
+    """With a full stop, and a capital unless it begins with a name such as ``/lidar`` or ``x``."""
     text = text.replace("+/-", "±")
-    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith((".", "!", "?")) else ".")
+    first = text[:1] if text.partition(" ")[0] in AXES else text[:1].upper()
+    return f"{first}{text[1:]}" + ("" if text.endswith((".", "!", "?")) else ".")
 
 
 def _facts(state: NodeState) -> str:
@@ -278,7 +282,8 @@ def _facts(state: NodeState) -> str:
     if seen is None or not seen.n_poses:
         return ""
     told = [f"{seen.path_m:,.0f} m", f"{duration(seen.motion_s)} of motion"]
-    told += [f"result {duration(seen.result.age_s)} old"] if seen.result else []
+    if seen.result and not state.has_ended:
+        told.append(f"result {duration(seen.result.age_s)} old")
     return ", ".join(told)
 
 
@@ -301,7 +306,8 @@ def _bar(axis: str, state: NodeState) -> Bar:
         left = f"{duration(known.seconds_left)} left"
     tone, word = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, left
     wanted = amount(axis, known.target)
-    against = f"± {amount(axis, known.sigma)} of {wanted}"
+    sigma = amount(axis, known.sigma).removesuffix(f" {wanted.rpartition(' ')[2]}")
+    against = f"± {sigma} of {wanted}"
     if not math.isfinite(known.sigma):
         tone, word, against = Tone.UNKNOWN, "not seen yet", f"wanted: {wanted}"
     elif known.seconds_left == 0:
@@ -311,9 +317,11 @@ def _bar(axis: str, state: NodeState) -> Bar:
     difference = ""
     if at.comparison is not None and at.comparison.differences:
         row = at.comparison.differences[0].axes[axis]
-        sign = "+" * (row.difference >= 0)
-        difference = f"{sign}{amount(axis, row.difference)} ± {amount(axis, row.sigma)}"
-        difference = difference if math.isfinite(row.sigma) else "unknown"
+        unit, size = ("deg", math.degrees(1.0)) if axis in ROTATIONS else ("cm", 100.0)
+        told = with_sigma(size * row.difference, size * row.sigma, 1).replace("+/-", "±")
+        difference = (
+            f"{'+' * (row.difference >= 0)}{told} {unit}" if math.isfinite(row.sigma) else told
+        )
     is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
     meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""
     return Bar(_NAMES[axis], meaning, share, tone, word, against, difference)

@@ -51,13 +51,13 @@ _POLICY = (
 _POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
 
-# A vehicle from the side and its axes: x forward, y to the side, z up.
+# A vehicle from its left side, on which y points to whoever looks at it.
 _SKETCH = (
-    '<svg class="sketch" viewBox="0 0 170 92" role="img" aria-label="x forward, y sideways, z up">'
-    '<path class="body" d="M22 66v-20h24l10-16h40l8 16h12v20z"/><circle cx="44" cy="68" r="9"/>'
-    '<circle cx="98" cy="68" r="9"/><path d="M76 46h68m-7-5l7 5l-7 5M76 46V8m-5 7l5-7l5 7'
-    'M76 46L52 60m4-8l-4 8l9 0"/><text x="148" y="50">x</text><text x="84" y="14">z</text>'
-    '<text x="40" y="64">y</text></svg>'
+    '<svg class="sketch" viewBox="0 0 150 76" role="img" aria-label="x forward, y left, z up">'
+    '<path class="body" d="M34 58V40h22l12-15h42l8 15h24v18z"/><circle cx="54" cy="59" r="9"/>'
+    '<circle cx="124" cy="59" r="9"/><path d="M84 42H14m7-5l-7 5l7 5M84 42V6m-5 7l5-7l5 7'
+    'M84 42l10 28m-7-5l7 5l2-8"/><text x="2" y="47">x</text><text x="92" y="16">z</text>'
+    '<text x="100" y="74">y</text></svg>'
 )
 
 
@@ -216,8 +216,8 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def fragment(view: View, files: Sequence[str] = ()) -> str:
-    """Everything but the buttons, which stay in the page, so that none vanishes under a finger: the
-    attributes of the first element say which of them are shown.
+    """Everything but buttons and links, which stay in the page, so that none vanishes under a
+    finger: the attributes of the first element say which of them are shown.
 
     Parameters
     ----------
@@ -225,12 +225,12 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     files : sequence of str
         Saved files that the page may have.
     """
-    axes = "precision against the target"
+    axes = "precision of target"
+    axes += ", change from what is installed" * any(bar.difference for bar in view.bars)
     sketch = [_SKETCH] if any(bar.meaning for bar in view.bars) else []
     values = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
     reasons = (f"<li>{escape(reason)}</li>" for reason in view.reasons)
     result = [*map(_line, view.result[:1]), *_wrapped("ul", reasons), *map(_line, view.result[1:])]
-    links = (f'<a data-file="{escape(name)}" target="_blank">{escape(name)}</a> ' for name in files)
     topics = (f"<li>{escape(topic)}</li>" for topic in view.topics)
     sections = (
         _section("answer", "", [_line(view.answer)] if view.answer else []),
@@ -239,13 +239,13 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         _section("axes", "the mount, after ten minutes of motion", map(_line, view.watched)),
         '<div class="side">',
         _section("pose", view.title, _wrapped("dl", values)),
-        _section("health", "result and inputs", [*result, *links, *map(_line, view.health)]),
+        _section("health", "result and inputs", [*result, *map(_line, view.health)]),
         "</div>",
     )
     facts = f'<p class="facts">{escape(view.facts)}</p>' if view.facts else ""
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
-        f'data-by-hand="{escape(view.by_hand)}">'
+        f'data-by-hand="{escape(view.by_hand)}" data-files="{" ".join(files)}">'
         f'<p class="node">{escape(view.node or "no node")}</p>'
         f'<section class="headline"><h1>{_sign(view.tone)} {escape(view.word)}</h1>'
         f"<p>{escape(view.sentence)}</p>{facts}</section>{''.join(sections)}</div>"
@@ -265,14 +265,13 @@ def _wrapped(tag: str, parts: Iterable[str]) -> list[str]:
 
 
 def _bar(bar: Bar) -> str:
-    difference = f"from installed: {bar.difference}" if bar.difference else ""
+    difference = f"change: {bar.difference}" if bar.difference else ""
     return (
-        f'<div class="axis {bar.tone.name.lower()}"><b>{escape(bar.name)}</b>'
-        f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.name)}"></progress>'
+        f'<div class="axis {bar.tone.name.lower()}">'
+        f"<span><b>{escape(bar.name)}</b> {escape(bar.meaning)}</span>"
         f'<span class="state">{_sign(bar.tone)} {escape(bar.word)}</span>'
-        f'<span class="meaning">{escape(bar.meaning)}</span>'
-        f'<span class="against">{escape(bar.against)}</span>'
-        f'<span class="difference">{escape(difference)}</span></div>'
+        f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.name)}"></progress>'
+        f"<span>{escape(bar.against)}</span><span>{escape(difference)}</span></div>"
     )
 
 

@@ -25,18 +25,22 @@ const element = (more) => withClasses({
   addEventListener(name, run) { this.heard[name] = run; }, ...more});
 const withClasses = (one) => { one.classList = {toggle(name, on) {
   on ? one.classes.add(name) : one.classes.delete(name); }}; return one; };
+const anchors = [element({dataset: {file: "a"}, hidden: true})];
 const nodes = {connection: element(), footer: element(), view: element({
-  innerHTML: "", links: [], querySelectorAll() { return this.links; },
-  querySelector() {
+  innerHTML: "",
+  querySelector(what) {
+    if (what === ".headline") return {innerText: this.innerHTML};
     return {textContent: this.innerHTML.match(/<h1>(.*?)<.h1>/)[1].replace(/<[^>]*>/g, "")};
   }})};
-for (const id of ["by-hand", "sound", "asked", "unit", "icon"]) nodes[id] = element();
-const shown = {buttons: "solve save reset", byHand: ""};
+for (const id of ["by-hand", "files", "sound", "asked", "unit", "icon", "said"])
+  nodes[id] = element();
+const shown = {buttons: "solve save reset", byHand: "", files: ""};
 nodes.state = {className: "busy", dataset: shown};
 const keys = ["solve", "save", "reset"].map((request) => element(
   {dataset: request === "reset" ? {request, sure: "Forget all poses?"} : {request}}));
 globalThis.document = {title: "", getElementById: (id) => nodes[id], visibilityState: "visible",
-  addEventListener() {}, querySelector: () => nodes.footer, querySelectorAll: () => keys};
+  addEventListener() {}, querySelector: () => nodes.footer,
+  querySelectorAll: (what) => what.startsWith("a") ? anchors : keys};
 globalThis.FormData = class {
   *[Symbol.iterator]() { yield ["value", "1.85"]; yield ["sigma", "0.02"]; }
 };
@@ -58,7 +62,7 @@ const state = () => ({...log, posts: [...log.posts],
   title: document.title, said: nodes.connection.textContent,
   lost: nodes.connection.classes.has("lost"), footer: nodes.footer.hidden,
   form: nodes["by-hand"].hidden, hidden: keys.map((key) => key.hidden),
-  main: keys.map((key) => key.classes.has("main")), link: nodes.view.links[0]?.href,
+  main: keys.map((key) => key.classes.has("main")), link: anchors[0].hidden || anchors[0].href,
   disabled: keys.every((button) => button.disabled)});
 """
 
@@ -84,6 +88,7 @@ def test_the_script_finds_what_it_looks_for():
     page = Found(PAGE)
     assert set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
     assert set(re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)) <= set(page.tags)
+    assert page.data["data-file"] == list(web.SAVED)
     assert sorted(page.data["data-request"]) == sorted(web.BUTTONS)
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
     assert len(page.data["data-sure"]) == 2
@@ -114,20 +119,22 @@ def test_the_page_shows_what_comes_and_says_when_nothing_comes():
             "now = 9500; tick();",
             f"now = 9800; events.onmessage({{data: {go_on}}});",
             "events.onerror(); now = 10800; tick();",
+            "answer = {status: 403}; events.onerror(); await null; now = 11800; tick();",
         ]
     )
     opened, title, said = ([each[key] for each in states] for key in ("opened", "title", "said"))
-    assert opened == [1, 1, 1, 1, 2, 2, 2, 3]
+    assert opened == [1, 1, 1, 1, 2, 2, 2, 3, 4]
     assert states[0]["last"] == "events?key=word"
     assert title[1:4] == ["▶ GO ON", "MOUNT MOVED", "MOUNT MOVED"]
-    assert [each["shaken"] for each in states] == [0, 1, 2, 2, 2, 2, 3, 3]
+    assert [each["shaken"] for each in states] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
     assert [each["footer"] for each in states][1:3] == [False, True]
-    assert [each["disabled"] for each in states] == [False] * 4 + [True, True, False, True]
+    assert [each["disabled"] for each in states] == [False] * 4 + [True, True, False, True, True]
     assert said[3:6] == [
         "✓ connected",
         "✗ NO CONNECTION for 0 s, trying again ...",
         "✗ NO CONNECTION for 0 s, trying again ...",
     ]
+    assert said[8].startswith("✗ OLD ADDRESS: watch was started again")
     assert [each["lost"] for each in states][3:7] == [False, True, True, False]
 
 
@@ -151,7 +158,7 @@ def test_buttons_are_asked_for_by_their_addresses():
 
 def test_what_is_to_be_pressed_first_stands_out_and_an_axis_can_be_given_by_hand():
     go_on = "events.onmessage({data: '<h1>GO ON</h1>'});"
-    linked = "nodes.view.links = [{dataset: {file: 'a'}}];"
+    linked = "shown.files = 'a b';"
     states = played(
         [
             go_on,
@@ -162,6 +169,6 @@ def test_what_is_to_be_pressed_first_stands_out_and_an_axis_can_be_given_by_hand
     )
     assert [each["main"] for each in states[:2]] == [[False] * 3, [False, True, False]]
     assert [each["hidden"] for each in states[:2]] == [[False] * 3, [False, False, True]]
-    assert states[1]["link"] == "a?key=word"
+    assert [each["link"] for each in states[:2]] == [True, "a?key=word"]
     assert [each["form"] for each in states] == [True, True, False, False]
     assert states[3]["posts"] == ["POST prior?key=word&value=1.85&sigma=0.02&axis=z"]

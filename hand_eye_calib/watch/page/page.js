@@ -4,14 +4,14 @@
 const address = new URLSearchParams(location.search);
 const part = (id) => document.getElementById(id);
 const view = part("view"), connection = part("connection"), form = part("by-hand");
-const sound = part("sound");
+const sound = part("sound"), links = document.querySelectorAll("a[data-file]");
 const footer = document.querySelector("footer");
 const buttons = document.querySelectorAll("button[data-request]");
 
 // The server sends something every second. A connection that is silent for longer is opened anew:
 // a phone that was asleep or out of reach does not notice by itself.
 const SILENT_MS = 4000, RETRY_MS = 1000;
-let source = null, heardAt = 0, lostAt = null, tones = null;
+let source = null, heardAt = 0, lostAt = null, isOld = false, tones = null;
 
 const ICONS = {good: "#11703a", busy: "#0b5cad", act: "#c77700", bad: "#b3211c", unknown: "#6b4a8a"};
 
@@ -20,8 +20,9 @@ function show(isLive) {
   if (isLive) lostAt = null;
   const seconds = lostAt === null ? 0 : Math.round((Date.now() - lostAt) / 1000);
   connection.classList.toggle("lost", !isLive);
-  connection.textContent = isLive
-    ? "✓ connected" : `✗ NO CONNECTION for ${seconds} s, trying again ...`;
+  connection.textContent = isLive ? "✓ connected"
+    : isOld ? "✗ OLD ADDRESS: watch was started again, open the address that it shows now"
+    : `✗ NO CONNECTION for ${seconds} s, trying again ...`;
   for (const button of buttons) button.disabled = !isLive;
 }
 
@@ -45,17 +46,21 @@ function put(html) {
     button.hidden = !shown.includes(button.dataset.request);
     button.classList.toggle("main", button.dataset.request === shown[0] && shown[0] !== "solve");
   }
-  footer.hidden = shown[0] === "";
+  footer.hidden = ["", "reset"].includes(shown[0]);
+  part("files").hidden = state.dataset.files === "";
   form.hidden = state.dataset.byHand === "";
   if (!form.hidden) {
     part("asked").textContent = state.dataset.byHand;
     part("unit").textContent = "xyz".includes(state.dataset.byHand) ? "m" : "deg";
   }
-  for (const link of view.querySelectorAll("a[data-file]")) {
-    link.href = link.dataset.file + "?" + address;
+  for (const link of links) {
+    link.hidden = !state.dataset.files.split(" ").includes(link.dataset.file);
   }
   const word = view.querySelector("h1").textContent;
-  if (word !== document.title) call(state.className);
+  if (word !== document.title) {
+    call(state.className);
+    part("said").textContent = view.querySelector(".headline").innerText;
+  }
   document.title = word;
   const colour = encodeURIComponent(ICONS[state.className]);
   part("icon").href = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' "
@@ -71,7 +76,14 @@ function connect() {
     show(true);
     if (event.data) put(event.data);
   };
-  source.onerror = () => { source.close(); show(false); };
+  source.onerror = () => { source.close(); show(false); look(); };
+}
+
+// A server that was started again has another key, which no reconnecting finds.
+async function look() {
+  try {
+    isOld = (await fetch("page.html?" + address, {method: "GET"})).status === 403;
+  } catch (error) { isOld = false; }
 }
 
 setInterval(() => {
@@ -86,6 +98,7 @@ async function post(request, more = "") {
   } catch (error) { show(false); }
 }
 
+for (const link of links) link.href = link.dataset.file + "?" + address;
 for (const button of buttons) {
   button.addEventListener("click", () => {
     if (button.dataset.sure && !confirm(button.dataset.sure)) return;
@@ -104,7 +117,7 @@ form.addEventListener("submit", (event) => {
 // https or from the same computer.
 sound.addEventListener("click", () => {
   tones = tones === null ? new AudioContext() : null;
-  sound.textContent = tones ? "Sound on" : "Sound off";
+  sound.textContent = tones ? "Sound: on" : "Sound: off";
   sound.setAttribute("aria-pressed", String(tones !== null));
 });
 
