@@ -89,6 +89,7 @@ setup(
     package_data={
         name: ["py.typed"],
         f"{name}.report": ["templates/*.html", "templates/*.css"],
+        f"{name}.io": ["templates/*"],
         f"{name}.results": ["*.yaml"],
         f"{name}.watch": ["page/*"],
     },

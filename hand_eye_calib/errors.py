@@ -5,6 +5,8 @@ line and node print it as it is. Anything else that escapes is a defect of the p
 traceback.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -51,6 +53,15 @@ class NotEnoughDataError(InputError):
 
 class MissingDependencyError(HandEyeCalibError, ImportError):
     """An optional package is needed for what was asked and is not installed."""
+
+
+@contextmanager
+def located(where: object) -> Iterator[None]:
+    """Begins the errors that are raised in the block with where it was, such as a path."""
+    try:
+        yield
+    except HandEyeCalibError as error:
+        raise type(error)(f"{where}: {error}") from None
 
 
 def required(module: str, purpose: str, install: str) -> Any:

@@ -115,16 +115,15 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Any]) -
     topic and stamp.
     """
     columns = (poses.streams, poses.sensor_frames, poses.stamps_ns, poses.poses)
-    row = 0
-    try:
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        for row, (stream, frame, stamp_ns, pose) in enumerate(rows):  # noqa: B007
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    for stream, frame, stamp_ns, pose in rows:
+        try:
             if frame is not None:
                 calibrator.set_frame(stream, frame)
             calibrator.add_pose(stream, stamp_ns, pose[:3], pose[3:])
-    except InputError as error:
-        at = seconds(poses.stamps_ns[row])
-        raise InputError(f"{topics[poses.streams[row]]}, stamp {at}: {error}") from error
+        except InputError as error:
+            at = f"{topics[stream]}, stamp {seconds(stamp_ns)}"
+            raise InputError(f"{at}: {error}") from error
 
 
 def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> None:

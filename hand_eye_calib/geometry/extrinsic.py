@@ -43,10 +43,15 @@ class Extrinsic:
         return np.r_[self.T_parent_child[:3, 3], rpy]
 
 
+def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariances (..., 6, 6) along and about axes that rotations (..., 3, 3) turn theirs to."""
+    both = np.kron(np.eye(2), rotation)
+    return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
+
+
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
     """Standard deviations (6,) along and about the parent's axes."""
-    to_parent = np.kron(np.eye(2), rotation_parent_child)
-    variances = np.diag(to_parent @ covariance @ to_parent.T)
+    variances = np.diag(turned(rotation_parent_child, covariance))
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 

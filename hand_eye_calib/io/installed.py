@@ -13,7 +13,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import EXPORT_FORMATS
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError, InputError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.geometry.frames import FrameTree, numbers_of, pose_of
@@ -77,10 +77,8 @@ def stated(
     """The installed pose that a source finds by the names of both frames; if it does not, an
     InputError that begins with the origin.
     """
-    try:
+    with located(origin):
         return Extrinsic(find(parent_frame, child_frame), origin)
-    except InputError as error:
-        raise InputError(f"{origin}: {error}") from None
 
 
 def frames_of_bag(path: str | Path) -> FrameTree:
@@ -206,10 +204,8 @@ def read_urdf(path: str | Path) -> FrameTree:
     xacro in it, as nobody can tell where in such a file a value comes from.
     """
     data = read_bytes(path)
-    try:
+    with located(path):
         return _frames(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _frames(data: bytes) -> FrameTree:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from hand_eye_calib.errors import InputError, printable
+from hand_eye_calib.errors import InputError, located, printable
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
@@ -174,10 +174,8 @@ def load_result(path: str | Path) -> Calibration:
             raise InputError(f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}")
         path = path / FILE_NAME
     document = read_yaml(path)
-    try:
+    with located(path):
         return Calibration.from_dict(document)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _xacro_text(calibration: Calibration) -> str:
@@ -194,54 +192,27 @@ def _xacro_text(calibration: Calibration) -> str:
     )
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
     comment = re.sub("-(?=-)", "- ", comment)  # no comment may hold two hyphens
-    return f"""\
-<?xml version="1.0" encoding="UTF-8"?>
-<!-- Include this file in the robot's description, which has both links.
-{comment} -->
-<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <joint name={joint} type="fixed">
-    <parent link={parent}/>
-    <child link={child}/>
-    <origin xyz="{xyz}" rpy="{rpy}"/>
-  </joint>
-</robot>
-"""
-
-
-_NODE = """\
-            Node(
-                package='tf2_ros',
-                executable='static_transform_publisher',
-                arguments={},
-            ),
-"""
+    return _template(XACRO_NAME).format(
+        comment=comment, joint=joint, parent=parent, child=child, xyz=xyz, rpy=rpy
+    )
 
 
 def _launch_text(calibrations: Sequence[Calibration]) -> str:
     """A launch file that publishes extrinsics as static transforms."""
     comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
-    nodes = ""
+    transforms = []
     for calibration in calibrations:
         frames = printable(calibration.mounting[0]), printable(calibration.child_frame)
         arguments = ["--frame-id", frames[0], "--child-frame-id", frames[1]]
         for name, value in usable_numbers(calibration).items():
             text = value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
             arguments += [f"--{name}", text]
-        nodes += _NODE.format(arguments)
-    return f"""\
-# Publishes the extrinsic on /tf_static. Only if no robot description has this edge: a frame has one
-# parent and one publisher.
-{comment}
-from launch import LaunchDescription
-from launch_ros.actions import Node
+        transforms.append(f"    {arguments},")
+    return _template(LAUNCH_NAME).format(comment=comment, transforms="\n".join(transforms))
 
 
-def generate_launch_description():
-    return LaunchDescription(
-        [
-{nodes}        ]
-    )
-"""
+def _template(name: str) -> str:
+    return Path(__file__).with_name("templates").joinpath(f"{name}.in").read_text("utf-8")
 
 
 def _remarks(calibration: Calibration) -> list[str]:

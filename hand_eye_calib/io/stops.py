@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of
 from hand_eye_calib.io.yaml_files import read_yaml
@@ -81,10 +81,8 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
         raise InputError(f"{path}: expected {_EXPECTED}")
     poses = []
     for number, sample in enumerate(document, 1):
-        try:
+        with located(f"{path}, sample {number}"):
             poses.append([pose_of(value) for value in _pair(sample)])
-        except InputError as error:
-            raise InputError(f"{path}, sample {number}: {error}") from None
     robot, tracking = np.swapaxes(poses, 0, 1)
     return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
 

@@ -8,7 +8,7 @@ from typing import Any
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, StreamStatistics
 from hand_eye_calib.engine.snapshot import STREAMS
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, located
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.journal import Journal, has_session, read_journal
 from hand_eye_calib.live.journal import SessionJournal
@@ -34,7 +34,7 @@ def give(journal: Journal, directory: Path, engines: Engines) -> None:
     InputError
         If they do not take it.
     """
-    try:
+    with located(f"cannot use the session journal {directory}"):
         for stream, about in journal.about.items():
             for own_stream, engine in takers(stream, engines) if about.get("frame") else ():
                 engine.set_frame(own_stream, about["frame"])
@@ -42,8 +42,6 @@ def give(journal: Journal, directory: Path, engines: Engines) -> None:
         for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
             for own_stream, engine in takers(stream, engines):
                 engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
-    except InputError as error:
-        raise InputError(f"cannot use the session journal {directory}: {error}") from None
 
 
 class LiveSession:

@@ -21,10 +21,6 @@ _VERSION = 1
 # Variances (m^2, rad^2) of directions that are unknown are larger.
 _UNKNOWN = 1.0
 
-# Share of an answer's variance that errors of the first sensor explain, at most: no other sensor is
-# without errors.
-_MOST_SHARED = 0.9
-
 # Variance (m^2, rad^2) that no answer is better than: that of poses without noise is zero.
 _ROUNDING = 1e-16
 
@@ -146,43 +142,26 @@ class RigCalibration:
         steps = np.linalg.solve(information.reshape(6 * K, 6 * K), pulled.ravel())
         return np.asarray(steps.reshape(K, 6))
 
-    @cached_property
-    def _own(self) -> FloatArray:
-        """Covariances (S, 6, 6), in the frame of the first sensor, of what the errors of each
-        sensor add to its answers.
-
-        An answer for two sensors has the errors of both, so that half of what two answers with the
-        first sensor have more than the answer for their other sensors is the first one's.
-        """
-        of_first = [_moved(each, X) for each, X in zip(self.calibrations, self.Xs[1:], strict=True)]
-        between = [_moved(each, X) for each, X in zip(self.neighbours, self.Xs[2:], strict=True)]
-        three = zip(of_first, of_first[1:], between, strict=False)
-        shared = np.mean([0.5 * (a + b - c) for a, b, c in three], axis=0)
-        own = []
-        for covariance in of_first:
-            root = np.linalg.cholesky(covariance)
-            values, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, shared).T))
-            axes, kept = root @ axes, 1.0 - np.clip(values, 0.0, _MOST_SHARED)
-            own.append((axes * kept) @ axes.T)
-        return np.array([np.mean(np.array(of_first) - own, axis=0), *own])
-
     def T(self, first: str, second: str) -> FloatArray:
         """Pose (4, 4) of the second sensor in the frame of the first."""
         before, after = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
         return se3.inverse(before) @ after
 
     def covariance(self, first: str, second: str) -> FloatArray:
-        """Covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``, m and rad."""
-        before, after = self.sensors.index(first), self.sensors.index(second)
-        if before == after:
+        """Covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``, m and rad.
+
+        It is that of the answer for both. Without one it is the sum of those with the first sensor:
+        rather too large, as it has that sensor's errors twice.
+        """
+        near, far = sorted(map(self.sensors.index, (first, second)))
+        if near == far:
             return np.zeros((6, 6))
-        if 0 in (before, after):
-            other = before + after
-            in_first = _moved(self.calibrations[other - 1], self.Xs[other])
-        else:
-            in_first = self._own[before] + self._own[after]
-        to_second = se3.adjoint(se3.inverse(self.Xs[after]))
-        return to_second @ in_first @ to_second.T
+        answers = [(self.calibrations[at - 1], self.Xs[at]) for at in (near, far) if at]
+        if 0 < near == far - 1:
+            answers = [(self.neighbours[near - 1], self.Xs[far])]
+        to_second = se3.adjoint(self.T(second, self.sensors[0]))
+        in_first = np.sum([_moved(*each) for each in answers], axis=0)
+        return np.asarray(to_second @ in_first @ to_second.T)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain values."""

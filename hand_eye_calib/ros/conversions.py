@@ -3,7 +3,6 @@
 from importlib import import_module
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -11,6 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import turned
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.results.calibration import Calibration
 
@@ -101,8 +101,7 @@ def covariance_about_parent_axes(
     To first order it moves the child's origin by ``R rho`` and rotates the child by ``R phi`` about
     the parent's axes through that origin. Both blocks are rotated; there is no lever arm.
     """
-    to_parent = np.kron(np.eye(2), T_parent_child[:3, :3])
-    return np.asarray(to_parent @ cov_parent_child_in_child @ to_parent.T)
+    return turned(T_parent_child[:3, :3], cov_parent_child_in_child)
 
 
 def _put(T_target_source: FloatArray, place: Any, turn: Any) -> None:

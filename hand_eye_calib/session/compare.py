@@ -10,7 +10,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_recordings
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.geometry.extrinsic import Extrinsic, turned
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.context import AxisDifference, Comparison, Difference
 from hand_eye_calib.results.status import AXES
@@ -131,13 +131,13 @@ def _spread(given: Calibration | Extrinsic) -> FloatArray:
     """Covariance (6, 6) along and about the parent's axes, how recordings of its rig scatter, and
     its floor, stacked.
     """
-    to_parent = np.kron(np.eye(2), given.T_parent_child[:3, :3])
+    rotation = given.T_parent_child[:3, :3]
     covariance, floor = np.diag(UNKNOWN**2), np.zeros((6, 6))
     if np.isfinite(given.covariance).all():
-        covariance = to_parent @ given.covariance @ to_parent.T
+        covariance = turned(rotation, given.covariance)
     if isinstance(given, Calibration):
         hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
         covariance = covariance + np.diag(np.where(hidden, UNKNOWN**2, 0.0))
-        floor = to_parent @ given.floor @ to_parent.T
+        floor = turned(rotation, given.floor)
     scatter = scatter_of_recordings(covariance) if _is_found(given) else np.zeros((6, 6))
     return np.array([covariance, scatter, floor])

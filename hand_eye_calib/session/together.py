@@ -13,7 +13,8 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import combined
 from hand_eye_calib.assessment.moved import scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.errors import HandEyeCalibError, InputError
+from hand_eye_calib.errors import HandEyeCalibError, InputError, located
+from hand_eye_calib.geometry.extrinsic import turned
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import (
     Calibration,
@@ -77,10 +78,8 @@ def calibrate_together(
     """
     results: dict[str, Calibration] = {}
     for name, pair in zip(_named(names), recordings, strict=False):
-        try:
+        with located(name):
             results[name] = calibrate(*pair, **options)
-        except HandEyeCalibError as error:
-            raise type(error)(f"{name}: {error}") from None
     return together(results)
 
 
@@ -193,9 +192,7 @@ def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) ->
     level is that of :func:`agreement_of`.
     """
     Ts = np.array([each.T_parent_child for each in results])
-    to_parent = np.kron(np.eye(2), Ts[:, :3, :3])
-    covariances = np.array([each.covariance for each in results])
-    covariances = to_parent @ covariances @ np.swapaxes(to_parent, 1, 2)
+    covariances = turned(Ts[:, :3, :3], np.array([each.covariance for each in results]))
     usual = [np.diag(scatter_of_recordings(each)) for each in covariances]
     return agreement_of(Ts, covariances, np.sqrt(np.median(usual, axis=0)), level)
 
@@ -222,7 +219,6 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
 def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> Calibration:
     """The result of recordings that belong together."""
     T = found.T_parent_child
-    to_child = np.kron(np.eye(2), T[:3, :3].T)
     covariance, by_prior = found.covariance.copy(), set()
     for axis, name in enumerate(AXES):
         known = [one.observability[axis] for one in used if math.isfinite(one.sigmas[axis])]
@@ -231,7 +227,7 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
             by_prior.add(name)
             least = min(dof.sigma for dof in known)
             covariance[axis, axis] = max(covariance[axis, axis], least**2)
-    covariance = to_child @ covariance @ to_child.T
+    covariance = turned(T[:3, :3].T, covariance)
     assessed = combined(T, covariance, None, unknown_directions(covariance))
     observability = tuple(
         replace(dof, verdict=DofVerdict.PRIOR) if dof.name in by_prior else dof

@@ -186,12 +186,16 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     save_result(written, tmp_path)
     text = (tmp_path / "static_transform.launch.py").read_text(encoding="utf-8")
     compile(text, "static_transform.launch.py", "exec")
-    calls = {node.func.id: node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)}
+    tree = ast.parse(text)
+    calls = {node.func.id: node for node in ast.walk(tree) if isinstance(node, ast.Call)}
     assert set(calls) == {"LaunchDescription", "Node"}
+    (transforms,) = (ast.literal_eval(one.value) for one in tree.body if hasattr(one, "value"))
     assert f"# {written.headline}\n" in text
-    node = {keyword.arg: ast.literal_eval(keyword.value) for keyword in calls["Node"].keywords}
-    assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
-    options = dict(zip(node["arguments"][::2], node["arguments"][1::2], strict=True))
+    node = {keyword.arg: ast.unparse(keyword.value) for keyword in calls["Node"].keywords}
+    program = {"package": "'tf2_ros'", "executable": "'static_transform_publisher'"}
+    assert node == program | {"arguments": "each"}
+    (arguments,) = transforms
+    options = dict(zip(arguments[::2], arguments[1::2], strict=True))
     assert (options.pop("--frame-id"), options.pop("--child-frame-id")) == (
         written.parent_frame,
         written.child_frame,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError, InputError, printable
+from hand_eye_calib.errors import ConfigError, InputError, located, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
 from hand_eye_calib.io.bags.messages import (
@@ -191,10 +191,8 @@ class ImageReading(Reading):
 
     def take(self, run: Run) -> None:
         for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
-            try:
+            with located(self.topics[0]):
                 is_seen = self._finder.look(grey_of(message))
-            except InputError as error:
-                raise InputError(f"{self.topics[0]}: {error}") from None
             if is_seen:
                 self._stamps_ns.append(ns_of(message.header.stamp) or 0)
                 self._bag_ns.append(bag_ns)
