@@ -211,7 +211,7 @@ def log_ratio(H: FloatArray, S: FloatArray, shift: FloatArray | None = None) -> 
 def solve(H: FloatArray, S: FloatArray) -> FloatArray:
     """``H^-1 S`` (..., n) of matrices (..., n, n)."""
     # As many dimensions as the matrices: else NumPy 1 takes the columns for vectors.
-    columns = np.broadcast_to(S, H.shape[:-1])[..., None]
+    columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[..., None]
     return np.asarray(np.linalg.solve(H, columns)[..., 0])
 
 
@@ -284,21 +284,25 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
         X0, near the extrinsic.
     """
     starts_ns, H, S = _by_second(pose_pairs, T_parent_child)
-    S = _about_answer(H, S)
+    # Scores of shifts from the answer of all of them, to first order.
+    S = S - H @ (_inverse(H.sum(axis=0)) @ S.sum(axis=0))
     cuts = [np.arange(n) * len(S) // n for n in _WINDOWS if len(S) >= n * _LEAST_WINDOW_S]
     if not cuts:
         return None
     long_run = 1.0
     for edges in cuts:  # the least of all splits, about the answers of their sides
         H_of, S_of = np.add.reduceat(H, edges), np.add.reduceat(S, edges)
-        rests = [
-            np.concatenate([_about_answer(H_of[:k], S_of[:k]), _about_answer(H_of[k:], S_of[k:])])
-            for k in range(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
-        ]
+        splits = np.arange(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
+        before = [np.cumsum(each, axis=0)[splits - 1] for each in (H_of, S_of)]
+        sides = before, [H_of.sum(axis=0) - before[0], S_of.sum(axis=0) - before[1]]
+        answers = np.stack([(_inverse(one) @ two[..., None])[..., 0] for one, two in sides], axis=1)
+        is_after = (np.arange(len(edges)) >= splits[:, None]).astype(int)
+        own = answers[np.arange(len(splits))[:, None], is_after]
+        rests = S_of - (H_of @ own[..., None])[..., 0]
         # Mean of S' H^-1 S of scores about two answers, per degree of freedom.
         seen = np.trace(H_of, axis1=1, axis2=2) > 0
-        squared = [squared_shift(H_of[seen], rest[seen], 1e-6).sum() for rest in rests]
-        long_run = max(long_run, float(min(squared)) / max(6 * seen.sum() - 12, 1))
+        squared = squared_shift(H_of[seen], rests[:, seen], 1e-6).sum(axis=1)
+        long_run = max(long_run, float(squared.min()) / max(6 * seen.sum() - 12, 1))
     before_H, before_S = np.cumsum(H, axis=0)[:-1], np.cumsum(S, axis=0)[:-1]
     after_H, after_S = H.sum(axis=0) - before_H, S.sum(axis=0) - before_S
     # The common answer is free.
@@ -335,11 +339,6 @@ def _by_second(
     np.add.at(H, blocks, whitened @ jacobians)
     np.add.at(S, blocks, -np.einsum("kij,kj->ki", whitened, residuals))
     return stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS, H, S
-
-
-def _about_answer(H: FloatArray, S: FloatArray) -> FloatArray:
-    """Scores of shifts from the answer of all of them, to first order."""
-    return np.asarray(S - H @ (_inverse(H.sum(axis=0)) @ S.sum(axis=0)))
 
 
 def _inverse(H: FloatArray) -> FloatArray:

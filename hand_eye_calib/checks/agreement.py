@@ -73,7 +73,7 @@ _SHARE = 0.9
 
 # Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
 # compared: a hundredth of them, at least and at most so many.
-_NEAREST = (40, 1000)
+_NEAREST = (40, 300)
 
 
 def check_agreement(

@@ -30,11 +30,11 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import (
     MotionPairs,
     PosePairs,
-    pairs_between,
+    motions,
     pairs_over,
     synchronise,
 )
-from hand_eye_calib.stats import median, robust_sigma
+from hand_eye_calib.stats import medians, robust_sigmas
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
 # so many at most, and in closed form.
@@ -255,15 +255,14 @@ def _or_rival(
     most = min(limit, plain.fit.unexplained / _DECISIVE)
     if plain.fit.unexplained < EXPLAINED:
         return plain
-    pairs = streams.pairs(lag_s, _MAX_ROUGH)
-    rows, n_pairs = np.concatenate([pairs.i, pairs.j]), len(pairs)
-    few = streams.synchronised[rows]
-    tried = []
-    for rival in rivals:
-        poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
-        motions = pairs_between(*poses, np.arange(n_pairs), np.arange(n_pairs) + n_pairs)
-        if _left_unexplained(motions) < _ROUGHLY * most:
-            tried.append(_fitted(rival, streams, lag_s))
+    pairs, rivals = streams.pairs(lag_s, _MAX_ROUGH), [*rivals]
+    few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
+    moved = []
+    for stream, Ts in (("parent", few.Ts_pw_p), ("child", few.Ts_cw_c)):
+        corrected = np.stack([rival.corrected(stream, Ts) for rival in rivals])
+        moved.append(motions(*np.split(corrected, 2, axis=1)))
+    left = zip(rivals, _left_unexplained(*moved), strict=True)
+    tried = [_fitted(rival, streams, lag_s) for rival, share in left if share < _ROUGHLY * most]
     least = min((each.fit.unexplained for each in tried), default=np.inf)
     if least >= most:
         return plain
@@ -283,45 +282,48 @@ def _fitted(
     return Explanation(hypothesis, fit, same_unit=same_unit)
 
 
-def _left_unexplained(pairs: MotionPairs) -> float:
-    """About the share of the motion that no extrinsic and scale explain, in closed form."""
-    A, B = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
-    a, b = se3.rotation_log(A[:, :3, :3]), se3.rotation_log(B[:, :3, :3])
-    # No extrinsic changes an angle: where angles differ, one is of a jump.
-    apart = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
-    kept = a * (apart <= 3.0 * median(apart))[:, None]
-    rotation = se3.nearest_rotation(kept.T @ b)
-    # The rotations may leave the angle about their main axis open: the translations show it then.
-    axis = np.linalg.eigh(kept.T @ kept)[1][:, -1]
-    chords, moved = A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ rotation.T
-    along = moved @ np.outer(axis, axis)
-    columns = np.stack([along - moved, np.cross(moved, axis), -along], axis=2)
-    of_path = _fit_robustly(np.concatenate([chords, columns], axis=2), -A[:, :3, 3])[0]
-    shares = []
-    for angle in (0.0, np.arctan2(of_path[4], of_path[3])):
-        turned = se3.rotation_exp(angle * axis)
-        column = -(moved @ turned.T)[:, :, None]
-        x, left_m = _fit_robustly(np.concatenate([chords, column], axis=2), -A[:, :3, 3])
-        left_rad = robust_sigma(a - b @ (turned @ rotation).T)
-        size_m = min(np.linalg.norm(A[:, :3, 3]), max(x[3], 0.0) * np.linalg.norm(moved))
-        size_rad = np.linalg.norm(a)
-        shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (size_rad + 1e-12)))
-    return float(min(shares) * np.sqrt(len(pairs)))
-
-
-def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
-    """Unknowns (p,) of the equations ``rows @ x = target`` of (K, 3, p) and (K, 3), of which some
-    are far off, and the standard deviation per axis of what is left.
+def _left_unexplained(A: FloatArray, B: FloatArray) -> FloatArray:
+    """About the share of the motion that no extrinsic and scale explain, in closed form: (H,) of H
+    sets (H, K, 4, 4) of motions each of parent and child.
     """
-    both, weights = np.concatenate([rows, target[:, :, None]], axis=2), np.ones(len(rows))
+    (a, t_a), (b, t_b) = ((se3.rotation_log(Ts[..., :3, :3]), Ts[..., :3, 3]) for Ts in (A, B))
+    # No extrinsic changes an angle: where angles differ, one is of a jump.
+    apart = np.abs(np.linalg.norm(a, axis=-1) - np.linalg.norm(b, axis=-1))
+    kept = a * (apart <= 3.0 * medians(apart)[:, None])[..., None]
+    back = np.swapaxes(se3.nearest_rotation(np.swapaxes(kept, 1, 2) @ b), 1, 2)
+    # The rotations may leave the angle about their main axis open: the translations show it then.
+    axis = np.linalg.eigh(np.swapaxes(kept, 1, 2) @ kept)[1][..., -1]
+    chords, moved = A[..., :3, :3] - np.eye(3), t_b @ back
+    along = (moved @ axis[..., None]) * axis[:, None]
+    columns = np.stack([along - moved, np.cross(moved, axis[:, None]), -along], axis=-1)
+    of_path, _ = _fit_robustly(np.concatenate([chords, columns], axis=-1), -t_a)
+    shares = []
+    for angle in (np.zeros(len(A)), np.arctan2(of_path[:, 4], of_path[:, 3])):
+        turned = np.swapaxes(se3.rotation_exp(angle[:, None] * axis), 1, 2)
+        column = -(moved @ turned)[..., None]
+        x, left_m = _fit_robustly(np.concatenate([chords, column], axis=-1), -t_a)
+        left_rad = robust_sigmas(a - b @ back @ turned)
+        sizes_m = np.linalg.norm(t_a, axis=(1, 2)), np.linalg.norm(moved, axis=(1, 2))
+        size_m = np.minimum(sizes_m[0], np.maximum(x[:, 3], 0.0) * sizes_m[1])
+        size_rad = np.linalg.norm(a, axis=(1, 2))
+        shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (size_rad + 1e-12)))
+    return np.asarray(np.minimum(*shares) * np.sqrt(A.shape[1]))
+
+
+def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unknowns (H, p) of the equations ``rows @ x = target`` of (H, K, 3, p) and (H, K, 3), of
+    which some are far off, and the standard deviations (H,) per axis of what is left.
+    """
+    both, weights = np.concatenate([rows, target[..., None]], axis=-1), np.ones(target.shape[:2])
     for _ in range(_ROUNDS):
-        flat = (weights[:, None, None] * both).reshape(-1, both.shape[2])
-        products = flat.T @ flat
-        x = np.linalg.pinv(products[:-1, :-1], rcond=1e-12, hermitian=True) @ products[:-1, -1]
-        left = rows @ x - target
-        sigma = robust_sigma(left)
-        weights = 1.0 / (1.0 + (left**2).sum(axis=1) / (6.0 * sigma + 1e-12) ** 2)
-    return x, sigma
+        flat = (weights[..., None, None] * both).reshape(len(both), -1, both.shape[-1])
+        products = np.swapaxes(flat, 1, 2) @ flat
+        inverse = np.linalg.pinv(products[:, :-1, :-1], rcond=1e-12, hermitian=True)
+        x = (inverse @ products[:, :-1, -1:])[..., 0]
+        left = (rows @ x[:, None, :, None])[..., 0] - target
+        sigmas = robust_sigmas(left)
+        weights = 1.0 / (1.0 + (left**2).sum(axis=-1) / (6.0 * sigmas[:, None] + 1e-12) ** 2)
+    return x, sigmas
 
 
 def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:

@@ -48,45 +48,36 @@ class Fitted:
 
 
 class Regression:
-    """Robust linear regression of rows (K, r), in standard deviations, on named groups of columns
-    (K, r, m), those of ``base`` in every fit. Rows are in order of time.
+    """Robust linear regression of rows (K, r, p + 1), in standard deviations, the values last, on
+    groups of the p columns: by name, where they are; those of ``base`` in every fit. Rows are in
+    order of time.
     """
 
     def __init__(
-        self,
-        target: FloatArray,
-        columns: Mapping[str, FloatArray],
-        base: Sequence[str],
-        noise: float,
+        self, rows: FloatArray, where: Mapping[str, list[int]], base: Sequence[str], noise: float
     ) -> None:
-        ends = np.cumsum([column.shape[2] for column in columns.values()])
-        self._where = {
-            name: list(range(end - column.shape[2], end))
-            for (name, column), end in zip(columns.items(), ends.tolist(), strict=True)
-        }
-        self._base = list(base)
-        flat = np.concatenate([*columns.values(), target[:, :, None]], axis=2)
-        known = np.concatenate([flat[:, :, self._columns()], target[:, :, None]], axis=2)
-        weights = np.ones(len(flat))
+        self._where, self._base = where, list(base)
+        n_rows, size, n_columns = rows.shape
+        known = rows.reshape(-1, n_columns)[:, [*self._columns(), n_columns - 1]]
+        weights = np.ones(n_rows)
         for _ in range(_ROUNDS):
-            products = np.tensordot(known * weights[:, None, None], known, axes=((0, 1), (0, 1)))
+            products = (known * np.repeat(weights, size)[:, None]).T @ known
             values = _solved(products, list(range(len(products) - 1)))
-            lengths = np.linalg.norm(target - known[:, :, :-1] @ values, axis=1)
-            self._sigma = max(median(lengths) / np.sqrt(target.shape[1]), 1e-12)
-            squared = (lengths / self._sigma) ** 2 / (target.shape[1] * _TUNING**2)
-            weights = 1.0 / (1.0 + squared) ** 2
+            left = (known[:, -1] - known[:, :-1] @ values).reshape(n_rows, size)
+            lengths = np.sqrt((left**2).sum(axis=1))
+            self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
+            weights = 1.0 / (1.0 + (lengths / self._sigma) ** 2 / (size * _TUNING**2)) ** 2
         self._weight = float(weights.sum())
-        parts = np.array_split(flat, _BLOCKS), np.array_split(weights, _BLOCKS)
-        self._blocks = np.stack(
-            [
-                np.tensordot(rows * each[:, None, None], rows, axes=((0, 1), (0, 1)))
-                for rows, each in zip(*parts, strict=True)
-            ]
-        )
+        blocks, parts = [], (np.array_split(each, _BLOCKS) for each in (rows, weights))
+        for part, each in zip(*parts, strict=True):
+            flat = part.reshape(-1, n_columns)
+            blocks.append((flat * np.repeat(each, size)[:, None]).T @ flat)
+        self._blocks = np.stack(blocks)
         # Noise of the columns would make the lever arm too short: at most half of them is noise.
         sizes, directions = np.linalg.eigh(self._blocks.sum(axis=0)[:3, :3])
         of_noise = np.minimum(noise * self._weight, 0.5 * np.maximum(sizes, 0.0))
         self._blocks[:, :3, :3] -= (directions * of_noise) @ directions.T / _BLOCKS
+        self._total = self._blocks.sum(axis=0)
 
     def _columns(self, *groups: str, without: str = "") -> list[int]:
         names = [*(name for name in self._base if name != without), *groups]
@@ -97,21 +88,22 @@ class Regression:
         may push its values.
         """
         at = self._where[group]
-        powers = np.maximum(self._blocks.sum(axis=0)[at, at], 1e-300)
-        return np.asarray(self._sigma**2 * self._weight / powers)
+        return np.asarray(self._sigma**2 * self._weight / np.maximum(self._total[at, at], 1e-300))
 
     def fit(self, group: str, without: str = "") -> Fitted:
         """Fit a group beside the base, or beside what is left of it."""
-        total, before = self._blocks.sum(axis=0), self._columns(without=without)
+        before = self._columns(without=without)
         known = [*before, *self._where[group]]
-        left_out = _solved(total - self._blocks, known)[:, len(before) :]
+        # All rows, and all but those of each block.
+        solved = _solved(np.concatenate([self._total[None], self._total - self._blocks]), known)
+        values, left_out = solved[0], solved[1:, len(before) :]
         spread = left_out - left_out.mean(axis=0)
         costs = [
-            float(total[-1, -1] - total[indices, -1] @ _solved(total, indices))
-            for indices in (before, known)
+            float(self._total[-1, -1] - self._total[columns, -1] @ found)
+            for columns, found in ((before, _solved(self._total, before)), (known, values))
         ]
         return Fitted(
-            values=_solved(total, known)[len(before) :],
+            values=values[len(before) :],
             sigmas=np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0)),
             share=1.0 - costs[1] / max(costs[0], 1e-300),
         )
@@ -288,15 +280,20 @@ def _regression(
         "rotation": (se3.skew(child.moved), child.rotations - np.eye(3)),
         "scale": (child.moved[:, :, None], np.zeros((len(turned), 3, 1))),
     }
-    columns = {
-        name: np.concatenate([of_t / unit_t, of_r / unit_r], axis=1)
-        for name, (of_t, of_r) in (of_mount | dict(groups)).items()
-    }
+    columns = of_mount | dict(groups)
     if after is not None:
-        of_x = np.concatenate([columns["lever"], columns["rotation"]], axis=2)
-        columns["moved"] = after[:, None, None] * of_x
-    target = np.concatenate([displaced / unit_t, turned / unit_r], axis=1)
-    return Regression(target, columns, (*of_mount, *base), (unit_r / unit_t) ** 2)
+        of_x = zip(columns["lever"], columns["rotation"], strict=True)
+        columns["moved"] = tuple(after[:, None, None] * np.concatenate(x, axis=2) for x in of_x)
+    columns["target"] = displaced[:, :, None], turned[:, :, None]
+    ends = np.cumsum([of_t.shape[2] for of_t, _ in columns.values()]).tolist()
+    rows = np.empty((len(turned), 6, ends[-1]))
+    where = {}
+    for name, start, end in zip(columns, [0, *ends], ends, strict=False):
+        where[name] = list(range(start, end))
+        of_t, of_r = columns[name]
+        np.divide(of_t, unit_t, out=rows[:, :3, start:end])
+        np.divide(of_r, unit_r, out=rows[:, 3:, start:end])
+    return Regression(rows, where, (*of_mount, *base), (unit_r / unit_t) ** 2)
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:

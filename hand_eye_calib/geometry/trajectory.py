@@ -234,21 +234,28 @@ class Trajectory:
         """The same poses with ``offset_s`` seconds added to every stamp, and ``rate`` seconds more
         for each second after a stamp.
         """
+        if not (offset_s or rate):
+            return self
         stamps_ns = self.stamps_ns + np.int64(round(offset_s * 1e9))
         if rate:
             stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
-        return self._unchecked("stamps_ns", stamps_ns)
+        return self._unchecked("stamps_ns", stamps_ns, keeps_bends=not rate)
 
     def scaled(self, scale: float) -> Self:
         """The same rotations with every translation multiplied by ``scale``."""
+        if scale == 1.0:
+            return self
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
         return self._unchecked("poses", poses)  # in another unit, they may be farther away
 
-    def _unchecked(self, name: str, value: IntArray | FloatArray) -> Self:
+    def _unchecked(
+        self, name: str, value: IntArray | FloatArray, keeps_bends: bool = False
+    ) -> Self:
         changed = copy.copy(self)
         object.__setattr__(changed, name, value)
-        changed.__dict__.pop("_bends", None)
+        if not keeps_bends:
+            changed.__dict__.pop("_bends", None)
         return changed
 
     @cached_property

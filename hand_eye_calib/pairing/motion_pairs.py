@@ -277,14 +277,14 @@ def pairs_between(
 
 
 def motions(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Motions (K, 4, 4) from poses to poses, (K, 4, 4) each, of one sensor.
+    """Motions (..., 4, 4) from poses to poses, (..., 4, 4) each, of one sensor.
 
     The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
     first costs ten digits.
     """
     moved = end.copy()
-    moved[:, :3, 3] -= start[:, :3, 3]
-    moved[:, :3] = np.swapaxes(start[:, :3, :3], 1, 2) @ moved[:, :3]
+    moved[..., :3, 3] -= start[..., :3, 3]
+    moved[..., :3, :] = np.swapaxes(start[..., :3, :3], -1, -2) @ moved[..., :3, :]
     return moved
 
 
