@@ -39,6 +39,13 @@ def amount(axis: str, value: float) -> str:
     return length(value) if axis in ("x", "y", "z") else angle(value)
 
 
+def change(axis: str, value: float, sigma: float) -> str:
+    """A difference along or about an axis (m, rad) with its sign and standard deviation."""
+    unit, factor = ("deg", math.degrees(1.0)) if axis in _ABOUT else ("cm", 100.0)
+    told = with_sigma(factor * value, factor * sigma, 1).replace("+/-", "±")
+    return f"{'+' * (value >= 0)}{told} {unit}" if math.isfinite(sigma) else told
+
+
 def axes_in_words(axes: Sequence[str]) -> str:
     """Axes as in "x and the rotation about z" for x and yaw."""
     about = [_ABOUT[axis] for axis in axes if axis in _ABOUT]

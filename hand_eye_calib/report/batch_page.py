@@ -54,7 +54,7 @@ def render_batch(
         "batch.html",
         TONES.get(cells[0][2], "bad"),
         counted(len(rows), "recording"),
-        listing([f"{count} {verdict}" for verdict, count in counts.most_common()]),
+        listing([f"{count:,} {verdict}" for verdict, count in counts.most_common()]),
         batch=title.rpartition("/")[2],
         vehicles_left_out=max(0, len(ordered) - LOOK.vehicles),
         vehicles=[

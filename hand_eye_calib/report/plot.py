@@ -25,7 +25,7 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import listing
 
 # The three views: which axes of the parent go across and up, and what that is on a vehicle.
-_VIEWS = {"xy": "from above", "xz": "from the side", "yz": "from behind"}
+_VIEWS = {"xy": "from above", "xz": "from the side", "yz": "from the front"}
 
 
 class ShownFigure(Figure):

@@ -30,6 +30,7 @@ from hand_eye_calib.rig.result import RigCalibration
 from hand_eye_calib.text import (
     amount,
     angle,
+    change,
     counted,
     duration,
     fixed,
@@ -83,6 +84,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
     )
     environment.filters |= {"number": fixed, "printable": printable}
     environment.globals |= {"amount": amount, "counted": counted, "axis_names": _AXIS_NAMES}
+    environment.globals["change"] = change
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
     return environment.get_template(template).render(
         **values, marks=MARKS, said=f"{said[:1].upper()}{said[1:]}"

@@ -139,7 +139,8 @@ def summary(result: Result) -> dict[str, str]:
     if rate and rate.is_used:
         rows["Time offset"] += f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
     if result.noise:
-        rows["Noise"] = "; ".join(result.noise.in_words)
+        said = (each.removeprefix("Noise: ").rstrip(".") for each in result.noise.in_words)
+        rows["Noise"] = "; ".join(said)
     return rows
 
 

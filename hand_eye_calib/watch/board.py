@@ -22,7 +22,7 @@ from hand_eye_calib.live.state import (
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.stats import LARGEST_OF_SIX
-from hand_eye_calib.text import amount, duration, fixed, two_digits, with_sigma
+from hand_eye_calib.text import amount, change, duration, fixed, two_digits
 
 # A node that has said nothing for so long (s) is silent.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
@@ -317,11 +317,7 @@ def _bar(axis: str, state: NodeState) -> Bar:
     difference = ""
     if at.comparison is not None and at.comparison.differences:
         row = at.comparison.differences[0].axes[axis]
-        unit, size = ("deg", math.degrees(1.0)) if axis in ROTATIONS else ("cm", 100.0)
-        told = with_sigma(size * row.difference, size * row.sigma, 1).replace("+/-", "±")
-        difference = (
-            f"{'+' * (row.difference >= 0)}{told} {unit}" if math.isfinite(row.sigma) else told
-        )
+        difference = change(axis, row.difference, row.sigma)
     is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
     meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""
     return Bar(_NAMES[axis], meaning, share, tone, word, against, difference)
