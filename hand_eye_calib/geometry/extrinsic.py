@@ -44,7 +44,12 @@ class Extrinsic:
 
 
 def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances (..., 6, 6) along and about axes that rotations (..., 3, 3) turn theirs to."""
+    """Covariances (..., 6, 6) along and about axes that rotations (..., 3, 3) turn theirs to.
+
+    Of a pose they are as ROS messages carry them (REP-103): the engine's error xi = (rho, phi) in
+    ``T_parent_child @ exp(xi)`` moves the child's origin by ``R rho``, to first order, and rotates
+    the child by ``R phi`` about the parent's axes through that origin. There is no lever arm.
+    """
     both = np.kron(np.eye(2), rotation)
     return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
 

@@ -86,22 +86,9 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message.header.frame_id = calibration.parent_frame
     T, pose = calibration.T_parent_child, message.pose.pose
     _put(T, pose.position, pose.orientation)
-    covariance = covariance_about_parent_axes(T, calibration.covariance_with_floor)
+    covariance = turned(T[:3, :3], calibration.covariance_with_floor)
     message.pose.covariance = covariance.ravel().tolist()
     return message
-
-
-def covariance_about_parent_axes(
-    T_parent_child: FloatArray, cov_parent_child_in_child: FloatArray
-) -> FloatArray:
-    """Covariance (6, 6) of a pose as ROS messages carry it (REP-103): m and rad, of x, y, z and the
-    rotation about X, Y, Z of the parent frame.
-
-    The engine's error is ``xi = (rho, phi)`` in ``T_parent_child @ exp(xi)``, in the child's axes.
-    To first order it moves the child's origin by ``R rho`` and rotates the child by ``R phi`` about
-    the parent's axes through that origin. Both blocks are rotated; there is no lever arm.
-    """
-    return turned(T_parent_child[:3, :3], cov_parent_child_in_child)
 
 
 def _put(T_target_source: FloatArray, place: Any, turn: Any) -> None:

@@ -16,7 +16,7 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
-from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.geometry.extrinsic import Extrinsic, turned
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog
@@ -26,7 +26,6 @@ from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.ros.conversions import (
     LATCHED,
     LISTENING,
-    covariance_about_parent_axes,
     from_transform,
     quick,
     to_transform,
@@ -177,7 +176,7 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
         return calibration
     index = AXES.index(hidden[0])
     T = calibration.T_parent_child.copy()
-    covariance = covariance_about_parent_axes(T, calibration.covariance)
+    covariance = turned(T[:3, :3], calibration.covariance)
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
     # The other axes follow as far as the motion has tied them to this one.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing

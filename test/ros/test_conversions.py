@@ -12,6 +12,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from hand_eye_calib import config
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import turned
 from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.ros import conversions
@@ -119,7 +120,7 @@ def test_covariance_is_about_the_fixed_axes_of_the_parent():
     shift = moved[:, :3, 3] - T_PARENT_CHILD[:3, 3]
     turn = se3.rotation_log(moved[:, :3, :3] @ T_PARENT_CHILD[:3, :3].T)
     measured = np.cov(np.hstack([shift, turn]).T)
-    converted = conversions.covariance_about_parent_axes(T_PARENT_CHILD, cov_in_child)
+    converted = turned(T_PARENT_CHILD[:3, :3], cov_in_child)
     scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
     # Standard error of a sampled correlation is below 1 / sqrt(samples); five of them, and the
     # second-order terms of exp.

@@ -10,8 +10,11 @@ import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
+from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.stops import read_arm_samples
+from hand_eye_calib.results.calibration import Verdict
+from hand_eye_calib.solvers.robot_world import Stops, solve
 
 NOISE = np.repeat([0.0005, 0.001], 3)
 
@@ -114,3 +117,221 @@ class TestCommand:
         np.testing.assert_allclose(document["T_parent_child"]["matrix"], X, atol=5e-3)
         assert main(["calibrate", files[0], "--order", "none"]) == 1
         assert "expected samples of an arm" in capsys.readouterr().err
+
+
+# ---- samples of arms as other tools write them
+
+
+N_SAMPLES = 4
+
+
+@pytest.fixture
+def both_poses():
+    random = np.random.default_rng(0)
+    return [se3.exp(random.normal(size=(N_SAMPLES, 6))) for _ in range(2)]
+
+
+def transform_of(T):
+    x, y, z, w = se3.to_quat_xyzw(T).tolist()
+    return {
+        "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
+        "rotation": {"x": x, "y": y, "z": z, "w": w},
+    }
+
+
+def opencv(both_poses):
+    text = f"%YAML:1.0\n---\nframeCount: {N_SAMPLES}\n"
+    for k in range(N_SAMPLES):
+        for name, Ts in zip(("T1", "T2"), both_poses, strict=True):
+            numbers = ", ".join(f"{x:.17e}" for x in Ts[k].ravel())
+            text += f"{name}_{k}: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n"
+            text += f"   data: [ {numbers} ]\n"
+    return text
+
+
+def easy_handeye2(both_poses):
+    parameters = {"robot_effector_frame": "tool0", "tracking_base_frame": "camera"}
+    samples = [
+        {"robot": transform_of(a), "tracking": transform_of(b)}
+        for a, b in zip(*both_poses, strict=True)
+    ]
+    return json.dumps({"parameters": parameters, "samples": samples})
+
+
+def moveit_yaml(both_poses):
+    names = ("effector_wrt_world", "object_wrt_sensor")
+    rows = (
+        dict(zip(names, (a.ravel().tolist(), b.ravel().tolist()), strict=True))
+        for a, b in zip(*both_poses, strict=False)
+    )
+    return json.dumps(list(rows))
+
+
+def moveit_json(both_poses):
+    return json.dumps([[a.tolist(), b.tolist()] for a, b in zip(*both_poses, strict=True)])
+
+
+@pytest.mark.parametrize("written", [opencv, easy_handeye2, moveit_yaml, moveit_json])
+def test_files_of_other_tools(written, both_poses, tmp_path):
+    path = tmp_path / "samples.yaml"
+    path.write_text(written(both_poses))
+    read = read_arm_samples(path)
+    np.testing.assert_allclose(read.robot, both_poses[0], atol=1e-12)
+    np.testing.assert_allclose(read.tracking, both_poses[1], atol=1e-12)
+    frames = {"hand": "tool0", "camera": "camera"} if written is easy_handeye2 else {}
+    assert read.frames == frames
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "expected samples of an arm"),
+        ("a: 1", "expected samples of an arm"),
+        ("[1, 2]", "sample 1: expected samples of an arm"),
+        ("[[1, 2]]", "sample 1: expected a pose"),
+        ("[{x: 1, y: 2}]", "expected samples of an arm"),
+        ("[{robot: {}, tracking: {}}]", "translation and rotation"),
+        (json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]), "the rotation is not one"),
+        (json.dumps([[[0] * 7, [0] * 7]]), "a quaternion of length 0"),
+        ("[[" + "[.nan" + ", 1" * 15 + "], [.nan]]]", "not finite"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(text, said, tmp_path):
+    path = tmp_path / "samples.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=said) as raised:
+        read_arm_samples(path)
+    assert str(raised.value).startswith(str(path))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("as_rows", [False, True])
+def test_two_stacks_in_an_npz(as_rows, both_poses, tmp_path):
+    stacks = (
+        [np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)] for Ts in both_poses] if as_rows else both_poses
+    )
+    file = tmp_path / "arm.npz"
+    np.savez(file, robot=stacks[0], tracking=stacks[1])
+    read = read_arm_samples(file)
+    np.testing.assert_allclose([read.robot, read.tracking], both_poses, atol=1e-12)
+    np.savez(file, first=np.eye(4))
+    with pytest.raises(InputError, match="expected samples of an arm"):
+        read_arm_samples(file)
+    file.write_bytes(b"PK and no more")
+    with pytest.raises(InputError, match=r"cannot read .*arm\.npz"):
+        read_arm_samples(file)
+
+
+# ---- stops: A X = Z B, its covariance, outliers, several sensors and targets, and what is unknown
+
+
+LEVELS = np.repeat([0.002, 0.004], 3)  # m, rad
+
+
+def poses(random, n, reach_m=0.3, turn_rad=0.5):
+    xi = random.normal(size=(n, 6)) * np.repeat([reach_m, turn_rad], 3)
+    return se3.exp(xi)
+
+
+def recorded(random, n, noise=1.0, outliers=0.0, Ts_world_parent=None, levels=LEVELS):
+    """X, Z and the stops of a target seen by a camera in a hand."""
+    X, Z = poses(random, 2, turn_rad=1.5)
+    A = poses(random, n) if Ts_world_parent is None else Ts_world_parent
+    B = se3.inverse(Z) @ A @ X @ se3.exp(noise * levels * random.normal(size=(n, 6)))
+    wrong = random.random(n) < outliers
+    B[wrong] = B[wrong] @ poses(random, int(wrong.sum()), 0.3, 0.5)
+    return X, Z, Stops.of_one(A, B)
+
+
+def off(estimate, truth):
+    return se3.log(se3.inverse(estimate) @ truth)
+
+
+@pytest.mark.parametrize("n", [3, 10, 1000])
+def test_exact_stops_are_solved_exactly(random, n):
+    X, Z, stops = recorded(random, n, noise=0.0)
+    fit = solve(stops)
+    assert np.abs(off(fit.Ts_parent_child[0], X)).max() < 1e-7
+    assert np.abs(off(fit.Ts_world_world[0], Z)).max() < 1e-7
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.15])
+def test_covariance_is_that_of_the_errors(random, outliers):
+    squared = []
+    for _ in range(40):
+        X, Z, stops = recorded(random, 20, outliers=outliers)
+        fit = solve(stops)
+        error = np.r_[off(fit.Ts_parent_child[0], X), off(fit.Ts_world_world[0], Z)]
+        squared.append(error @ np.linalg.solve(fit.covariance, error))
+    # Twelve are expected; the mean of 40 scatters by 0.8.
+    assert 8.0 < np.mean(squared) < 18.0
+
+
+def test_order_does_not_matter(random):
+    _, _, stops = recorded(random, 30)
+    first, second = solve(stops), solve(stops[random.permutation(30)])
+    assert np.abs(off(first.Ts_parent_child[0], second.Ts_parent_child[0])).max() < 2e-4
+
+
+def test_outliers_have_no_weight(random):
+    X, _, stops = recorded(random, 40)
+    stops.Ts_world_child[:4] = poses(random, 4, 1.0, 2.0)
+    fit = solve(stops)
+    assert np.all(fit.weights[:4] == 0.0)
+    assert np.sum(fit.weights == 0.0) <= 6
+    assert np.linalg.norm(off(fit.Ts_parent_child[0], X)[:3]) < 0.01
+
+
+def test_several_cameras_and_targets_are_one_solve(random):
+    Xs, Zs = poses(random, 2, turn_rad=1.5), poses(random, 3, turn_rad=1.5)
+    child, world = np.array([0, 0, 1, 1, 1]).repeat(20), np.array([0, 1, 1, 2, 0]).repeat(20)
+    A = poses(random, 100)
+    B = se3.inverse(Zs[world]) @ A @ Xs[child] @ se3.exp(LEVELS * random.normal(size=(100, 6)))
+    fit = solve(Stops(A, B, child, world))
+    for estimates, truths in ((fit.Ts_parent_child, Xs), (fit.Ts_world_world, Zs)):
+        errors = off(estimates, truths)
+        assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.02
+        assert np.linalg.norm(errors[:, 3:], axis=1).max() < 0.02
+
+
+def test_sensors_without_a_common_target_are_refused(random):
+    _, _, stops = recorded(random, 20)
+    side = np.arange(20) % 2
+    with pytest.raises(NotEnoughDataError, match="tied to no others"):
+        solve(Stops(stops.Ts_world_parent, stops.Ts_world_child, side, side))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_two_stops_are_too_few(random, n):
+    _, _, stops = recorded(random, n)
+    with pytest.raises(NotEnoughDataError, match="at least 3"):
+        solve(stops)
+
+
+class TestUndetermined:
+    def test_rotations_about_all_axes_determine_everything(self, random):
+        assert solve(recorded(random, 15)[2]).undetermined().shape == (6, 0)
+
+    @pytest.mark.parametrize("seed", range(10))
+    @pytest.mark.parametrize("motion", ["one_axis", "no_rotation", "one_axis_unmoved"])
+    def test_degenerate_stops_are_refused_by_axis(self, motion, seed):
+        random = np.random.default_rng(seed)
+        axis = random.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        xi = np.zeros((25, 6))
+        if motion != "one_axis_unmoved":
+            xi[:, :3] = random.normal(size=(25, 3)) * 0.3
+        if motion != "no_rotation":
+            xi[:, 3:] = random.normal(size=(25, 1)) * axis
+        A = poses(random, 1, turn_rad=2.0) @ se3.exp(xi)
+        levels = LEVELS * random.uniform(0.3, 3.0)
+        X, _, stops = recorded(random, 25, Ts_world_parent=A, levels=levels)
+        fit = solve(stops)
+        unknown = np.kron(np.eye(2), fit.Ts_parent_child[0][:3, :3]) @ fit.undetermined()
+        along = np.eye(3) if motion == "no_rotation" else axis[None]
+        assert np.linalg.norm(along @ unknown[:3], axis=1).min() > 0.98
+        if motion == "one_axis":
+            assert unknown.shape == (6, 1)
+        result = calibrate_stops(stops.Ts_world_parent, stops.Ts_world_child)
+        assert result.verdict is not Verdict.USE
+        assert result.reasons[0].rule in ("unobservable", "nothing_known")

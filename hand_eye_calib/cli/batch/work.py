@@ -25,7 +25,7 @@ from hand_eye_calib.cli.bags import read_recording
 from hand_eye_calib.cli.console import STREAMS
 from hand_eye_calib.cli.options import Options
 from hand_eye_calib.cli.present import exit_code
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, required
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.results.calibration import Calibration
@@ -290,15 +290,9 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
+    distributed = required("dask.distributed", "--dask", "hand_eye_calib[cluster]")
     try:
-        from dask.distributed import Client
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            f"--dask needs the package dask.distributed ({error.name} is missing): "
-            "pip install 'hand_eye_calib[cluster]'"
-        ) from None
-    try:
-        client = Client(address, timeout="10s")
+        client = distributed.Client(address, timeout="10s")
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"no Dask scheduler at {address}: {reason}") from None
