@@ -20,7 +20,7 @@ _HOMES = {
     "HandEyeCalibError": "errors",
     "Reason": "results.verdict",
     "Residuals": "results.records",
-    "RigCalibration": "rig.result",
+    "RigCalibration": "rig.calibrate",
     "SolveStatus": "results.status",
     "Trajectory": "geometry.trajectory",
     "Verdict": "results.verdict",
@@ -30,7 +30,7 @@ _HOMES = {
     "calibrate_rig": "rig.calibrate",
     "calibrate_stops": "engine.stops",
     "calibrate_together": "session.together",
-    "compare": "session.compare",
+    "compare": "session.together",
     "cross_check": "engine.offline",
     "load": "io.results",
     "plot": "report.plot",
@@ -64,11 +64,11 @@ if TYPE_CHECKING:
     from hand_eye_calib.results.status import SolveStatus as SolveStatus
     from hand_eye_calib.results.verdict import Reason as Reason
     from hand_eye_calib.results.verdict import Verdict as Verdict
+    from hand_eye_calib.rig.calibrate import RigCalibration as RigCalibration
     from hand_eye_calib.rig.calibrate import calibrate_rig as calibrate_rig
-    from hand_eye_calib.rig.result import RigCalibration as RigCalibration
-    from hand_eye_calib.session.compare import compare as compare
     from hand_eye_calib.session.together import calibrate_many as calibrate_many
     from hand_eye_calib.session.together import calibrate_together as calibrate_together
+    from hand_eye_calib.session.together import compare as compare
     from hand_eye_calib.simulation.drive import simulate as simulate
 
     __version__: str

@@ -71,7 +71,7 @@ def _with_robot(
     """
     installed, base = arguments.installed, arguments.base_frame
     from hand_eye_calib.io.installed import frames_of_bag, open_installed, read_urdf
-    from hand_eye_calib.session.compare import with_comparison
+    from hand_eye_calib.session.together import with_comparison
 
     if installed:
         frames = calibration.parent_frame, calibration.child_frame

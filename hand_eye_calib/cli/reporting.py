@@ -18,7 +18,7 @@ from hand_eye_calib.results.calibration import Calibration
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
     from hand_eye_calib.live.saving import SessionResult
-    from hand_eye_calib.rig.result import RigCalibration
+    from hand_eye_calib.rig.calibrate import RigCalibration
 
 REPORT = "report.html"
 # Frame of a child sensor that names none: in a rig it has the name of its input.

@@ -12,7 +12,7 @@ from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
-    from hand_eye_calib.rig.result import RigCalibration
+    from hand_eye_calib.rig.calibrate import RigCalibration
 
 
 def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:

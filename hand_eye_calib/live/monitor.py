@@ -39,7 +39,7 @@ from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.results.status import AXES
-from hand_eye_calib.session.compare import SEEN_TARGETS
+from hand_eye_calib.session.together import SEEN_TARGETS
 from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
 from hand_eye_calib.text import axes_in_words
 

@@ -26,7 +26,7 @@ from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
-from hand_eye_calib.rig.result import RigCalibration
+from hand_eye_calib.rig.calibrate import RigCalibration
 from hand_eye_calib.text import (
     amount,
     angle,

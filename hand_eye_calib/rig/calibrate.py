@@ -1,20 +1,28 @@
-"""Whole trajectories of several sensors in, the extrinsics of all of them out."""
+"""Whole trajectories of several sensors in, the extrinsics of all of them out: a tree of
+extrinsics, and the closure test.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import numpy as np
+
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import solve_poses
 from hand_eye_calib.engine.run import run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import synchronise
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.rig.result import RigCalibration
+from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.stats import CHI2
+from hand_eye_calib.text import angle, length, listing
 
 # Options that are of one pair of sensors, by their beginnings.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
@@ -102,3 +110,191 @@ def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) 
                 f"{name} {value} would be of which sensor of the rig? Give {name} estimate, or "
                 "correct the trajectories before"
             )
+
+
+_FORMAT = "hand_eye_calib/rig"
+_VERSION = 1
+
+# Variances (m^2, rad^2) of directions that are unknown are larger.
+_UNKNOWN = 1.0
+
+# Variance (m^2, rad^2) that no answer is better than: that of poses without noise is zero.
+_ROUNDING = 1e-16
+
+
+@dataclass(frozen=True)
+class Closure:
+    """By how much the pairwise answers of three sensors miss closing.
+
+    Attributes
+    ----------
+    sensors : (str, str, str)
+    translation_m, rotation_rad : float
+        Size of ``T_ab T_bc T_ca``, which is the identity without errors, along directions that all
+        three answers know.
+    chi2 : float
+        The same in standard deviations, squared: with the covariances of the three answers as if
+        they were independent. They share sensors, so that it is rather smaller than by chance.
+    dof : int
+        Number of these directions.
+    """
+
+    sensors: tuple[str, str, str]
+    translation_m: float
+    rotation_rad: float
+    chi2: float
+    dof: int
+
+    @property
+    def closes(self) -> bool:
+        """Whether chance makes it so large more than once in a hundred times."""
+        return self.dof == 0 or self.chi2 <= CHI2[0.01][self.dof]
+
+    @property
+    def sentence(self) -> str:
+        """In words."""
+        how = "closes" if self.closes else "DOES NOT CLOSE"
+        return (
+            f"{' - '.join(self.sensors)} {how}: off by {length(self.translation_m)} and "
+            f"{angle(self.rotation_rad)}, chi-square {self.chi2:.1f} with "
+            f"{self.dof} degrees of freedom"
+        )
+
+
+@dataclass(frozen=True)
+class RigCalibration:
+    """The extrinsics of all sensors of a rig.
+
+    Attributes
+    ----------
+    sensors : tuple of str
+        Frames of the S sensors. All extrinsics are stated in the first one's.
+    calibrations : tuple of Calibration
+        Of every other sensor in the frame of the first one: S - 1.
+    neighbours : tuple of Calibration
+        Of every sensor from the third one on in the frame of the one before it: S - 2.
+    closures : tuple of Closure
+        Of answers for two sensors at a time: the first and two neighbours in the list each.
+
+    Examples
+    --------
+    >>> sensors = {"lidar": parent, "camera": child, "rear": other}
+    >>> hec.calibrate_rig(sensors).sensors
+    ('lidar', 'camera', 'rear')
+    """
+
+    sensors: tuple[str, ...]
+    calibrations: tuple[Calibration, ...]
+    neighbours: tuple[Calibration, ...]
+    closures: tuple[Closure, ...]
+
+    @classmethod
+    def of(
+        cls,
+        sensors: tuple[str, ...],
+        star: Sequence[Calibration],
+        neighbours: Sequence[Calibration],
+    ) -> RigCalibration:
+        """From answers for two sensors at a time. What they miss closing by is shared among them,
+        as far as each is uncertain.
+        """
+        triangles = zip(star, neighbours, star[1:], strict=False)
+        closures = tuple(closure(*answers) for answers in triangles)
+        found = cls(sensors, tuple(star), tuple(neighbours), closures)
+        calibrations = tuple(
+            replace(each, T_parent_child=se3.exp(step) @ each.T_parent_child)
+            for each, step in zip(star, found._steps(), strict=True)
+        )
+        return replace(found, calibrations=calibrations)
+
+    def __repr__(self) -> str:
+        return f"{self.verdict.value}: {listing(self.sensors)}"
+
+    @property
+    def verdict(self) -> Verdict:
+        """The gravest verdict of all extrinsics."""
+        return max((each.verdict for each in self.calibrations), key=[*Verdict].index)
+
+    @cached_property
+    def Xs(self) -> FloatArray:
+        """Poses (S, 4, 4) of the sensors in the frame of the first one."""
+        return np.array([np.eye(4), *(each.T_parent_child for each in self.calibrations)])
+
+    def _steps(self) -> FloatArray:
+        """Changes (S - 1, 6) of the extrinsics, in the frame of the first sensor, that make all
+        answers close: weighted least squares.
+        """
+        K = len(self.calibrations)
+        information, pulled = np.zeros((K, 6, K, 6)), np.zeros((K, 6))
+        for at, (each, X) in enumerate(zip(self.calibrations, self.Xs[1:], strict=True)):
+            information[at, :, at] += np.linalg.inv(_moved(each, X))
+        for at, each in enumerate(self.neighbours):
+            before, after = self.Xs[at + 1], self.Xs[at + 2]
+            miss = se3.log(before @ each.T_parent_child @ se3.inverse(after))
+            weight = np.linalg.inv(_moved(each, after))
+            for row, sign in ((at + 1, 1.0), (at, -1.0)):
+                pulled[row] += sign * weight @ miss
+                information[row, :, at + 1] += sign * weight
+                information[row, :, at] -= sign * weight
+        steps = np.linalg.solve(information.reshape(6 * K, 6 * K), pulled.ravel())
+        return np.asarray(steps.reshape(K, 6))
+
+    def T(self, first: str, second: str) -> FloatArray:
+        """Pose (4, 4) of the second sensor in the frame of the first."""
+        before, after = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
+        return se3.inverse(before) @ after
+
+    def covariance(self, first: str, second: str) -> FloatArray:
+        """Covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``, m and rad.
+
+        It is that of the answer for both. Without one it is the sum of those with the first sensor:
+        rather too large, as it has that sensor's errors twice.
+        """
+        near, far = sorted(map(self.sensors.index, (first, second)))
+        if near == far:
+            return np.zeros((6, 6))
+        answers = [(self.calibrations[at - 1], self.Xs[at]) for at in (near, far) if at]
+        if 0 < near == far - 1:
+            answers = [(self.neighbours[near - 1], self.Xs[far])]
+        to_second = se3.adjoint(self.T(second, self.sensors[0]))
+        in_first = np.sum([_moved(*each) for each in answers], axis=0)
+        return np.asarray(to_second @ in_first @ to_second.T)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything in plain values."""
+        return {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "sensors": list(self.sensors),
+            "verdict": self.verdict.value,
+            "closures": [
+                asdict(each) | {"sensors": list(each.sensors), "closes": each.closes}
+                for each in self.closures
+            ],
+            "calibrations": {each.child_frame: each.to_dict() for each in self.calibrations},
+        }
+
+
+def _moved(calibration: Calibration, X: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of an answer in the frame that its child has the pose X (4, 4) in."""
+    adjoint = se3.adjoint(X)
+    covariance = calibration.covariance + _ROUNDING * np.eye(6)
+    return np.asarray(adjoint @ covariance @ adjoint.T)
+
+
+def closure(to_second: Calibration, on: Calibration, to_third: Calibration) -> Closure:
+    """How the answers for a -> b, b -> c and a -> c close."""
+    ahead = to_second.T_parent_child @ on.T_parent_child
+    covariance = _moved(to_second, to_second.T_parent_child) + _moved(on, ahead)
+    covariance += _moved(to_third, to_third.T_parent_child)
+    variances, axes = np.linalg.eigh(covariance)
+    is_known = variances < _UNKNOWN
+    along = axes[:, is_known].T @ se3.log(ahead @ to_third.T_child_parent)
+    miss = axes[:, is_known] @ along
+    return Closure(
+        sensors=(to_second.parent_frame, to_second.child_frame, to_third.child_frame),
+        translation_m=float(np.linalg.norm(miss[:3])),
+        rotation_rad=float(np.linalg.norm(miss[3:])),
+        chi2=float((along**2 / variances[is_known]).sum()),
+        dof=int(is_known.sum()),
+    )

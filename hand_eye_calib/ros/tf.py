@@ -30,7 +30,7 @@ from hand_eye_calib.ros.conversions import (
     quick,
     to_transform,
 )
-from hand_eye_calib.session.compare import with_comparison
+from hand_eye_calib.session.together import with_comparison
 from hand_eye_calib.text import axes_in_words
 
 TF, STATIC_TOPIC, DYNAMIC_TOPIC = "tf", "/tf_static", "/tf"

@@ -15,8 +15,7 @@ from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.session.compare import compare
-from hand_eye_calib.session.together import together
+from hand_eye_calib.session.together import compare, together
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.recordings import Rig, Truth
 from reproduction.writing import markdown_table

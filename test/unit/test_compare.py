@@ -16,7 +16,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.status import AXES
-from hand_eye_calib.session.compare import compare, with_comparison
+from hand_eye_calib.session.together import compare, with_comparison
 
 
 def values(difference):

@@ -26,7 +26,7 @@ from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.records import Finding, Severity
-from hand_eye_calib.session.compare import with_comparison
+from hand_eye_calib.session.together import with_comparison
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
 from hand_eye_calib.text import amount, change, with_sigma
