@@ -4,8 +4,11 @@ what cannot be read is told in one sentence.
 
 import importlib.util
 import json
+import re
 import struct
 from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 
 import numpy as np
 import pytest
@@ -23,6 +26,7 @@ N = 40
 TRUTH = as_trajectory(wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000)
 SECONDS = TRUTH.stamps_ns / 1e9
 P, Q = TRUTH.poses[:, :3, 3], se3.to_quat_xyzw(TRUTH.poses)
+VECTORS = se3.rotation_log(TRUTH.poses[:, :3, :3])
 LAT, LON, HEIGHT = geodetic(P - P[0], (48.1, 11.5, 550.0))
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -35,13 +39,20 @@ def joined(rows, separator=" "):
     return "".join(separator.join(map(str, row)) + "\n" for row in rows)
 
 
-def of_nmea():
+def of_nmea(damaged=3):
+    """After a logger's own stamps, one sentence with a wrong checksum."""
     lat, lon = ([100 * (each // 1) + each % 1 * 60 for each in deg] for deg in (LAT, LON))
-    return "".join(
-        f"$GPRMC,{clock[:-4]},A,,,,,,,{day},,*00\r\n$GNGGA,{clock[:-4]},{lat[k]:014.9f},N,"
-        f"{lon[k]:015.9f},E,4,12,0.8,{HEIGHT[k] - 45.0:.6f},M,45.0,M,,*00\r\n"
+    texts = [
+        f"GPRMC,{clock[:-4]},A,,,,,,,{day},,|GNGGA,{clock[:-4]},{lat[k]:014.9f},N,"
+        f"{lon[k]:015.9f},E,4,12,0.8,{HEIGHT[k] - 45.0:.6f},M,45.0,M,,"
         for k, (clock, day) in enumerate(zip(dates("%H%M%S.%f"), dates("%d%m%y"), strict=True))
-    )
+    ]
+    texts.insert(damaged, texts[damaged].replace(".", ".9"))
+    lines = [each for text in texts for each in text.split("|")]
+    checks = [reduce(xor, each.encode()) for each in lines]
+    checks[2 * damaged + 1] ^= 1
+    rows = zip(lines, checks, strict=True)
+    return "".join(f"12:00:00 ${each}*{check:02X}\r\n" for each, check in rows)
 
 
 def of_gpx():
@@ -103,10 +114,10 @@ def of_motive():
     return head + joined([*rows, lost], ",")
 
 
-def of_vicon():
-    head = "Objects\n10\n,,drone:drone\nFrame,Sub Frame,RX,RY,RZ,TX,TY,TZ\n,,rad,rad,rad,mm,mm,mm\n"
-    vectors = se3.rotation_log(TRUTH.poses[:, :3, :3])
-    return head + joined(([k, 0, *vectors[k], *(1e3 * P[k])] for k in range(N)), ",")
+def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad"):
+    head = f"Objects\n10\n,,drone:drone\nFrame,Sub Frame,{turn},TX,TY,TZ\n,,{units},mm,mm,mm\n"
+    turns = Q if "RW" in turn else VECTORS
+    return head + joined(([k, 0, *turns[k], *(1e3 * P[k])] for k in range(N)), ",")
 
 
 def of_g2o():
@@ -140,7 +151,57 @@ def of_euroc():
     return joined(([t, *p, *q, 0.5] for t, p, q in rows), ", ")
 
 
+def of_rows(header, *values, separator=","):
+    """Numbers below a header, each value (N, ...) one or several columns."""
+    rows = zip(*values, strict=True)
+    return header + joined(
+        ([x for v in row for x in np.ravel(v).tolist()] for row in rows), separator
+    )
+
+
+def of_echo(frames="odom,base"):
+    """As ros2 topic echo --csv writes TransformStamped, or PoseStamped."""
+    stamps = (f"{each // 10**9},{each % 10**9}" for each in TRUTH.stamps_ns.tolist())
+    return joined(([stamp, frames, *p, *q] for stamp, p, q in zip(stamps, P, Q, strict=True)), ",")
+
+
+def of_nuscenes():
+    keys = ("token", "timestamp", "rotation", "translation")
+    values = zip(
+        map(str, STAMPS), (STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True
+    )
+    return json.dumps([dict(zip(keys, each, strict=True)) for each in values][::-1], indent=1)
+
+
+STAMPS, WXYZ = TRUTH.stamps_ns, Q[:, [3, 0, 1, 2]]
+ROWS = TRUTH.poses[:, :3].reshape(-1, 12)
+OKVIS = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n"
+ULOG2CSV = "timestamp,position[0],position[1],position[2],q[0],q[1],q[2],q[3]\n"
 FORMATS = {
+    "mulran": (of_rows("", STAMPS, ROWS), "looks like format csv"),
+    "stamp_and_matrix": (of_rows("", SECONDS, TRUTH.poses.reshape(-1, 16), separator=" "), ""),
+    "newer_college": (
+        of_rows("#sec,nsec,x,y,z,qx,qy,qz,qw\n", STAMPS // 10**9, STAMPS % 10**9, P, Q),
+        "",
+    ),
+    "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
+    "ids": (
+        of_rows("id timestamp tx ty tz qx qy qz qw\n", [*range(N)], SECONDS, P, Q, separator=" "),
+        "",
+    ),
+    "ulog2csv": (of_rows(ULOG2CSV, STAMPS // 1000, P, WXYZ), "scalar first"),
+    "arm": (
+        of_rows("t,x_ft,y_ft,z_ft,rotvec_x,rotvec_y,rotvec_z\n", SECONDS, P / 0.3048, VECTORS),
+        "read in rad",
+    ),
+    "comments": (
+        of_rows("// of Xsens\nt,x,y,z,qx,qy,qz,qw\n", SECONDS, P, Q),
+        "",
+    ),
+    "echo": (of_echo(), ""),
+    "echo_of_poses": (of_echo("map"), ""),
+    "nuscenes": (of_nuscenes(), ""),
+    "vicon_quaternions": (of_vicon("RX,RY,RZ,RW", ",,,"), "read as quaternions"),
     "tum": ("# of a program of eight words or so\n" + joined(np.c_[SECONDS, P, Q].tolist()), ""),
     "kitti": (joined(TRUTH.poses[:, :3].reshape(-1, 12)), "stamps read from"),
     "euroc": (of_euroc(), "looks like format euroc"),
@@ -152,7 +213,7 @@ FORMATS = {
     "nerfstudio": (of_nerfstudio(), "not those of OpenGL"),
     "motive": (of_motive(), "rigid body drone"),
     "vicon": (of_vicon(), "rotation vectors"),
-    "nmea": (of_nmea(), "positions alone"),
+    "nmea": (of_nmea(), "1 sentences with a wrong checksum left out"),
     "gpx": (of_gpx(), "above the sea"),
     "rtklib": (of_rtklib(), "18 s ahead of UTC"),
     "rtklib_weeks": (of_rtklib(weeks=True), "18 s ahead of UTC"),
@@ -172,7 +233,7 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
     (tmp_path / "times.txt").write_text("\n".join(map(repr, SECONDS.tolist())))
     found = read_trajectory_file(path, AUTO)
     trajectory = found.trajectory
-    start_ns = TRUTH.stamps_ns[0] if name == "vicon" else 0
+    start_ns = TRUTH.stamps_ns[0] if name.startswith("vicon") else 0
     np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
     expected = TRUTH.poses.copy()
     if trajectory.measures == "positions":
@@ -199,9 +260,13 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_pa
     names = [f"{chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(N)]
     (tmp_path / "a.json").write_text(of_nerfstudio(names))
     (tmp_path / "b.json").write_text(of_nerfstudio(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1]))
-    for name, poses in (("a.kitti", TRUTH.poses), ("b.kitti", TRUTH.poses @ MOUNT)):
-        (tmp_path / name).write_text(joined(poses[:, :3].reshape(-1, 12)))
-    for kind, by in (("json", "name"), ("kitti", "row")):
+    for name, poses in (("a", TRUTH.poses), ("b", TRUTH.poses @ MOUNT)):
+        (tmp_path / f"{name}.kitti").write_text(joined(poses[:, :3].reshape(-1, 12)))
+        (tmp_path / f"{name}.txt").write_text(joined(poses.reshape(-1, 16)))
+        (tmp_path / f"{name}.pose").write_text(joined(se3.to_rows(poses)))
+        np.save(tmp_path / f"{name}.npy", poses)
+    kinds = ("kitti", "row"), ("txt", "row"), ("pose", "row"), ("npy", "row")
+    for kind, by in (("json", "name"), *kinds):
         command = ["calibrate", *(str(tmp_path / f"{name}.{kind}") for name in "ab")]
         assert main([*command, "--pair-by", by, "--json"]) in (0, 3)
         document = json.loads(capsys.readouterr().out)
@@ -276,8 +341,23 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"<gpx><trkpt lat='1' lon='2'/></gpx>", "has no time"),
         (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),
         (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
+        (b'[{"cameras": {}, "shots": {}}]', "ego_pose.json of nuScenes"),
+        (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n", "a g2o graph without vertices"),
+        (
+            b"source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw\n1,2,0,0,0,0,0,0\n",
+            "chain",
+        ),
+        (b'<?xml version="1.0"?>\n<kml></kml>', "export the track as GPX"),
+        (b"SQLite format 3\0", "a bag ends in .db3"),
+        (
+            b"# Frame list\n#   FRAME_ID, RIG_ID, RIG_FROM_WORLD\n1 1 1 0 0 0 0 0 0 0\n",
+            "images.txt",
+        ),
+        (b"# .PCD v0.7\nVERSION 0.7\n", "points, no trajectory"),
+        (b"header:\n  stamp:\n    sec: 1\n", "YAML, no trajectory; record messages as a bag"),
+        (of_echo("a,b,c").encode(), "messages without poses"),
         (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
-        (of_nmea().replace("RMC", "VTG").encode(), "the date in RMC sentences"),
+        (re.sub(r"\*..", "", of_nmea()).replace("RMC", "ZDA").encode(), "the date in RMC"),
         (b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n", "set out-solformat to llh, degrees"),
         (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
         (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),

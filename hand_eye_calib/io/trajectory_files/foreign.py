@@ -11,8 +11,10 @@ import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 import numpy as np
@@ -27,6 +29,7 @@ from hand_eye_calib.text import shortened
 
 _POSE = (*POSITION, *QUATERNION)
 _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
+_EGO_POSE = ("timestamp", "translation", "rotation")
 # Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
@@ -66,24 +69,30 @@ def _lines(data: bytes) -> list[str]:
 def _of_nmea(data: bytes, _: str | None) -> _Rows:
     """GGA sentences; the day is that of the last RMC sentence."""
     rows: list[Sequence[float]] = []
-    day = None
+    day, n_damaged = None, 0
     for line in _lines(data):
-        cells = line.partition("*")[0].strip().split(",")
+        text, _, check = line[line.find("$") + 1 :].partition("*")
+        if check and f"{reduce(xor, text.encode(), 0):02X}" != check[:2].upper():
+            n_damaged += 1
+            continue
+        cells = text.strip().split(",")
         if cells[0][-3:] == "RMC" and len(cells) > 9 and cells[9]:
             day = datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
         elif day is None or cells[0][-3:] != "GGA" or len(cells) < 12:
             continue
         elif cells[6] not in ("", "0") and cells[9]:
             clock, lat, north, lon, east = cells[1:6]
-            now = 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
+            now = day + 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
+            if rows and now < rows[-1][0] - 43_200:  # midnight, and the next date is still to come
+                now += 86_400
             degrees = (
                 (-1 if side in "SW" else 1) * (int(each[:n]) + float(each[n:]) / 60)
                 for each, n, side in ((lat, 2, north), (lon, 3, east))
             )
-            rows.append([day + now, *degrees, float(cells[9]) + float(cells[11] or 0)])
+            rows.append([now, *degrees, float(cells[9]) + float(cells[11] or 0)])
     if not rows:
         raise ValueError("NMEA: expected GGA sentences with a fix, and the date in RMC sentences")
-    return _PLACE, rows, ()
+    return _PLACE, rows, [f"{n_damaged} sentences with a wrong checksum left out"][:n_damaged]
 
 
 def _of_gpx(data: bytes, _: str | None) -> _Rows:
@@ -109,16 +118,19 @@ def _of_rtklib(data: bytes, _: str | None) -> _Rows:
                 stamp = repr(gps_epoch + 604_800 * int(cells[0]) + float(cells[1]))
             rows.append((stamp, *cells[2:5]))
     note = "stamps are of GPS time, 18 s ahead of UTC since 2017"
-    return _PLACE, rows, [note] if b"GPST" in data else ()
+    return _PLACE, rows, [note] if re.search(rb"(?m)^%\s+GPST\b", data) else ()
 
 
 # ---- poses
 
 
 def _of_g2o(data: bytes, _: str | None) -> _Rows:
-    vertices = (line.split() for line in _lines(data) if line.startswith("VERTEX_SE3:QUAT "))
-    rows = sorted((cells[1:9] for cells in vertices), key=lambda row: int(row[0]))
-    return ("t [s]", *_POSE), rows, [_NUMBERED.format("vertices")]
+    vertices = [line.split()[1:9] for line in _lines(data) if line.startswith("VERTEX_SE")]
+    if not vertices:
+        raise ValueError("a g2o graph without vertices; save it with them, optimised")
+    rows = sorted(vertices, key=lambda row: int(row[0]))
+    names = _POSE if len(rows[0]) > len(_POSE) else ("x", "y", "yaw [rad]")
+    return ("t [s]", *names), rows, [_NUMBERED.format("vertices")]
 
 
 def _of_colmap(data: bytes, _: str | None) -> _Rows:
@@ -136,9 +148,16 @@ def _of_colmap(data: bytes, _: str | None) -> _Rows:
 
 def _of_json(data: bytes, _: str | None) -> _Rows:
     document = json.loads(data)
-    frames = document.get("frames") if isinstance(document, dict) else None
-    if not isinstance(frames, list) or not frames or "transform_matrix" not in frames[0]:
-        raise ValueError("JSON that is not read; expected transforms.json of nerfstudio, or csv")
+    frames = document.get("frames") if isinstance(document, dict) else document
+    first = frames[0] if isinstance(frames, list) and frames else ()
+    if {*_EGO_POSE} <= {*first}:
+        poses = ([each[_EGO_POSE[0]], *each[_EGO_POSE[1]], *each[_EGO_POSE[2]]] for each in frames)
+        return ("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(poses), ()
+    if "transform_matrix" not in first:
+        raise ValueError(
+            "JSON that is not read; expected transforms.json of nerfstudio, ego_pose.json of "
+            "nuScenes, or csv"
+        )
     Ts_world_camera = np.array([each["transform_matrix"] for each in frames], dtype=float)
     Ts_world_camera[:, :3, :3] = Ts_world_camera[:, :3, :3] @ _FLIP
     turned = "axes of the camera: x right, y down, z forward, not those of OpenGL in the file"
@@ -195,25 +214,32 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
         raise ValueError("Vicon without segments: export Segments or Objects (global), not markers")
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
     body = _chosen(starts, choice, "segments")
-    at = starts[body]
-    rows = [cells for cells in lines[5:] if len(cells) >= at + 6 and all(cells[at : at + 6])]
-    values = np.array([[float(each) for each in cells[at : at + 6]] for cells in rows])
-    angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
-    positions = values[:, 3:] * {"m": 1.0, "cm": 0.01, "mm": 0.001}[units[at + 3]]
-    poses = se3.from_rotation_translation(se3.rotation_exp(angles), positions)
+    at, place = starts[body], columns.index("TX", starts[body])
+    rows = [cells for cells in lines[5:] if len(cells) >= place + 3 and all(cells[at : place + 3])]
+    values = np.array([[float(each) for each in cells[at : place + 3]] for cells in rows])
+    positions = values[:, -3:] * {"m": 1.0, "cm": 0.01, "mm": 0.001}[units[place]]
+    if "RW" in columns[at:place]:
+        kind, poses = "quaternions", se3.from_quat_xyzw(positions, values[:, :4])
+    else:
+        angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
+        rotations = se3.rotation_exp(angles)
+        kind, poses = "rotation vectors", se3.from_rotation_translation(rotations, positions)
     stamps = [int(cells[0]) / rate_hz for cells in rows]
-    note = f"poses of {body}; rotations read as rotation vectors"
+    note = f"poses of {body}; rotations read as {kind}"
     return ("t [s]", *MATRIX), np.c_[stamps, _as_rows(poses)].tolist(), [note]
 
 
 def _of_numpy(data: bytes, _: str | None) -> _Rows:
     values = np.load(io.BytesIO(data), allow_pickle=False)
-    if values.ndim != 2 or values.shape[1] not in (4, 8) or values.dtype.kind not in "fiu":
+    names = ("t", *_POSE)[: values.shape[-1] if values.ndim == 2 else 0]
+    if values.shape[1:] in ((3, 4), (4, 4)):
+        names, values = MATRIX, _as_rows(values)
+    if len(names) not in (4, 8, 12) or values.dtype.kind not in "fiu":
         raise ValueError(
             f"an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, z, qx, "
-            "qy, qz, qw, or (N, 4) of t, x, y, z"
+            "qy, qz, qw, (N, 4) of t, x, y, z, or matrices (N, 4, 4)"
         )
-    return ("t", *_POSE)[: values.shape[1]], values.tolist(), ()
+    return names, values.tolist(), ()
 
 
 def _of_ulog(data: bytes, _: str | None) -> _Rows:
@@ -270,16 +296,49 @@ def _chosen(found: Mapping[str, Any], choice: str | None, what: str) -> str:
     return next(iter(found))
 
 
+# Cells of a message, and the one where its pose begins: PoseStamped, with covariance, Odometry,
+# TransformStamped.
+_POSE_OF_CELLS = {10: 3, 46: 3, 89: 4, 11: 4}
+
+
+def _of_echo(data: bytes, _: str | None) -> _Rows:
+    """Messages with a header as ``ros2 topic echo --csv`` writes them."""
+    rows = [line.split(",") for line in _lines(data) if line]
+    at = _POSE_OF_CELLS.get(len(rows[0]))
+    if at is None:
+        raise ValueError("messages without poses, as of ros2 topic echo --csv; record a bag")
+    return ("secs", "nsecs", *_POSE), ([*row[:2], *row[at : at + 7]] for row in rows), ()
+
+
+def _refusing(sentence: str) -> _Reader:
+    def refuse(_: bytes, __: str | None) -> NoReturn:
+        raise ValueError(sentence)
+
+    return refuse
+
+
+# How files begin that have no trajectory, and what to do.
+_REFUSED = {
+    rb"\Asource_timestamp,destination_timestamp": "motions between images, no poses; chain them",
+    rb"\A(<\?xml[^>]*>\s*)?<kml": "KML without times; export the track as GPX",
+    rb"\ASQLite format 3": "a database; a bag ends in .db3, and COLMAP exports its model as text",
+    rb"\A(#.*\n)+#\s+FRAME_ID, RIG_ID": "frames of COLMAP; give its images.txt",
+    rb"\A(# \.PCD|VERSION 0?\.7)": "points, no trajectory; record the odometry as a bag",
+    rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML, no trajectory; record messages as a bag; "
+    "samples of an arm are a recording of their own",
+}
 #: How files begin that are no text with a row of numbers on each line, and what reads them.
 PROGRAMS: dict[bytes, _Reader] = {
+    **{begin: _refusing(sentence) for begin, sentence in _REFUSED.items()},
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
     rb"\A(<\?xml[^>]*>\s*)?<gpx": _of_gpx,
-    rb"\A\{": _of_json,
-    rb"\A\$[A-Z]{5},": _of_nmea,
+    rb"\A(\{|\[\s*[\[{\"\d-])": _of_json,
+    rb"\$[A-Z]{2}(GGA|RMC),": _of_nmea,
+    rb"\A\d{9,10},\d{1,9},[^,\n]*[A-Za-z/][^,\n]*,": _of_echo,
     rb"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)": _of_rtklib,
     rb"\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW": _of_colmap,
-    rb"(?m)^VERTEX_SE3:QUAT ": _of_g2o,
+    rb"(?m)^(VERTEX|EDGE)_SE(2|3:QUAT) ": _of_g2o,
     rb"\AFormat Version,": _of_motive,
     rb"\A(Segments|Objects|Trajectories)\b.*\r?\n\d+": _of_vicon,
 }

@@ -25,6 +25,8 @@ from hand_eye_calib.io.trajectory_files.table import (
     MATRIX,
     QUATERNION,
     RATES,
+    ROTATION_VECTOR,
+    SCALAR_FIRST,
     UNNAMED,
     Table,
     seconds,
@@ -38,7 +40,7 @@ _LONGEST_INTERVAL_S = 10
 # second if a value is larger than the limit: a turn with room for rounding, and 2,000 deg/s, which
 # no gyroscope exceeds.
 _KINDS = {
-    "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001}, np.inf),
+    "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}, np.inf),
     "angle": ({"rad": 1.0, "deg": np.pi / 180}, 2 * np.pi + 0.01),
     "rate": ({"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0),
 }
@@ -208,10 +210,13 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
 
 def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:
     """Quaternions (N, 4), scalar last; level where there are none."""
-    names = next((each for each in (QUATERNION, UNNAMED) if each[0] in table.at), ())
+    kinds = (QUATERNION, SCALAR_FIRST, UNNAMED)
+    names = next((each for each in kinds if each[0] in table.at), ())
     if not names:
         if {"yaw", "heading"} & table.at.keys():
             return _from_angles(table, positions, convention)
+        if ROTATION_VECTOR[0] in table.at:
+            return se3.to_quat_xyzw(se3.rotation_exp(_in_si(table, ROTATION_VECTOR, "angle")))
         return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
     quats = table.values(names)
     with np.errstate(over="ignore"):
@@ -228,6 +233,10 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
     # The order that motion and start speak for; the scalar is last if they say nothing.
     ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
     fitting = _fitting(positions, ways)
+    if names == SCALAR_FIRST:
+        way = "last" if fitting == ["last"] else "first"
+        table.guess(f"q0, q1, q2, q3 read with the scalar {way}")
+        return ways[way]
     # An odometry starts at the identity.
     level = [way for way, (first, *_) in ways.items() if np.isclose(abs(first[3]), 1.0, rtol=0.0)]
     reason = ""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory, TrajectoryLike
 from hand_eye_calib.io.files import LONGEST_LINE, read_bytes, read_text
 from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
@@ -52,8 +52,16 @@ _FORMATS: dict[str, tuple[Sequence[str], str]] = {
 }
 # A stamp, a position and a quaternion, whose order is to be found.
 _UNNAMED = ("t", *POSITION, *UNNAMED)
+# Rows of numbers that have a matrix, all or the first three rows of it, by how many there are.
+_LAST_ROW = tuple(f"m4{column}" for column in "1234")
+_BY_NUMBER = {
+    13: ("t", *MATRIX),
+    16: (*MATRIX, *_LAST_ROW),
+    17: ("t", *MATRIX, *_LAST_ROW),
+}
 _TIMES = "times.txt"
 _LINE = re.compile(r"\S[^\n]*")
+_COMMENTS = ("#", "//")
 _DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+([eE][-+]?\d+)?)")
 # Time between poses that are paired without stamps.
 _STEP_NS = 100_000_000
@@ -319,7 +327,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     except UnicodeDecodeError:
         raise InputError(
             f"{path}: not a text file; expected lines of a trajectory: save the poses of MATLAB, "
-            "HDF5, spreadsheets and pickles as csv"
+            "HDF5, Arrow, spreadsheets and pickles as csv, and a model of COLMAP as text"
         ) from None
     number, cells, names, format, header = _beginning(path, text)
     columns, times, guesses = options.columns, options.times, list[str]()
@@ -366,7 +374,7 @@ def _lines(path: str | Path, text: str, after: int | None = None) -> Iterator[tu
         end = line.end()
         if end - line.start() > LONGEST_LINE:
             raise InputError(f"{path}, line {number}: longer than {LONGEST_LINE} characters")
-        if after is None or (number > after and text[line.start()] != "#"):
+        if after is None or (number > after and not line[0].startswith(_COMMENTS)):
             yield number, line[0].rstrip()
 
 
@@ -393,9 +401,9 @@ def _beginning(
     comments: dict[int, list[str]] = {}
     first = 0, "", list[str](), True
     for number, line in _lines(path, text):
-        cells = _cells(line.lstrip("#").strip())
+        cells = _cells(line.lstrip("#/").strip())
         is_row = all(NUMBER.fullmatch(cell) for cell in cells if cell)
-        if not line.startswith("#"):
+        if not line.startswith(_COMMENTS):
             first = number, line, cells, is_row
             break
         if not is_row:
@@ -406,15 +414,24 @@ def _beginning(
     is_separated, n_cells = "," in line or ";" in line, len(cells)
     known = named_columns(names or ())[0].keys()
     if names is cells or any({*group} <= known for group in (*PLANAR_POSITIONS, RATES)):
-        is_tum = " ".join(names or ()).lower().endswith(TUM_COLUMNS.partition(" ")[2])
+        is_tum = " ".join((names or ())[1:]).lower() == TUM_COLUMNS.partition(" ")[2]
         found = ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", names)
+    elif (by_number := _BY_NUMBER.get(n_cells)) and _has_rotation(cells[by_number.index("m11") :]):
+        found = "csv", by_number
     elif not is_separated and n_cells != 4:
-        found = ("kitti", MATRIX) if n_cells == 12 else ("tum", _UNNAMED)
+        known = {7: ("csv", _UNNAMED[1:]), 12: ("kitti", MATRIX)}
+        found = known.get(n_cells, ("tum", _UNNAMED))
     elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= DIGITS["ns"]:
         found = "euroc", _FORMATS["euroc"][0]
     else:
         found = "csv", _UNNAMED if n_cells == 8 else None
     return number, cells, names, *found
+
+
+def _has_rotation(cells: Sequence[str]) -> bool:
+    """Whether rows of a matrix have a rotation in their first three columns."""
+    R = np.array(cells[:12], dtype=float).reshape(3, 4)[:, :3]
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=ROTATION_TOLERANCE))
 
 
 def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:

@@ -24,8 +24,10 @@ from hand_eye_calib.text import shortened, shown_value
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-# Coefficients of a quaternion whose order is not known.
+# Coefficients of a quaternion with the scalar first, and of one whose order is not known.
+SCALAR_FIRST = ("q0", "q1", "q2", "q3")
 UNNAMED = ("q1", "q2", "q3", "q4")
+ROTATION_VECTOR = ("rotvec_x", "rotvec_y", "rotvec_z")
 # The first three rows of a pose's matrix.
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 RATES = ("wx", "wy", "wz")
@@ -34,23 +36,30 @@ TWIST = ("vx", "vy", "vz", *RATES)
 # plane, fewer.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
 PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
-_ORIENTATIONS = (QUATERNION, ("roll", "pitch", "yaw"), ("roll", "pitch", "heading"), UNNAMED)
+_ORIENTATIONS = (
+    QUATERNION,
+    SCALAR_FIRST,
+    ("roll", "pitch", "yaw"),
+    ("roll", "pitch", "heading"),
+    ROTATION_VECTOR,
+    UNNAMED,
+)
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
 
 # What stands before the axis in names of angular rates, velocities and quaternions.
 _BEGINNINGS = {
-    "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_ w_rs_s_",
+    "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
     "v": "v",
-    "q": "q q_ quat_ quaternion_ rot_ orientation_ rotation_ q_rs_",
+    "q": "q q_ quat_ quaternion_ rot_ orientation_ rotation_",
 }
-_OF_POSITION = "{0} t{0} p{0} p_{0} pos_{0} position_{0} translation_{0} p_rs_r_{0} "
+_OF_POSITION = "{0} t{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
 _ALIASES = {
     "t": "t time timestamp timestamps stamp gpstime header_stamp",
-    "x": _OF_POSITION.format("x") + "easting",
-    "y": _OF_POSITION.format("y") + "northing",
-    "z": _OF_POSITION.format("z") + "altitude",
+    "x": _OF_POSITION.format("x") + "easting position0",
+    "y": _OF_POSITION.format("y") + "northing position1",
+    "z": _OF_POSITION.format("z") + "altitude position2",
     "lat": "lat latitude",
     "lon": "lon long lng longitude",
     "height": "height h_ell ellipsoidal_height altitude alt",
@@ -59,21 +68,28 @@ _ALIASES = {
     "yaw": "yaw yaw_angle theta",
     "heading": "heading true_heading hdg azimuth",
     "secs": "header_stamp_secs header_stamp_sec stamp_secs stamp_sec secs sec",
-    "nsecs": "header_stamp_nsecs header_stamp_nanosec stamp_nsecs stamp_nanosec nsecs nanosec",
+    "nsecs": "header_stamp_nsecs header_stamp_nanosec stamp_nsecs stamp_nanosec nsecs nanosec nsec",
     "image": "image",
     **{
         f"{kind}{axis}": " ".join(f"{name}{axis}" for name in names.split())
         for kind, names in _BEGINNINGS.items()
         for axis in "xyzw"
     },
-    **{name: name for name in (*MATRIX, *UNNAMED)},
+    **{name: f"{name} quat_{name}" for name in (*SCALAR_FIRST, *UNNAMED)},
+    **{name: name for name in (*MATRIX, *ROTATION_VECTOR)},
 }
-# Names that stand for a part of an orientation, even if it is not known which.
-_ORIENTED = re.compile(r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude", re.I).search
+# Names that stand for a part of an orientation, or of a position, even if it is not known which.
+_ORIENTED = re.compile(
+    r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude|^([abcpwr]|r[xyz])$", re.I
+).search
+_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord)", re.I).search
 
 # Units as names have them, with a slash for what separates words.
 _UNITS = {
-    **{unit: unit for unit in ("m", "mm", "cm", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)},
+    **{
+        unit: unit for unit in ("m", "mm", "cm", "ft", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)
+    },
+    "feet": "ft",
     **dict.fromkeys(("degree", "degrees", "°"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
     **dict.fromkeys(("dps", "°/s"), "deg/s"),
@@ -123,7 +139,8 @@ class Table:
         if missing := [name for name in measured if name not in found]:
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among {listed}; name all columns "
-                "with `columns`, such as t,x,y,z,qw,qx,qy,qz"
+                "with `columns`, such as t,x,y,z,qw,qx,qy,qz, or roll_deg,pitch_deg,yaw_deg or "
+                "rotvec_x,rotvec_y,rotvec_z for turns"
             )
         for name in (*stamp, *measured):
             if len(found[name]) > 1:
@@ -214,7 +231,10 @@ def _measured(
         if flat and not (found.keys() & oriented or any(map(_ORIENTED, names))):
             measures = "positions"
         elif not found.keys() & {*sum(_POSITIONS, ())}:
-            measures = "rates" if {*RATES} <= found.keys() else "rotations" if turn else "poses"
+            is_turning = turn and not any(map(_PLACED, names))
+            measures = (
+                "rates" if {*RATES} <= found.keys() else "rotations" if is_turning else "poses"
+            )
     if measures == "poses" and MATRIX[0] in found:
         return measures, MATRIX
     orientation: Sequence[str] = turn or heading or QUATERNION
@@ -229,7 +249,9 @@ def _split(name: str) -> tuple[str, str]:
     """A column's name without its unit, and the unit, empty if there is none:
     ``.pose.position.x [mm]`` to pose_position_x and mm, wx_deg_s to wx and deg/s.
     """
-    name = name.strip().lower()
+    # An element such as q[0], and frames as in p_RS_R_x.
+    name = re.sub(r"\[(\d)\]$", r"\1", name.strip().lower())
+    name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_", r"\1_", name)
     words = re.findall("[a-z0-9°]+", re.sub(r"\[.*?\]|\(.*?\)", "", name))
     if in_brackets := re.search(r"[\[(]\s*([^\])]*?)\s*(?:\^?-1)?\s*[\])]$", name):
         return "_".join(words), _UNITS.get(re.sub(r"[\s/_]+", "/", in_brackets[1]), "")
