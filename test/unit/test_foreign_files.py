@@ -341,7 +341,7 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"<gpx><trkpt lat='1' lon='2'/></gpx>", "has no time"),
         (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),
         (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
-        (b'[{"cameras": {}, "shots": {}}]', "ego_pose.json of nuScenes"),
+        (b"[1, 2]", "ego_pose.json of nuScenes"),
         (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n", "a g2o graph without vertices"),
         (
             b"source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw\n1,2,0,0,0,0,0,0\n",

@@ -25,7 +25,7 @@ GEODETIC = geodetic(P - P[0], (48.1, 11.5, 550.0))
 TWIST = "geometry_msgs/msg/TwistStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
-GEO = "geographic_msgs/msg/GeoPoseStamped"
+GEO, INS = "geographic_msgs/msg/GeoPoseStamped", "novatel_oem7_msgs/msg/INSPVA"
 MARKER, BODY, BODIES = (f"mocap4r2_msgs/msg/{x}" for x in ("Marker", "RigidBody", "RigidBodies"))
 NAMED, NAMED_ARRAY = (
     f"motion_capture_tracking_interfaces/msg/{x}" for x in ("NamedPose", "NamedPoseArray")
@@ -45,6 +45,9 @@ for name, fields in {
     POINT: "float64 latitude\nfloat64 longitude\nfloat64 altitude",
     POSE: "geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation",
     GEO: "std_msgs/Header header\ngeographic_msgs/GeoPose pose",
+    # Without what is not read.
+    INS: "std_msgs/Header header\nfloat64 latitude\nfloat64 longitude\nfloat64 height\n"
+    "float64 roll\nfloat64 pitch\nfloat64 azimuth",
 }.items():
     JAZZY.register(get_types_from_msg(fields, name))
 
@@ -59,8 +62,10 @@ def messages():
     steps = se3.log(se3.inverse(TRUTH.poses[:-1]) @ TRUTH.poses[1:]) / 0.05
     twists = np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
+    rpy = np.degrees(se3.rotation_to_rpy(TRUTH.poses[:, :3, :3]))
     types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
     types |= {
+        "/ins": INS,
         "/twists": f"{TWIST[:-7]}WithCovarianceStamped",
         "/bodies": BODIES,
         "/named": NAMED_ARRAY,
@@ -88,6 +93,7 @@ def messages():
             NAMED_ARRAY: (head, [made(NAMED, "cart", pose)]),
             ARRAY: (head, [pose, pose]),
             GEO: (head, made(POSE, point, quaternion)),
+            INS: (head, lat[k], lon[k], height[k], rpy[k, 0], -rpy[k, 1], 90.0 - rpy[k, 2]),
         }
         for key in found:
             found[key].append(made(key[1], *each[key[1]]))
@@ -122,6 +128,7 @@ def from_start(poses):
         ("/twists", 0.05),
         ("/fix+/imu", 1e-6),
         ("/geo", 1e-5),
+        ("/ins", 1e-5),
         ("/px4", 1e-5),
         ("/array", 1e-12),
         ("/bodies", 1e-12),
@@ -215,6 +222,14 @@ def test_json_without_what_its_type_has_is_named(tmp_path):
     in_json(path, "FrameTransforms", (b"rotation", b"turn"))
     with PoseBag(path) as bag, pytest.raises(InputError, match="/pose: .* not a readable foxglove"):
         bag.trajectory(TfSource.parse("map:base"))
+
+
+def test_values_that_are_not_finite_are_left_out(tmp_path):
+    in_json(tmp_path / "poses.mcap", "PoseInFrame", (b'"x": -', b'"x": -Infinity, "X": '))
+    with PoseBag(tmp_path / "poses.mcap") as opened:
+        found, _ = opened.trajectory("/pose")
+        assert f"{len(P) - len(found)} messages with values that are" in opened.warnings[0]
+    assert (found.stamps_ns == TRUTH.stamps_ns[(P[:, 0] >= 0) & (Q[:, 0] >= 0)]).all()
 
 
 def test_fields_of_a_place_are_positions(bag):

@@ -144,6 +144,13 @@ TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", f"{_FRAME_TRANSFORM}s"
 
 # Types that are read by their fields; of an array in a message, the first element.
 _FIELDS = {
+    **{
+        f"novatel_{name}": "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=height,"
+        "roll_deg=roll,pitch_deg=pitch,heading_deg=azimuth"
+        for name in ("oem7_msgs/msg/INSPVA", "oem7_msgs/msg/INSPVAX", "gps_msgs/msg/Inspva")
+    },
+    "septentrio_gnss_driver/msg/INSNavGeod": "t=header.stamp,lat_rad=latitude,lon_rad=longitude,"
+    "height=height,roll_deg=roll,pitch_deg=pitch,heading_deg=heading",
     "geographic_msgs/msg/GeoPoseStamped": "t=header.stamp,"
     + f"{_PLACE.format('pose.position.')},{_TURN.format('pose.orientation')}",
     "geometry_msgs/msg/TwistStamped": _twist_at("twist"),

@@ -142,14 +142,14 @@ class PoseBag:
             for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
                 self.measured(part, wanted)
         elif not fields and (type_ := self._type_of(topic)) not in messages.MESSAGE_TYPES:
-            hint = "read others by their fields, TOPIC?t=header.stamp,x=..."
+            hint = "name its fields, TOPIC?t=header.stamp,x=..."
             if type_ in messages.TF_TYPES:
                 hint = "name two of its frames instead, as odom:lidar"
             elif type_ in messages.IMAGE_TYPES:
                 hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
             raise InputError(
-                f"topic {source} of {self} is of type {type_ or 'several types'}; accepted are "
-                f"{', '.join(messages.MESSAGE_TYPES)}; {hint}. {self._listing()}"
+                f"topic {source} of {self} is of type {type_ or 'several types'}, which is not "
+                f"read as it is; {hint}. {self._listing()}"
             )
 
     def select(

@@ -10,6 +10,7 @@ camera's intrinsics.
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from decimal import Decimal
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ Source = str | TfSource
 # neighbours than these are from each other and than the usual step: computers delay for less.
 _JUMP_S = 0.5
 _NOTHING = PoseTable.of([], np.empty((0, 7)))
+_NOT_FINITE = {"nan", "inf", "-inf"}
 
 
 class Reading(ABC):
@@ -224,14 +226,18 @@ class FieldReading(Reading):
         of_table = "twists" if {*TWIST} <= {*self._names} else "auto"
         self._table = Table(topic, self._names, of_table)
         self._bag_ns: list[int] = []
+        self._n_left_out = 0
         self.measures = "poses" if of_table == "twists" else self._table.measures
         if self.measures == "rates":
             raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
 
     def take(self, run: Run) -> None:
-        rows = ([self._cell(each, path) for path in self._paths] for each in run.decoded())
-        self._table.fill(enumerate(rows, len(self._bag_ns) + 1), list)
-        self._bag_ns += run.bag_ns.tolist()
+        rows = [[self._cell(each, path) for path in self._paths] for each in run.decoded()]
+        # As of an estimator that has not started.
+        is_known = [_NOT_FINITE.isdisjoint(row) for row in rows]
+        self._n_left_out += is_known.count(False)
+        self._table.fill(enumerate(compress(rows, is_known), len(self._bag_ns) + 1), list)
+        self._bag_ns += run.bag_ns[is_known].tolist()
 
     def _cell(self, value: Any, path: list[str]) -> str:
         """A value of a message, stamps in seconds with all their digits."""
@@ -251,6 +257,8 @@ class FieldReading(Reading):
             topic = self.topics[0]
             raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
         stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
+        if self._n_left_out:
+            table.guess(f"{self._n_left_out} messages with values that are not finite left out")
         are_twists = table.measures == "twists"
         poses = _integrated(stamps_ns, table.values()) if are_twists else np.c_[poses_of(table)]
         return PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)

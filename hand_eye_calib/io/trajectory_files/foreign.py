@@ -29,7 +29,6 @@ from hand_eye_calib.text import shortened
 
 _POSE = (*POSITION, *QUATERNION)
 _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
-_EGO_POSE = ("timestamp", "translation", "rotation")
 # Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
@@ -148,12 +147,14 @@ def _of_colmap(data: bytes, _: str | None) -> _Rows:
 
 def _of_json(data: bytes, _: str | None) -> _Rows:
     document = json.loads(data)
-    frames = document.get("frames") if isinstance(document, dict) else document
-    first = frames[0] if isinstance(frames, list) and frames else ()
-    if {*_EGO_POSE} <= {*first}:
-        poses = ([each[_EGO_POSE[0]], *each[_EGO_POSE[1]], *each[_EGO_POSE[2]]] for each in frames)
+    found = document.get("frames") if isinstance(document, dict) else document
+    is_list = isinstance(found, list) and found and isinstance(found[0], dict)
+    frames: list[Any] = found if is_list else [{}]
+    names = frames[0].keys()
+    if {"timestamp", "translation", "rotation"} <= names:
+        poses = ([each["timestamp"], *each["translation"], *each["rotation"]] for each in frames)
         return ("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(poses), ()
-    if "transform_matrix" not in first:
+    if "transform_matrix" not in names:
         raise ValueError(
             "JSON that is not read; expected transforms.json of nerfstudio, ego_pose.json of "
             "nuScenes, or csv"

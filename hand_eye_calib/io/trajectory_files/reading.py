@@ -419,8 +419,8 @@ def _beginning(
     elif (by_number := _BY_NUMBER.get(n_cells)) and _has_rotation(cells[by_number.index("m11") :]):
         found = "csv", by_number
     elif not is_separated and n_cells != 4:
-        known = {7: ("csv", _UNNAMED[1:]), 12: ("kitti", MATRIX)}
-        found = known.get(n_cells, ("tum", _UNNAMED))
+        by_default = "tum", _UNNAMED
+        found = {7: ("csv", _UNNAMED[1:]), 12: ("kitti", MATRIX)}.get(n_cells, by_default)
     elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= DIGITS["ns"]:
         found = "euroc", _FORMATS["euroc"][0]
     else:
