@@ -14,9 +14,8 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import PoseTable
 from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.sources import Source
+from hand_eye_calib.io.bags.sources import Source, source_of
 from hand_eye_calib.io.trajectory_files.table import seconds
-from hand_eye_calib.io.transforms import TfSource
 
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
 # A part may begin before the last poses of the one before it are written.
@@ -49,11 +48,6 @@ def read_recording(
             "with topics or frames"
         )
     return read_journal_of(journal, options)
-
-
-def source_of(text: str) -> Source:
-    """The topic, or the frames, that a text names."""
-    return TfSource.parse(text) if ":" in text.partition("?")[0] else text
 
 
 def select(

@@ -27,8 +27,9 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
     if topics := arguments.topics:
-        from hand_eye_calib.cli.bags import read_sources, refuse_recordings, source_of
+        from hand_eye_calib.cli.bags import read_sources, refuse_recordings
         from hand_eye_calib.io.bags.reader import PoseBag
+        from hand_eye_calib.io.bags.sources import source_of
 
         names, sources = topics, [*map(source_of, topics)]
         refuse_recordings(arguments.paths, sources)

@@ -191,22 +191,22 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     moving = [("odom", "map", slow), ("base", "odom", PARENT)]
     static = [("lidar", "base", MOUNT), ("rear", "base", T_PARENT_CHILD)]
     path = write_messages(bag_path(tmp_path, storage), transforms(moving, static), storage)
-    trajectory = hec.read_trajectory(path, tf="map:lidar")
+    trajectory = hec.read_trajectory(path, topic="map:lidar")
     stamps_ns = slow.stamps_ns[slow.stamps_ns <= PARENT.stamps_ns[-1]]
     expected = slow.poses[: len(stamps_ns)] @ PARENT.at(stamps_ns, straight=True) @ MOUNT
     assert_same_motion(trajectory, stamps_ns, expected)
     assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", "lidar")
     # Up and down again, through the common ancestor; and against the direction of the tree.
-    other = hec.read_trajectory(path, tf="odom:lidar")
+    other = hec.read_trajectory(path, topic="odom:lidar")
     assert_same_motion(other, PARENT.stamps_ns, PARENT.poses @ MOUNT)
-    backwards = hec.read_trajectory(path, tf="lidar:odom")
+    backwards = hec.read_trajectory(path, topic="lidar:odom")
     assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
     said = (
         r"transform lidar:rear: it does not move: all of its transforms are static; it has "
         r"base:lidar \(static\), base:rear \(static\), map:odom"
     )
     with pytest.raises(InputError, match=said):
-        hec.read_trajectory(path, tf="lidar:rear")
+        hec.read_trajectory(path, topic="lidar:rear")
 
 
 def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
@@ -216,7 +216,7 @@ def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
         for stamp_ns, matrix in zip(PARENT.stamps_ns, PARENT.poses, strict=True)
     ]
     path = write_messages(tmp_path / "old.bag", messages * 2, "rosbag1")
-    assert_same_motion(hec.read_trajectory(path, tf="odom:base"), PARENT.stamps_ns, PARENT.poses)
+    assert_same_motion(hec.read_trajectory(path, topic="odom:base"), PARENT.stamps_ns, PARENT.poses)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +233,7 @@ def test_transforms_that_do_not_lead_there(tmp_path, new_bag, edges, message):
     moving = [(*edge.split(), PARENT) for edge in edges]
     path = write_messages(tmp_path / "tf", transforms(moving)) if edges else new_bag()
     with pytest.raises(InputError, match=message) as caught:
-        hec.read_trajectory(path, tf="odom:lidar")
+        hec.read_trajectory(path, topic="odom:lidar")
     assert "\n" not in str(caught.value)
 
 

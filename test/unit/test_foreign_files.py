@@ -101,62 +101,27 @@ def of_nerfstudio(names=TRUTH.stamps_ns, poses=TRUTH.poses):
 def of_motive():
     head = (
         "Format Version,1.23,Take Name,a,Export Frame Rate,100.0,Rotation Type,Quaternion,"
-        "Length Units,Millimeters\n\n,Type,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,"
-        "Rigid Body,Rigid Body,Rigid Body,Marker\n,Name,drone,drone,drone,drone,drone,drone,drone,"
-        "drone,drone:1\n,,1,1,1,1,1,1,1,1,2\n,,Rotation,Rotation,Rotation,Rotation,Position,"
-        "Position,Position,Mean Marker Error,Position\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X\n"
+        f"Length Units,Millimeters\n\n,Type{',Rigid Body' * 8},Marker\n,Name{',drone' * 8},"
+        f"drone:1\n,{',1' * 8},2\n,{',Rotation' * 4}{',Position' * 3},Mean Marker Error,Position\n"
+        "Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X\n"
     )
-    rows = [
-        [k, t, *q, *(1e3 * p), 0.1, 1]
-        for k, (t, q, p) in enumerate(zip(SECONDS, Q, P, strict=True))
-    ]
-    lost = [N, SECONDS[-1] + 1, *[""] * 7, "", ""]
-    return head + joined([*rows, lost], ",")
+    rows = of_rows(head, range(N), SECONDS, Q, P * 1e3, [0.1] * N, [1] * N)
+    return f"{rows}{N},{SECONDS[-1] + 1}{',' * 9}\n"
 
 
-def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad"):
-    head = f"Objects\n10\n,,drone:drone\nFrame,Sub Frame,{turn},TX,TY,TZ\n,,{units},mm,mm,mm\n"
-    turns = Q if "RW" in turn else VECTORS
-    return head + joined(([k, 0, *turns[k], *(1e3 * P[k])] for k in range(N)), ",")
-
-
-def of_g2o():
-    rows = [["VERTEX_SE3:QUAT", k, *P[k], *Q[k]] for k in range(N)]
-    return joined(rows) + "EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n"
-
-
-def of_iso():
-    times = dates("%Y-%m-%dT%H:%M:%S.%f")
-    rows = ([f"{times[k]}Z", *P[k], *Q[k]] for k in range(N))
-    return "time,x,y,z,qx,qy,qz,qw\n" + joined(rows, ",")
-
-
-def of_decimal_comma():
-    values = np.c_[SECONDS, P, Q].tolist()
-    rows = [[repr(each).replace(".", ",") for each in row] for row in values]
-    return "t;x;y;z;qx;qy;qz;qw\n" + joined(rows, ";")
-
-
-def of_csv(unit, per_metre, time, per_second):
-    """In the units that the header names."""
-    names = ",".join(f"{axis} [{unit}]" for axis in "xyz")
-    head = f"# by hand\n# time [{time}],{names},q_w,q_x,q_y,q_z\n"
-    stamps = (f"{stamp * per_second // 10**9}" for stamp in TRUTH.stamps_ns.tolist())
-    rows = zip(stamps, P * per_metre, Q[:, [3, 0, 1, 2]], strict=True)
-    return head + joined(([t, *p, *q] for t, p, q in rows), ",")
-
-
-def of_euroc():
-    rows = zip(TRUTH.stamps_ns, P, Q[:, [3, 0, 1, 2]], strict=True)
-    return joined(([t, *p, *q, 0.5] for t, p, q in rows), ", ")
+def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad", bodies=("drone:drone",)):
+    """The second body has twice the positions of the first."""
+    names, n = ("," * (turn.count(",") + 4)).join(bodies), len(bodies)
+    head = f"Objects\n10\n,,{names}\nFrame,Sub Frame{f',{turn},TX,TY,TZ' * n}\n"
+    poses = [each for k in range(n) for each in (Q if "RW" in turn else VECTORS, P * 1e3 * (k + 1))]
+    return of_rows(f"{head},{f',{units},mm,mm,mm' * n}\n", range(N), [0] * N, *poses)
 
 
 def of_rows(header, *values, separator=","):
     """Numbers below a header, each value (N, ...) one or several columns."""
-    rows = zip(*values, strict=True)
-    return header + joined(
-        ([x for v in row for x in np.ravel(v).tolist()] for row in rows), separator
-    )
+    columns = [np.reshape(each, (N, -1)).tolist() for each in values]
+    rows = (sum(row, []) for row in zip(*columns, strict=True))
+    return header + joined(rows, separator)
 
 
 def of_echo(frames="odom,base"):
@@ -166,49 +131,46 @@ def of_echo(frames="odom,base"):
 
 
 def of_nuscenes():
-    keys = ("token", "timestamp", "rotation", "translation")
-    values = zip(
-        map(str, STAMPS), (STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True
-    )
+    values = zip((STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True)
+    keys = ("timestamp", "rotation", "translation")
     return json.dumps([dict(zip(keys, each, strict=True)) for each in values][::-1], indent=1)
 
 
 STAMPS, WXYZ = TRUTH.stamps_ns, Q[:, [3, 0, 1, 2]]
-ROWS = TRUTH.poses[:, :3].reshape(-1, 12)
+POSE = "tx,ty,tz,qx,qy,qz,qw\n"
+DATES = [f"{each}Z" for each in dates("%Y-%m-%dT%H:%M:%S.%f")]
+MATRICES = TRUTH.poses.reshape(N, 16)
+WITH_UNITS = "# by hand\n# time [{0}],x [{1}],y [{1}],z [{1}],q_w,q_x,q_y,q_z\n"
+EUROC = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w [],q_RS_x,q_RS_y,q_RS_z\n"
+ROT = "Stamp [ns],Pos_X [m],Pos_Y,Pos_Z,rot_w,rot_x,rot_y,rot_z\n"
 OKVIS = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n"
 ULOG2CSV = "timestamp,position[0],position[1],position[2],q[0],q[1],q[2],q[3]\n"
+ARM = "t,x_ft,y_ft,z_ft,rotvec_x,rotvec_y,rotvec_z\n"
 FORMATS = {
-    "mulran": (of_rows("", STAMPS, ROWS), "looks like format csv"),
-    "stamp_and_matrix": (of_rows("", SECONDS, TRUTH.poses.reshape(-1, 16), separator=" "), ""),
-    "newer_college": (
-        of_rows("#sec,nsec,x,y,z,qx,qy,qz,qw\n", STAMPS // 10**9, STAMPS % 10**9, P, Q),
-        "",
-    ),
-    "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
+    "tum": (of_rows("# of a program of eight words or so\n", SECONDS, P, Q, separator=" "), ""),
     "ids": (
-        of_rows("id timestamp tx ty tz qx qy qz qw\n", [*range(N)], SECONDS, P, Q, separator=" "),
+        of_rows(f"id timestamp {POSE}".replace(",", " "), range(N), SECONDS, P, Q, separator=" "),
         "",
     ),
+    "comments": (of_rows(f"// of Xsens\nt,{POSE}", SECONDS, P, Q), ""),
+    "seconds_and_nanoseconds": (of_rows(f"#sec,nsec,{POSE}", *divmod(STAMPS, 10**9), P, Q), ""),
+    "iso": (of_rows(f"time,{POSE}", DATES, P, Q), ""),
+    "decimal_comma": (of_rows(f"t,{POSE}", SECONDS, P, Q).replace(",", ";").replace(".", ","), ""),
+    "csv_mm_ms": (of_rows(WITH_UNITS.format("ms", "mm"), STAMPS // 10**6, P * 1e3, WXYZ), ""),
+    "csv_cm_us": (of_rows(WITH_UNITS.format("us", "cm"), STAMPS // 10**3, P * 1e2, WXYZ), ""),
+    "rotation_vectors_and_feet": (of_rows(ARM, SECONDS, P / 0.3048, VECTORS), "read in rad"),
     "ulog2csv": (of_rows(ULOG2CSV, STAMPS // 1000, P, WXYZ), "scalar first"),
-    "arm": (
-        of_rows("t,x_ft,y_ft,z_ft,rotvec_x,rotvec_y,rotvec_z\n", SECONDS, P / 0.3048, VECTORS),
-        "read in rad",
-    ),
-    "comments": (
-        of_rows("// of Xsens\nt,x,y,z,qx,qy,qz,qw\n", SECONDS, P, Q),
-        "",
-    ),
+    "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
+    "euroc_names": (of_rows(EUROC, STAMPS, P, WXYZ), "looks like format csv"),
+    "rot": (of_rows(ROT, STAMPS, P, WXYZ), ""),
+    "euroc": (of_rows("", STAMPS, P, WXYZ, P, separator=", "), "looks like format euroc"),
+    "kitti": (of_rows("", MATRICES[:, :12], separator=" "), "stamps read from"),
+    "stamp_and_rows": (of_rows("", STAMPS, MATRICES[:, :12]), "looks like format csv"),
+    "stamp_and_matrix": (of_rows("", SECONDS, MATRICES, separator=" "), ""),
     "echo": (of_echo(), ""),
     "echo_of_poses": (of_echo("map"), ""),
     "nuscenes": (of_nuscenes(), ""),
     "vicon_quaternions": (of_vicon("RX,RY,RZ,RW", ",,,"), "read as quaternions"),
-    "tum": ("# of a program of eight words or so\n" + joined(np.c_[SECONDS, P, Q].tolist()), ""),
-    "kitti": (joined(TRUTH.poses[:, :3].reshape(-1, 12)), "stamps read from"),
-    "euroc": (of_euroc(), "looks like format euroc"),
-    "csv_mm_ms": (of_csv("mm", 1e3, "ms", 1000), ""),
-    "csv_cm_us": (of_csv("cm", 1e2, "us", 10**6), ""),
-    "iso": (of_iso(), ""),
-    "decimal_comma": (of_decimal_comma(), ""),
     "colmap": (of_colmap(), ""),
     "nerfstudio": (of_nerfstudio(), "not those of OpenGL"),
     "motive": (of_motive(), "rigid body drone"),
@@ -248,7 +210,8 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
 
 def test_arrays_and_graphs(tmp_path):
     np.save(tmp_path / "a.npy", np.c_[SECONDS, P, Q])
-    (tmp_path / "a.g2o").write_text(of_g2o())
+    rows = of_rows("", ["VERTEX_SE3:QUAT"] * N, range(N), P, Q, separator=" ")
+    (tmp_path / "a.g2o").write_text(f"{rows}EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n")
     for name in ("a.npy", "a.g2o"):
         found = read_trajectory_file(tmp_path / name, AUTO)
         np.testing.assert_allclose(found.trajectory.poses, TRUTH.poses, atol=1e-12)
@@ -375,17 +338,8 @@ def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message)
 
 
 def test_of_several_bodies_one_is_named(tmp_path):
-    text = of_vicon().replace("drone:drone", "drone:drone,,,,,,cart:cart")
-    text = text.replace("TX,TY,TZ", "TX,TY,TZ,RX,RY,RZ,TX,TY,TZ").replace(
-        "mm,mm,mm", "mm,mm,mm,rad,rad,rad,mm,mm,mm"
-    )
-    lines = [
-        line + ",0,0,0,1,2,3" if line[:1].isdigit() and "," in line else line
-        for line in text.splitlines()
-    ]
-    (tmp_path / "vicon.csv").write_text("\n".join(lines))
+    (tmp_path / "vicon.csv").write_text(of_vicon(bodies=("drone:drone", "cart:cart")))
     with pytest.raises(InputError, match="several segments: drone:drone, cart:cart; name one"):
         read_trajectory_file(tmp_path / "vicon.csv", AUTO)
     found = read_trajectory_file(tmp_path / "vicon.csv", AUTO, columns="cart:cart").trajectory
-    assert isinstance(found, Trajectory)
-    np.testing.assert_allclose(found.poses[:, :3, 3], [[0.001, 0.002, 0.003]] * N)
+    np.testing.assert_allclose(found.poses[:, :3, 3], 2 * P, atol=1e-9)

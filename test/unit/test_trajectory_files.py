@@ -141,23 +141,6 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
             hec.read_trajectory(path, "kitti", times=beside)
 
 
-@pytest.mark.parametrize(
-    ("header", "separator"),
-    [
-        (
-            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y, p_RS_R_z, q_RS_w [], q_RS_x, q_RS_y, q_RS_z",
-            ", ",
-        ),
-        ("timestamp; tx; ty; tz; qw; qx; qy; qz", ";"),
-        ("# time px py pz q_w q_x q_y q_z", " "),
-        ("Stamp [ns],Pos_X [m],Pos_Y [m],Pos_Z [m],rot_w,rot_x,rot_y,rot_z", ","),
-    ],
-)
-def test_csv_finds_its_columns_by_their_names(file, header, separator):
-    path = file([header, *rows(TRAJECTORY.stamps_ns, "wxyz", separator)])
-    assert_is_the_trajectory(hec.read_trajectory(path, "csv"))
-
-
 def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
     names = ["time", ".header.stamp.secs", ".header.stamp.nsecs", ".child"]
     names += [f".pose.pose.position.{axis}" for axis in "xyz"]

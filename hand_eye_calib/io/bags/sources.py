@@ -42,6 +42,11 @@ _NOTHING = PoseTable.of([], np.empty((0, 7)))
 _NOT_FINITE = {"nan", "inf", "-inf"}
 
 
+def source_of(text: str) -> Source:
+    """The topic, or the frames, that a text names."""
+    return TfSource.parse(text) if ":" in text.partition("?")[0] else text
+
+
 class Reading(ABC):
     """Reads one stream; there is a subclass for each kind of source.
 

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,7 +24,13 @@ from hand_eye_calib.errors import InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.files import LONGEST_NAME
-from hand_eye_calib.io.trajectory_files.table import MATRIX, POSITION, QUATERNION, Table
+from hand_eye_calib.io.trajectory_files.table import (
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    Table,
+    columns_of_array,
+)
 from hand_eye_calib.text import shortened
 
 _POSE = (*POSITION, *QUATERNION)
@@ -40,11 +46,13 @@ _Reader = Callable[[bytes, str | None], _Rows]
 
 
 def foreign_table(
-    path: str | Path, data: bytes, read: _Reader, choice: str | None, measures: str
+    path: str | Path, data: bytes, read: _Reader | str, choice: str | None, measures: str
 ) -> Table:
     """The rows of a file in one of these formats, with what :data:`PROGRAMS` has for it.
     ``choice`` says which of several bodies is meant. An InputError if it cannot be read.
     """
+    if isinstance(read, str):
+        raise InputError(f"cannot read {path}: {read}")
     try:
         header, rows, notes = read(data, choice)
         rows = [[*map(str, row)] for row in rows]
@@ -147,11 +155,10 @@ def _of_colmap(data: bytes, _: str | None) -> _Rows:
 
 def _of_json(data: bytes, _: str | None) -> _Rows:
     document = json.loads(data)
-    found = document.get("frames") if isinstance(document, dict) else document
-    is_list = isinstance(found, list) and found and isinstance(found[0], dict)
-    frames: list[Any] = found if is_list else [{}]
-    names = frames[0].keys()
-    if {"timestamp", "translation", "rotation"} <= names:
+    frames: Any = document.get("frames") if isinstance(document, dict) else document
+    is_list = isinstance(frames, list) and frames and isinstance(frames[0], dict)
+    names = frames[0].keys() if is_list else ()
+    if {"timestamp", "translation", "rotation"} <= {*names}:
         poses = ([each["timestamp"], *each["translation"], *each["rotation"]] for each in frames)
         return ("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(poses), ()
     if "transform_matrix" not in names:
@@ -231,15 +238,7 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
 
 
 def _of_numpy(data: bytes, _: str | None) -> _Rows:
-    values = np.load(io.BytesIO(data), allow_pickle=False)
-    names = ("t", *_POSE)[: values.shape[-1] if values.ndim == 2 else 0]
-    if values.shape[1:] in ((3, 4), (4, 4)):
-        names, values = MATRIX, _as_rows(values)
-    if len(names) not in (4, 8, 12) or values.dtype.kind not in "fiu":
-        raise ValueError(
-            f"an array {values.shape} of {values.dtype}; expected rows (N, 8) of t, x, y, z, qx, "
-            "qy, qz, qw, (N, 4) of t, x, y, z, or matrices (N, 4, 4)"
-        )
+    names, values = columns_of_array(np.load(io.BytesIO(data), allow_pickle=False))
     return names, values.tolist(), ()
 
 
@@ -311,15 +310,9 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
     return ("secs", "nsecs", *_POSE), ([*row[:2], *row[at : at + 7]] for row in rows), ()
 
 
-def _refusing(sentence: str) -> _Reader:
-    def refuse(_: bytes, __: str | None) -> NoReturn:
-        raise ValueError(sentence)
-
-    return refuse
-
-
-# How files begin that have no trajectory, and what to do.
-_REFUSED = {
+#: How files begin that are no text with a row of numbers on each line, and what reads them, or what
+#: to do instead.
+PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\Asource_timestamp,destination_timestamp": "motions between images, no poses; chain them",
     rb"\A(<\?xml[^>]*>\s*)?<kml": "KML without times; export the track as GPX",
     rb"\ASQLite format 3": "a database; a bag ends in .db3, and COLMAP exports its model as text",
@@ -327,10 +320,6 @@ _REFUSED = {
     rb"\A(# \.PCD|VERSION 0?\.7)": "points, no trajectory; record the odometry as a bag",
     rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML, no trajectory; record messages as a bag; "
     "samples of an arm are a recording of their own",
-}
-#: How files begin that are no text with a row of numbers on each line, and what reads them.
-PROGRAMS: dict[bytes, _Reader] = {
-    **{begin: _refusing(sentence) for begin, sentence in _REFUSED.items()},
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
     rb"\A(<\?xml[^>]*>\s*)?<gpx": _of_gpx,

@@ -112,15 +112,14 @@ def read_trajectory(
     format: str = "tum",
     *,
     topic: str | None = None,
-    tf: str | None = None,
     columns: str | None = None,
     times: str | PathLike[str] | ArrayLike | None = None,
     stamp_unit: str | None = None,
     repair: bool = False,
     measures: str = "auto",
 ) -> Trajectory:
-    """Read a trajectory from a text file, from a bag if ``topic`` or ``tf`` is given, or from
-    numbers in memory.
+    """Read a trajectory from a text file, from a bag if ``topic`` is given, or from numbers in
+    memory.
 
     Parameters
     ----------
@@ -129,7 +128,7 @@ def read_trajectory(
         qz, qw or (N, 7) without t, or a pandas DataFrame with columns named as in csv files.
     format : str
         "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
-    topic, tf : str, optional
+    topic : str, optional
         Of a bag: the topic of the poses; or two frames, ``world:sensor``, whose transform is the
         trajectory, from ``/tf`` and ``/tf_static``. No other option but ``measures`` goes with it.
     columns : str, optional
@@ -178,12 +177,10 @@ def read_trajectory(
     has_options = is_named or columns is not None or file_of_times is not None
     if isinstance(source, Trajectory):
         return source
-    if topic or tf:
-        if has_options or times is not None or stamp_unit or repair or (topic and tf) or not path:
-            raise ConfigError(
-                "topic and tf are for bags: give one of them and none of the options of text files"
-            )
-        return _of_bag(path, topic, tf, measures)
+    if topic:
+        if has_options or times is not None or stamp_unit or repair or not path:
+            raise ConfigError("topic is for bags: none of the options of text files goes with it")
+        return _of_bag(path, topic, measures)
     if (has_options and not path) or (path and times is not None and not file_of_times):
         raise ConfigError(
             "format, columns and a file of times are for text files, other times for objects"
@@ -203,12 +200,12 @@ def read_trajectory(
     return trajectory
 
 
-def _of_bag(path: Path, topic: str | None, tf: str | None, measures: str) -> Trajectory:
+def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
     from hand_eye_calib.io.bags.reader import PoseBag
-    from hand_eye_calib.io.transforms import TfSource
+    from hand_eye_calib.io.bags.sources import source_of
 
     with PoseBag(path) as bag:
-        trajectory, notes = bag.trajectory(TfSource.parse(tf) if tf else topic or "", measures)
+        trajectory, notes = bag.trajectory(source_of(topic), measures)
         for text in [*bag.warnings, *notes]:
             warnings.warn(text, UserWarning, stacklevel=3)
     return trajectory

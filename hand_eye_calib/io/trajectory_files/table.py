@@ -290,6 +290,21 @@ _KINDS = (
 )
 
 
+def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray]:
+    """Names and values of the columns of an array of poses; an InputError if it is none."""
+    try:
+        values = np.asarray(source, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
+    if values.shape[1:] in ((3, 4), (4, 4)):
+        return MATRIX, values.reshape(len(values), -1)[:, :12]
+    names = ("t", *POSITION, *QUATERNION)
+    known = {8: names, 7: names[1:], 4: names[:4]}
+    if values.ndim != 2 or values.shape[1] not in known:
+        raise InputError(f"expected {_KINDS}; found an array {values.shape}")
+    return known[values.shape[1]], values
+
+
 def table_of_object(source: Any, times: Any = None) -> Table:
     """The numbers of an array or of a table; see :func:`hand_eye_calib.read_trajectory`. An
     InputError if it is neither, or the stamps are no numbers or datetimes, one for each pose.
@@ -302,18 +317,13 @@ def table_of_object(source: Any, times: Any = None) -> Table:
         if times is None and len(table.stamp_at) == 1:
             times = source[keys[table.stamp_at[0]]]
     else:
-        try:
-            values = np.asarray(source, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
-        if values.shape[1:] == (4, 4):
-            names, values = MATRIX, values.reshape(-1, 16)[:, :12]
-        elif values.ndim == 2 and values.shape[1] in (7, 8):
-            names = (*POSITION, *QUATERNION)
-            times = values[:, 0] if times is None and values.shape[1] == 8 else times
-            values = values[:, -7:]
-        else:
-            raise InputError(f"expected {_KINDS}; found an array {values.shape}")
+        names, values = columns_of_array(source)
+        if names[0] == "t":
+            times, names, values = (
+                values[:, 0] if times is None else times,
+                names[1:],
+                values[:, 1:],
+            )
         table = Table("the poses", names, expected=_KINDS)
     table.numbers.frombytes(np.ascontiguousarray(values).tobytes())
     table.line_numbers.extend(range(1, len(values) + 1))
