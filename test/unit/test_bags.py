@@ -144,9 +144,8 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
     for name, second_type in (("one.bag", ODOMETRY), ("two.bag", "std_msgs/msg/String")):
         with rosbag1.Writer(tmp_path / name) as writer:
             write_streams(writer, STREAMS, "rosbag1")
-            connection = writer.add_connection(
-                "/a", second_type, typestore=NOETIC, callerid="/second"
-            )
+            about = {"typestore": NOETIC, "callerid": "/second"}
+            connection = writer.add_connection("/a", second_type, **about)
             later = Trajectory(PARENT.stamps_ns[-1:] + 1, PARENT.poses[-1:])
             stamp_ns, message = next(stamped_messages(NOETIC.types, later, ODOMETRY, True))
             text = NOETIC.types["std_msgs/msg/String"]("hello")
@@ -334,10 +333,7 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
         ((_, message),) = stamped_messages(JAZZY.types, one, ODOMETRY, is_ros1=False)
         messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
     path = write_messages(tmp_path / "bag", messages)
-    expected = (
-        "/a: 1 stamps jump away and back against the bag's own time; their poses were left out"
-    )
-    with pytest.warns(UserWarning, match=expected):
+    with pytest.warns(UserWarning, match="/a: 1 stamps jump away and back against the bag's own"):
         found = hec.read_trajectory(path, topic="/a")
     rest = np.arange(120) != 30
     assert_same_motion(found, PARENT.stamps_ns[rest], PARENT.poses[rest])

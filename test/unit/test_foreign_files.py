@@ -76,18 +76,14 @@ def of_rtklib(weeks=False):
 
 
 def of_colmap():
-    poses = se3.inverse(TRUTH.poses)
-    quats = se3.to_quat_xyzw(poses)[:, [3, 0, 1, 2]]
+    rows = se3.to_rows(se3.inverse(TRUTH.poses))[::-1, [6, 3, 4, 5, 0, 1, 2]]
+    names = [f"cam 0/{stamp}.png\n1.5 2.5 -1 3.5 4.5 7" for stamp in TRUTH.stamps_ns[::-1]]
     head = (
         "# Image list with two lines of data per image:\n"
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+        "# POINTS2D[] as (X, Y, POINT3D_ID)\n"
     )
-    rows = [
-        f"{k + 1} {' '.join(map(repr, [*quats[k].tolist(), *poses[k, :3, 3].tolist()]))} 1 "
-        f"cam 0/{TRUTH.stamps_ns[k]}.png\n1.5 2.5 -1 3.5 4.5 7\n"
-        for k in reversed(range(N))
-    ]
-    return head + "# POINTS2D[] as (X, Y, POINT3D_ID)\n" + "".join(rows)
+    return of_rows(head, range(1, N + 1), rows, [1] * N, names, separator=" ")
 
 
 def of_nerfstudio(names=TRUTH.stamps_ns, poses=TRUTH.poses):
@@ -224,12 +220,12 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_pa
     (tmp_path / "a.json").write_text(of_nerfstudio(names))
     (tmp_path / "b.json").write_text(of_nerfstudio(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1]))
     for name, poses in (("a", TRUTH.poses), ("b", TRUTH.poses @ MOUNT)):
-        (tmp_path / f"{name}.kitti").write_text(joined(poses[:, :3].reshape(-1, 12)))
-        (tmp_path / f"{name}.txt").write_text(joined(poses.reshape(-1, 16)))
-        (tmp_path / f"{name}.pose").write_text(joined(se3.to_rows(poses)))
+        rows = {"kitti": poses[:, :3].reshape(-1, 12), "all": poses.reshape(-1, 16)}
+        for kind, values in (rows | {"seven": se3.to_rows(poses)}).items():
+            (tmp_path / f"{name}.{kind}").write_text(joined(values))
         np.save(tmp_path / f"{name}.npy", poses)
-    kinds = ("kitti", "row"), ("txt", "row"), ("pose", "row"), ("npy", "row")
-    for kind, by in (("json", "name"), *kinds):
+    for kind in ("json", "kitti", "all", "seven", "npy"):
+        by = "name" if kind == "json" else "row"
         command = ["calibrate", *(str(tmp_path / f"{name}.{kind}") for name in "ab")]
         assert main([*command, "--pair-by", by, "--json"]) in (0, 3)
         document = json.loads(capsys.readouterr().out)
@@ -283,17 +279,15 @@ def of_ulog(*topics):
 def test_a_log_of_px4(tmp_path, topics):
     """Odometry before positions and attitudes; without pyulog one sentence."""
     (tmp_path / "log.ulg").write_bytes(of_ulog(*topics))
-    if not importlib.util.find_spec("pyulog"):
-        with pytest.raises(MissingDependencyError, match=r"hand_eye_calib\[px4\]"):
+    message = r"hand_eye_calib\[px4\]|without vehicle_odometry or vehicle_local_position"
+    if not importlib.util.find_spec("pyulog") or topics == ["vehicle_attitude"]:
+        with pytest.raises((MissingDependencyError, InputError), match=message):
             read_trajectory_file(tmp_path / "log.ulg", AUTO)
-    elif len(topics) == 1 and topics != ["vehicle_odometry"]:
-        with pytest.raises(InputError, match="without vehicle_odometry or vehicle_local_position"):
-            read_trajectory_file(tmp_path / "log.ulg", AUTO)
-    else:
-        found = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
-        known = TRUTH if "vehicle_odometry" in topics else TRUTH[1:]
-        np.testing.assert_allclose(found.poses, known.poses, atol=1e-5)
-        assert (found.stamps_ns == known.stamps_ns).all()
+        return
+    found = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
+    known = TRUTH if "vehicle_odometry" in topics else TRUTH[1:]
+    np.testing.assert_allclose(found.poses, known.poses, atol=1e-5)
+    assert (found.stamps_ns == known.stamps_ns).all()
 
 
 @pytest.mark.parametrize(

@@ -63,32 +63,23 @@ def messages():
     twists = np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
     rpy = np.degrees(se3.rotation_to_rpy(TRUTH.poses[:, :3, :3]))
+    px4 = [*zip(P.astype("f4"), np.roll(Q, 1, axis=1).astype("f4"), strict=True)]
     types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
-    types |= {
-        "/ins": INS,
-        "/twists": f"{TWIST[:-7]}WithCovarianceStamped",
-        "/bodies": BODIES,
-        "/named": NAMED_ARRAY,
-    }
+    types |= {"/ins": INS, "/twists": f"{TWIST[:-7]}WithCovarianceStamped"}
+    types |= {"/bodies": BODIES, "/named": NAMED_ARRAY}
     found = {key: [] for key in types.items()}
     zero, nine, nothing = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9), np.zeros(3, "f4")
     for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
         head, quaternion = header(JAZZY, stamp_ns, "sensor"), made("Quaternion", *Q[k])
-        linear, angular = (made("Vector3", *part) for part in (twists[k, :3], twists[k, 3:]))
+        twist = made("Twist", made("Vector3", *twists[k, :3]), made("Vector3", *twists[k, 3:]))
         pose = made("Pose", made("Point", *P[k]), quaternion)
         point = made(POINT, lat[k], lon[k], height[k])
         each = {
-            TWIST: (head, made("Twist", linear, angular)),
-            types["/twists"]: (
-                *(head, made("TwistWithCovariance", made("Twist", linear, angular), np.zeros(36))),
-            ),
+            TWIST: (head, twist),
+            types["/twists"]: (head, made("TwistWithCovariance", twist, np.zeros(36))),
             FIX: (head, status, lat[k], lon[k], height[k], nine, 0),
             IMU: (head, quaternion, nine, zero, nine, zero, nine),
-            PX4: (
-                *(0, stamp_ns // 1000, 1, P[k].astype("f4"), np.roll(Q[k], 1).astype("f4"), 1),
-                *(nothing for _ in range(5)),
-                *(0, 0),
-            ),
+            PX4: (0, stamp_ns // 1000, 1, *px4[k], 1, *[nothing] * 5, 0, 0),
             BODIES: (head, k, [made(BODY, head, k, "cart", [], pose)]),
             NAMED_ARRAY: (head, [made(NAMED, "cart", pose)]),
             ARRAY: (head, [pose, pose]),
