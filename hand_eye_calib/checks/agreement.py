@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.floor import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
 from hand_eye_calib.checks.response import Fitted, Regression, delays, response
@@ -53,11 +54,12 @@ _MAX_ROTATION = 2.8
 # with less than the second it may be jumps of a clean recording, and is no error.
 _MOST, _SOME = 0.3, 0.1
 
-# Delays and smoothing are looked for in motions over this time (s), so many at most, and speeds are
-# over it, so that noise is no speed. Smallest delay (s), and smoothing (s^2), that count; that of
+# Delays and smoothing are looked for in motions over this time (s), so many at most. Vehicles whose
+# streams are as they should be are off by some milliseconds: a delay counts from the second line on
+# (s), and is an error from so many times that. Smallest smoothing (s^2) that counts; that of
 # interpolation is a share of the squared interval.
-_SHORT_S, _MOST_SHORT = 0.5, 6000
-_DELAY_S = 0.003
+_SHORT_S, _MOST_SHORT = 1.0, 6000
+_DELAY_S, _GRAVE = 2.5 * FLOOR_TRAVEL_S, 2.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
 
 # Orientations are copies if they agree to this angle, several times better than any two sensors of
@@ -100,7 +102,7 @@ def check_agreement(
         return same
     change = find_change(pose_pairs, T_parent_child)
     slow, axes = response(pose_pairs, motions, T_parent_child, change.at_ns if change else None)
-    speeds, speed = _speeds(pose_pairs)
+    speed = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
     drift = slow.fit("drift")
     tried = [(drift.share, _world_drift(drift, pose_pairs, speed))]
     tried += [_rotation_gain(slow, axes)]
@@ -111,10 +113,10 @@ def check_agreement(
     suspects = [max(tried, key=lambda each: each[0])]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
     if fast := delays(pose_pairs, motions, T_parent_child):
-        suspects += _delays(fast, speeds, speed)
+        suspects += _delays(fast, pose_pairs, speed)
         interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
         suspects += _smoothing(fast, _OF_INTERVAL * interval_s**2, speed)
-    found = [(share, each) for share, each in suspects if each]
+    found = [(share, each) for share, each in suspects if each and share > 0.0]
     return [max(found, key=lambda each: each[0])[1]] if found else []
 
 
@@ -132,7 +134,8 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     upper_m = distance_m + 2 * sigma_m
     angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
     is_parallel = angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max())
-    near_m = _PARALLEL_M if is_parallel else _NEARLY_M
+    may_be_zero = distance_m < _WITHIN * sigma_m
+    near_m = _PARALLEL_M if is_parallel or may_be_zero else _NEARLY_M
     if upper_m > near_m or sigmas[3:].max() > _MAX_SIGMA_RAD:
         return []
     if is_parallel:
@@ -229,54 +232,42 @@ def _world_drift(drift: Fitted, pose_pairs: PosePairs, usual: float) -> Finding 
     return graded("world_drift", "both", share, **values, percent=100 * share)
 
 
-def _delays(fast: Regression, speeds: FloatArray, speed: float) -> Iterator[_Suspect]:
+def _delays(fast: Regression, pose_pairs: PosePairs, speed: float) -> Iterator[_Suspect]:
     """Positions that are late, or early, against orientations of their stream: all, or those along
     one axis of its world.
     """
-    for stream, columns in (("child", 0), ("parent", 3)):
-        whole, by_axis = fast.fit(f"late_{stream}"), fast.fit(f"late_axes_{stream}")
+    for stream, Ts in zip(_STREAMS, (pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p), strict=True):
+        beside = [f"{part}_{stream}" for part in _SMOOTHING_S2]
+        whole, by_axis = (fast.fit(f"late_{each}{stream}", *beside) for each in ("", "axes_"))
         k, off_s, off_sigma_s = _odd_one(by_axis)
-        delay_s, along = float(whole.values[0]), float(speeds[columns + k])
+        delay_s, along = float(whole.values[0]), usual_speed(pose_pairs.stamps_ns, Ts[:, [k], 3])
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
         of_axis = (f"{'xyz'[k]} coordinates", "others")
-        for fitted, late_s, sigma_s, speed_m_s, code, names in (
+        for fitted, late_s, sigma_s, speed_m_s, code, (part, others) in (
             (whole, abs(delay_s), whole.sigmas[0], speed, "position_clock", parts),
             # The other stream's coordinate cannot be early.
             (by_axis, off_s, off_sigma_s, along, "axis_lag", of_axis),
         ):
-            shift_m = late_s * speed_m_s
             if late_s > _DELAY_S:
+                shift_m, sigma_m = late_s * speed_m_s, sigma_s * speed_m_s
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
-                told = {"part": names[0], "others": names[1]}
-                sigma_m = sigma_s * speed_m_s
-                yield fitted.share, graded("late", stream, shift_m, sigma_m, **values, **told)
+                if late_s < _GRAVE * _DELAY_S:
+                    shift_m = min(shift_m, LIMITS["late"][-1])
+                values |= {"part": part, "others": others}
+                yield fitted.share, graded("late", stream, shift_m, sigma_m, **values)
 
 
 def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Suspect]:
     """Smoothing of one part of the poses."""
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
-            fitted = fast.fit(f"{part}_{stream}")
+            fitted = fast.fit(f"{part}_{stream}", f"late_{stream}")
             value_s2, sigma_s2 = float(fitted.values[0]), float(fitted.sigmas[0])
             if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
                 smoothing_s = float(np.sqrt(value_s2))
                 shift_m = smoothing_s * speed
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": shift_m}
                 yield fitted.share, graded("smoothed", stream, shift_m, **values)
-
-
-def _speeds(pose_pairs: PosePairs) -> tuple[FloatArray, float]:
-    """Root mean square speeds (m/s) along the axes (6,) of the child's world and of the parent's,
-    and of the parent as a whole. Jumps are left out.
-    """
-    positions = np.concatenate([pose_pairs.Ts_cw_c[:, :3, 3], pose_pairs.Ts_pw_p[:, :3, 3]], axis=1)
-    step = max(1, round(_SHORT_S / max(median(np.diff(pose_pairs.stamps_ns)) * 1e-9, 1e-9)))
-    seconds = (pose_pairs.stamps_ns[step:] - pose_pairs.stamps_ns[:-step]) * 1e-9
-    velocities = (positions[step:] - positions[:-step]) / seconds[:, None]
-    sizes = np.linalg.norm(velocities[:, 3:], axis=1)
-    usual = velocities[sizes <= 3 * median(sizes)]
-    speeds = np.sqrt((usual**2).sum(axis=0) / max(len(usual), 1))
-    return speeds, float(np.linalg.norm(speeds[3:]))
 
 
 def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory) -> list[Finding]:

@@ -240,7 +240,7 @@ LIMITS = {
     "inverse_both": (0.0, 0.3, 0.3, 1.0),  # logarithm of lengths
     # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
     # smoothing does not contain noise of the columns. Both by the shift of positions, m.
-    "late": (5.0, 0.008, 0.008, 0.05),
+    "late": (4.5, 0.008, 0.008, 0.05),
     "smoothed": (8.0, 0.008, 0.008, 0.05),
     "rotation_gain": (6.0, 0.003, 0.003, 0.03),  # of the factor, less 1
     "axis_scale": (6.0, 0.015, 0.015, 0.05),  # of the factor, less 1

@@ -12,17 +12,19 @@ part of it, and the jackknife over the blocks gives standard deviations. Motions
 show gains, scales by axis, worlds that are turned or that move; those over a second show delays and
 smoothing, which change a motion of angular frequency f by ``1 - i f d - f^2 c``: -d times the
 velocity and c times the acceleration at both ends. These come from poses around the ends, not from
-those themselves: white noise has no part in both sides. Noise that accumulates makes the stream
-that a column comes from look less smooth than it is, never smoother. So columns of the child show
-that the child is smoothed.
+those themselves: white noise has no part in both sides. Noise of a column makes its value smaller,
+unless it is probed with what the other stream shows of it (an instrumental variable): so are lever
+arms and delays. Noise that accumulates makes the stream that a column comes from look less smooth
+than it is, never smoother. So columns of the child alone show that the child is smoothed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.stats import median, robust_sigma
@@ -30,10 +32,12 @@ from hand_eye_calib.stats import median, robust_sigma
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
 _STEP_S, _TOLERANCE = 0.1, 0.3
-_MIN_MOTIONS, _BLOCKS = 10, 10
+_BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING, _ROUNDS = 3.0, 4
+
+_Columns: TypeAlias = Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -50,15 +54,17 @@ class Fitted:
 class Regression:
     """Robust linear regression of rows (K, r, p + 1), in standard deviations, the values last, on
     groups of the p columns: by name, where they are; those of ``base`` in every fit. Rows are in
-    order of time.
+    order of time. What is left is to be orthogonal to the ``probes``, a table like that of the
+    rows: of columns without their noise, if there are such.
     """
 
     def __init__(
-        self, rows: FloatArray, where: Mapping[str, list[int]], base: Sequence[str], noise: float
+        self, rows: FloatArray, probes: FloatArray, where: Mapping[str, list[int]], *base: str
     ) -> None:
-        self._where, self._base = where, list(base)
+        self._where, self._base = where, base
         n_rows, size, n_columns = rows.shape
-        known = rows.reshape(-1, n_columns)[:, [*self._columns(), n_columns - 1]]
+        flat = rows.reshape(-1, n_columns)
+        known = flat[:, [*self._columns(), n_columns - 1]]
         weights = np.ones(n_rows)
         for _ in range(_ROUNDS):
             products = (known * np.repeat(weights, size)[:, None]).T @ known
@@ -68,16 +74,12 @@ class Regression:
             self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
             weights = 1.0 / (1.0 + (lengths / self._sigma) ** 2 / (size * _TUNING**2)) ** 2
         self._weight = float(weights.sum())
-        blocks, parts = [], (np.array_split(each, _BLOCKS) for each in (rows, weights))
-        for part, each in zip(*parts, strict=True):
-            flat = part.reshape(-1, n_columns)
-            blocks.append((flat * np.repeat(each, size)[:, None]).T @ flat)
+        weighted = rows * weights[:, None, None]
+        self._squares = flat.T @ weighted.reshape(flat.shape)
+        blocks, parts = [], (np.array_split(each, _BLOCKS) for each in (probes, weighted))
+        for probe, part in zip(*parts, strict=True):
+            blocks.append(probe.reshape(-1, n_columns).T @ part.reshape(-1, n_columns))
         self._blocks = np.stack(blocks)
-        # Noise of the columns would make the lever arm too short: at most half of them is noise.
-        sizes, directions = np.linalg.eigh(self._blocks.sum(axis=0)[:3, :3])
-        of_noise = np.minimum(noise * self._weight, 0.5 * np.maximum(sizes, 0.0))
-        self._blocks[:, :3, :3] -= (directions * of_noise) @ directions.T / _BLOCKS
-        self._total = self._blocks.sum(axis=0)
 
     def _columns(self, *groups: str, without: str = "") -> list[int]:
         names = [*(name for name in self._base if name != without), *groups]
@@ -88,30 +90,31 @@ class Regression:
         may push its values.
         """
         at = self._where[group]
-        return np.asarray(self._sigma**2 * self._weight / np.maximum(self._total[at, at], 1e-300))
+        return np.asarray(self._sigma**2 * self._weight / np.maximum(self._squares[at, at], 1e-300))
 
-    def fit(self, group: str, without: str = "") -> Fitted:
-        """Fit a group beside the base, or beside what is left of it."""
-        before = self._columns(without=without)
-        known = [*before, *self._where[group]]
-        # All rows, and all but those of each block.
-        solved = _solved(np.concatenate([self._total[None], self._total - self._blocks]), known)
-        values, left_out = solved[0], solved[1:, len(before) :]
-        spread = left_out - left_out.mean(axis=0)
-        costs = [
-            float(self._total[-1, -1] - self._total[columns, -1] @ found)
-            for columns, found in ((before, _solved(self._total, before)), (known, values))
-        ]
+    def fit(self, group: str, *beside: str, without: str = "") -> Fitted:
+        """Fit a group beside the base, or what is left of it, and ``beside`` other groups."""
+        before = self._columns(*beside, without=without)
+        known, total = [*before, *self._where[group]], self._blocks.sum(axis=0)
+        # All rows, and all but those of each block, or of two: errors may last longer than one.
+        left_out = np.concatenate([self._blocks, self._blocks[::2] + self._blocks[1::2]])
+        solved = _solved(np.concatenate([total[None], total - left_out]), known)
+        _, *parts = np.split(solved[:, len(before) :], [1, 1 + _BLOCKS])
+        variances = [(len(values) - 1) * values.var(axis=0) for values in parts]
+        costs = []
+        for columns, found in ((before, _solved(total, before)), (known, solved[0])):
+            x, at = np.append(-found, 1.0), [*columns, -1]
+            costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
         return Fitted(
-            values=values[len(before) :],
-            sigmas=np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum(axis=0)),
+            values=solved[0, len(before) :],
+            sigmas=np.sqrt(np.max(variances, axis=0)),
             share=1.0 - costs[1] / max(costs[0], 1e-300),
         )
 
 
 def _solved(products: FloatArray, columns: list[int]) -> FloatArray:
     normal = products[..., columns, :][..., columns]
-    units = 1.0 / np.sqrt(np.diagonal(normal, axis1=-2, axis2=-1) + 1e-300)
+    units = 1.0 / np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)) + 1e-300)
     balanced = normal * units[..., :, None] * units[..., None, :] + 1e-9 * np.eye(len(columns))
     pushed = (units * products[..., columns, -1])[..., None]
     return np.asarray(units * np.linalg.solve(balanced, pushed)[..., 0])
@@ -181,7 +184,8 @@ def response(
     arm = _times(parent.chords, T_parent_child[:3, 3])
     p_seen = _times(np.swapaxes(parent.from_world, 1, 2), child.moved - arm)
     c_seen = _times(np.swapaxes(child.from_world, 1, 2), parent.moved + arm)
-    seconds = (pose_pairs.stamps_ns[motions.j] - pose_pairs.stamps_ns[motions.i]) * 1e-9
+    stamps_ns = pose_pairs.stamps_ns
+    seconds = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
     drifted = child.from_world * seconds[:, None, None]
     middle = pose_pairs.Ts_cw_c[motions.i, :3, 3] + 0.5 * child.displaced
     middle = middle - middle.mean(axis=0)
@@ -190,110 +194,114 @@ def response(
     turned_child = -child.from_world @ se3.skew(child.displaced)
     turned_parent = parent.from_world @ se3.skew(parent.displaced)
     worlds = (np.swapaxes(child.from_world, 1, 2) @ parent.from_world).mean(axis=0)
-    none = np.zeros_like(drifted)
     groups = {
-        "turned_child": (turned_child, none),
-        "turned_parent": (turned_parent, none),
-        "turned_both": (turned_parent + turned_child @ se3.nearest_rotation(worlds), none),
-        "axes_child": (child.from_world * c_seen[:, None, :], none),
-        "axes_parent": (-parent.from_world * p_seen[:, None, :], none),
-        "drift": (
-            np.concatenate([drifted, -drifted @ se3.skew(middle)], axis=2),
-            np.concatenate([none, drifted], axis=2),
+        "turned_child": _rows(turned_child),
+        "turned_parent": _rows(turned_parent),
+        "turned_both": _rows(turned_parent + turned_child @ se3.nearest_rotation(worlds)),
+        "axes_child": _rows(child.from_world * c_seen[:, None, :]),
+        "axes_parent": _rows(-parent.from_world * p_seen[:, None, :]),
+        "drift": np.concatenate(
+            [_rows(drifted), _rows(-drifted @ se3.skew(middle), drifted)], axis=2
         ),
-        "gain": (none, (x @ axes)[:, None, :] * axes[None]),
+        "gain": _rows(np.zeros_like(drifted), (x @ axes)[:, None, :] * axes[None]),
     }
-    after = None
     if moved_at_ns is not None:
-        stamps_ns = pose_pairs.stamps_ns
         after = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2 >= moved_at_ns
-    return _regression(parent, child, T_parent_child, groups, (), after), axes
+        of_x = [part for name, part in _of_mount(parent, child).items() if name != "scale"]
+        groups["moved"] = after[:, None, None] * np.concatenate(of_x, axis=2)
+    return _regression(parent, child, T_parent_child, groups, {}), axes
 
 
 def delays(
     pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
 ) -> Regression | None:
-    """Regression of motions over less than a second; None if too few poses follow each other.
+    """Regression of motions over about a second; None if too few poses follow each other.
 
     Groups: ``late_child``, ``late_parent``: positions are late against the orientations of their
-    stream (s); ``late_axes_child``, ``late_axes_parent``: those by coordinate;
-    ``positions_child``, ``positions_parent``, ``orientations_child``, ``orientations_parent``:
-    smoothed (s^2).
+    stream (s), by velocities that the other stream shows; ``late_axes_child``,
+    ``late_axes_parent``: those by coordinate; ``positions_child``, ``positions_parent``,
+    ``orientations_child``, ``orientations_parent``: smoothed (s^2).
     """
     stamps_ns = pose_pairs.stamps_ns
     interval_s = median(np.diff(stamps_ns)) * 1e-9
     step = max(round(_STEP_S / interval_s), 1)
     h = step * interval_s
     follow = np.zeros(len(stamps_ns), dtype=bool)
-    inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
-    follow[inner] = True
-    for k in (-2, -1, 1, 2):
-        elapsed_s = (stamps_ns[inner + k * step] - stamps_ns[inner]) * 1e-9
-        follow[inner] &= np.abs(elapsed_s - k * h) < _TOLERANCE * h
+    inner, around = np.arange(2 * step, len(stamps_ns) - 2 * step), np.array([-2, -1, 1, 2])
+    elapsed_s = (stamps_ns[inner[:, None] + step * around] - stamps_ns[inner, None]) * 1e-9
+    follow[inner] = (np.abs(elapsed_s - h * around) < _TOLERANCE * h).all(axis=1)
     motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
-    if len(motions) < _MIN_MOTIONS * _BLOCKS:
+    if len(motions) < _BLOCKS**2:
         return None
-    parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
-    child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
-    none, groups = np.zeros_like(child.chords), {}
+    X, Ts_parent, Ts_child = T_parent_child, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X  # by the other stream
+    own, seen = (
+        (_Stream(of_parent, motions, np.eye(3)), _Stream(of_child, motions, X[:3, :3]))
+        for of_parent, of_child in ((Ts_parent, Ts_child), as_seen)
+    )
+    groups, probes = (_of_filters(*each, X[:3, 3], step, h) for each in (own, seen))
+    late = {name: probes[name] for name in ("late_child", "late_parent")}
+    return _regression(*own, X, groups, late, "late")
+
+
+def _of_filters(
+    parent: _Stream, child: _Stream, arm: FloatArray, step: int, h: float
+) -> dict[str, FloatArray]:
+    """Columns of delays and smoothing, and of a ``late`` child as a whole; ``arm`` (3,) to it."""
+    groups = {}
     for name, sign, stream in (("child", -1.0, child), ("parent", 1.0, parent)):
         velocity, acceleration, rate, bend = stream.derivatives(step, h)
         start, middle, end = stream.rows
         faster = sign * (velocity[end] - velocity[start])
         bent = sign * (acceleration[start] - acceleration[end])
-        by_axis = stream.from_world * faster[:, None, :]
         late, positions = _times(stream.from_world, faster), _times(stream.from_world, bent)
         orientations = sign * se3.cross(bend[middle], stream.moved)
         if name == "child":
-            whole = late + se3.cross(rate[middle], stream.moved), stream.back(rate)
-            groups["late"] = whole[0][:, :, None], whole[1][:, :, None]
+            groups["late"] = _rows(late + se3.cross(rate[middle], stream.moved), stream.back(rate))
         else:
-            arms = [se3.cross(bend[rows], T_parent_child[:3, 3]) for rows in (start, end)]
+            arms = [se3.cross(bend[rows], arm) for rows in (start, end)]
             orientations += _times(stream.ends[0], arms[0]) - _times(stream.ends[1], arms[1])
-        of_rotation = (sign * stream.back(bend))[:, :, None]
-        groups[f"late_{name}"] = late[:, :, None], none[:, :, :1]
-        groups[f"late_axes_{name}"] = by_axis, none
-        groups[f"positions_{name}"] = positions[:, :, None], none[:, :, :1]
-        groups[f"orientations_{name}"] = orientations[:, :, None], of_rotation
-    return _regression(parent, child, T_parent_child, groups, ("late",))
+        groups[f"late_{name}"] = _rows(late)
+        groups[f"late_axes_{name}"] = _rows(stream.from_world * faster[:, None, :])
+        groups[f"positions_{name}"] = _rows(positions)
+        groups[f"orientations_{name}"] = _rows(orientations, sign * stream.back(bend))
+    return groups
+
+
+def _of_mount(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
+    """Columns of X, and of the scale."""
+    return {
+        "lever": _rows(parent.chords),
+        "rotation": _rows(se3.skew(child.moved), child.rotations - np.eye(3)),
+        "scale": _rows(child.moved),
+    }
+
+
+def _rows(of_t: FloatArray, of_r: FloatArray | None = None) -> FloatArray:
+    """Columns (K, 6, m) from those of displacements and of rotations: (K, 3, m), or one (K, 3)."""
+    both = np.concatenate([of_t, np.zeros_like(of_t) if of_r is None else of_r], axis=1)
+    return both.reshape(len(of_t), 6, -1)
 
 
 def _regression(
-    parent: _Stream,
-    child: _Stream,
-    T_parent_child: FloatArray,
-    groups: Mapping[str, tuple[FloatArray, FloatArray]],
-    base: Sequence[str],
-    after: BoolArray | None = None,
+    parent: _Stream, child: _Stream, X: FloatArray, groups: _Columns, probes: _Columns, *base: str
 ) -> Regression:
-    """Regression on groups of columns, of displacements and of rotations, and on those of X and the
-    scale; on those of X again, as ``moved``, of the motions (K,) after some time.
-    """
+    """Regression on groups of columns, and on those of X and the scale."""
     displaced = child.moved - parent.moved
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
-    unexplained = displaced - _times(parent.chords, T_parent_child[:3, 3])
-    unit_t, unit_r = (
-        max(robust_sigma(v), least) for v, least in ((unexplained, 1e-7), (turned, 1e-8))
-    )
-    of_mount = {
-        "lever": (parent.chords, np.zeros_like(parent.chords)),
-        "rotation": (se3.skew(child.moved), child.rotations - np.eye(3)),
-        "scale": (child.moved[:, :, None], np.zeros((len(turned), 3, 1))),
-    }
-    columns = of_mount | dict(groups)
-    if after is not None:
-        of_x = zip(columns["lever"], columns["rotation"], strict=True)
-        columns["moved"] = tuple(after[:, None, None] * np.concatenate(x, axis=2) for x in of_x)
-    columns["target"] = displaced[:, :, None], turned[:, :, None]
-    ends = np.cumsum([of_t.shape[2] for of_t, _ in columns.values()]).tolist()
-    rows = np.empty((len(turned), 6, ends[-1]))
-    where = {}
-    for name, start, end in zip(columns, [0, *ends], ends, strict=False):
-        where[name] = list(range(start, end))
-        of_t, of_r = columns[name]
-        np.divide(of_t, unit_t, out=rows[:, :3, start:end])
-        np.divide(of_r, unit_r, out=rows[:, 3:, start:end])
-    return Regression(rows, where, (*of_mount, *base), (unit_r / unit_t) ** 2)
+    unexplained = displaced - _times(parent.chords, X[:3, 3])
+    sizes = [max(robust_sigma(v), least) for v, least in ((unexplained, 1e-7), (turned, 1e-8))]
+    units, of_mount = np.repeat(sizes, 3)[:, None], _of_mount(parent, child)
+    columns = of_mount | dict(groups) | {"target": _rows(displaced, turned)}
+    ends = np.cumsum([each.shape[2] for each in columns.values()]).tolist()
+    starts = zip(columns, [0, *ends], ends, strict=False)
+    where = {name: list(range(start, end)) for name, start, end in starts}
+    rows = np.concatenate([*columns.values()], axis=2)
+    rows /= units
+    probing = rows.copy()
+    for name, each in (_of_mount(child, child) | dict(probes)).items():
+        probing[:, :, where[name]] = each / units
+    return Regression(rows, probing, where, *of_mount, *base)
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
