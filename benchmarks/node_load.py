@@ -91,7 +91,7 @@ def measured_node(report, arguments):
         cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)
 
     latencies, durations, used = [], [], []
-    receive, sent_at = TopicInput.receive, place_of_sending_time()
+    receive, sent_at = TopicInput._receive, place_of_sending_time()
 
     def stopwatch(self, read, data, info):
         begun = time.time()
@@ -103,7 +103,7 @@ def measured_node(report, arguments):
         if len(latencies) % 100 == 0:
             used[1:] = [(time.monotonic(), cpu_seconds())]
 
-    TopicInput.receive = stopwatch
+    TopicInput._receive = stopwatch
     stop, conclude, solves = CalibratorNode.stop, cycle.SolveCycle.conclude, []
     cycle.SolveCycle.conclude = lambda *answered: solves.append(0) or conclude(*answered)
 

@@ -114,8 +114,8 @@ class SolveCycle:
     wake : callable
         Called in another thread when :meth:`take_answers` has something to do.
     complete, publish : callable
-        Called with each usable Calibration, which gives it with what there is to add; and with the
-        session's result whenever there is a new one.
+        Called with each usable Calibration, which gives it with what there is to add; and when an
+        answer is taken, before who has asked is told.
     targets : (6,) sequence
         Standard deviations wanted, m and rad.
 
@@ -133,7 +133,7 @@ class SolveCycle:
         log: NodeLog,
         wake: Callable[[], None],
         complete: Callable[[Calibration], Calibration],
-        publish: Callable[[Calibration], None],
+        publish: Callable[[], None],
         targets: Sequence[float],
     ) -> None:
         self.is_solving = False
@@ -149,6 +149,7 @@ class SolveCycle:
     def restart(self) -> None:
         """Begin a new session: no result yet."""
         self.result: Calibration | None = None
+        self._told_result: ResultState | None = None
         self._solved: tuple[Calibrator, dict[str, Any]] | None = None
         self._solved_at_s = 0.0
         self._seen = NO_MOTION
@@ -192,6 +193,7 @@ class SolveCycle:
         for answer in self._process.answers():
             good, text = self.conclude(answer)
             self.is_solving = False
+            self._publish()
             asked, self._asked_in_flight = self._asked_in_flight, []
             for on_solved in asked:
                 on_solved(good, text)
@@ -261,7 +263,7 @@ class SolveCycle:
             told = (*result.warnings, f"{kept}: {describe(newest)}")
             result = replace(result, warnings=told)
         self.result, self._solved_at_s = self._with_findings(result), time.monotonic()
-        self._publish(self.result)
+        self._told_result = _result_state(self.result)
         if not progress.is_faulty and progress.sentence:
             write = self._log.warning if progress.will_not_get_there else self._log.info
             write(progress.sentence, GOES_ON_S, key=f"now {progress.done}")
@@ -308,7 +310,7 @@ class SolveCycle:
         """The result: what is missing, how good it is, how it was found. ``tf_static`` is what is
         done about that topic, and the reason.
         """
-        seen, result = self._seen, self.result
+        seen, told = self._seen, self._told_result
         level, text = self._judged(accepts_poses, tf_static)
         return ExtrinsicState(
             level=level,
@@ -321,7 +323,7 @@ class SolveCycle:
             rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True)),
             tf_static=tf_static[0],
             tf_static_reason=tf_static[1],
-            result=_result_state(result, time.monotonic() - self._solved_at_s) if result else None,
+            result=told and replace(told, age_s=time.monotonic() - self._solved_at_s),
         )
 
     def _judged(self, accepts_poses: bool, tf_static: tuple[Broadcast, str]) -> tuple[Level, str]:
@@ -358,7 +360,7 @@ class SolveCycle:
         )
 
 
-def _result_state(result: Calibration, age_s: float) -> ResultState:
+def _result_state(result: Calibration) -> ResultState:
     T, sigmas = result.T_parent_child, result.sigmas_printed
     pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
     return ResultState(
@@ -373,7 +375,7 @@ def _result_state(result: Calibration, age_s: float) -> ResultState:
         n_poses=result.n_poses,
         time_offset_s=result.time_offset_s,
         scale=result.scale,
-        age_s=age_s,
+        age_s=0.0,
     )
 
 

@@ -22,7 +22,7 @@ from hand_eye_calib.io.bags.messages import measured_as
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.state import InputState, Level
+from hand_eye_calib.live.state import REPORT_PERIOD_S, InputState, Level
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
@@ -269,11 +269,13 @@ class PoseInput:
         return self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
-        """What has come in; to be called once a second. ``may_rest`` if silence is nothing to look
-        at: there is a result, and the other input is silent too.
+        """What has come in; to be called once a second or oftener. ``may_rest`` if silence is
+        nothing to look at: there is a result, and the other input is silent too.
         """
-        self._counts.append((steady_s, self._arrived, self._lost))
-        seconds, arrived, lost = np.subtract(self._counts[-1], self._counts[0]).tolist()
+        now = steady_s, self._arrived, self._lost
+        seconds, arrived, lost = np.subtract(now, self._counts[0]).tolist()
+        if steady_s - self._counts[-1][0] > REPORT_PERIOD_S / 2:
+            self._counts.append(now)
         rate_hz = arrived / seconds if seconds > 0 else 0.0
         level, text = self._judge(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
         taken = self._session.statistics(self.name)

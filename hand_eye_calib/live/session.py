@@ -173,7 +173,7 @@ class LiveSession:
                 "journal resume needs output_directory: that is where the session to resume is"
             )
         if options.output_directory and options.journal != "off" and not options.monitor:
-            directory = output_path(options.output_directory) / "journal"
+            directory = output_path(options.output_directory).resolve() / "journal"
             resumed = self._resume(directory) if is_resuming else None
             self._journal = SessionJournal(directory, self._about, self._log, resumed)
 
@@ -198,7 +198,7 @@ class LiveSession:
             text = "off"
             if options.journal != "off":
                 level, text = Level.WARN, "off: the node began without output_directory"
-        directory = str(journal.directory.resolve()) if journal else ""
+        directory = str(journal.directory) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import chain, cycle
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from hand_eye_calib.live.monitor import LIMITS, MountWatch
 from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.state import REPORT_PERIOD_S, NodeState
-from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
@@ -81,7 +81,7 @@ class CalibratorNode(Node):
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
-        hooks = self._answered.trigger, self._robot.complete, self._publish_result
+        hooks = self._answered.trigger, self._robot.complete, self._publish
         self._cycle = SolveCycle(self._session, self._log, *hooks, config.targets)
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
@@ -99,7 +99,7 @@ class CalibratorNode(Node):
                 saved, _ = self._saver.save(self._options.node)
             else:
                 self._log.warning("the result is not saved: output_directory is not set")
-        self._publish_state(has_ended=True)
+        self._publish(has_ended=True)
         self._session.stop_journal()
         return saved
 
@@ -146,21 +146,22 @@ class CalibratorNode(Node):
         # group.
         serve(Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup())
         save = lambda request: self._saver.save(self._options.node)  # noqa: E731
-        serve(Trigger, "~/save", partial(_answer, save))
-        serve(Trigger, "~/reset", partial(_answer, self._reset))
-        serve(SetBool, "~/set_enabled", partial(_answer, self._set_enabled))
+        serve(Trigger, "~/save", partial(self._answer, save))
+        serve(Trigger, "~/reset", partial(self._answer, self._reset))
+        serve(SetBool, "~/set_enabled", partial(self._answer, self._set_enabled))
         # Steady time: these go on while a bag, and with it simulated time, is paused.
         make = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._solve_timer = make(self._options.node.solve_period, self._on_solve_timer)
-        make(FLUSH_PERIOD_S, self._discover)
-        make(REPORT_PERIOD_S, self._publish_state)
+        # In turn: all at once would hold up messages for long on a slow computer.
+        others = [self._publish, *[self._discover] * round(REPORT_PERIOD_S / FLUSH_PERIOD_S - 1)]
+        turns = cycle(chain.from_iterable((self._session.flush_journal, each) for each in others))
+        make(FLUSH_PERIOD_S / 2, lambda: next(turns)())
 
     # ---------------------------------------------------------------- timers
 
     def _discover(self) -> None:
         for each in self._inputs:
             each.discover()
-        self._session.flush_journal()
 
     def _on_solve_timer(self) -> None:
         silent = [each for each in self._inputs if not each.has_poses]
@@ -169,21 +170,23 @@ class CalibratorNode(Node):
             self._log.info(text, GOES_ON_S)
         self._cycle.start_if_due()
 
-    def _publish_result(self, calibration: Calibration) -> None:
-        self._results.publish(calibration)
-        progress = self._cycle.goal.progress
-        faulty = "the streams are faulty" * progress.is_faulty
-        why_not = "" if progress.done else faulty or "the goal is not reached"
-        base_frame = self._options.node.base_frame
-        no_base = f"base_frame {base_frame} is not known" * (calibration.base_frame != base_frame)
-        self._tf.add(calibration, why_not or no_base)
-
-    def _publish_state(self, has_ended: bool = False) -> None:
-        self._tf.look()
+    def _publish(self, has_ended: bool = False) -> None:
+        """Publish all that is to be told now: so the topics agree at every time."""
+        self._results.publish(self._cycle.result)
+        self._tf.look(self._cycle.result, self._why_not_broadcast())
         if self._mount is not None:
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
         self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
+
+    def _why_not_broadcast(self) -> str:
+        result, progress = self._cycle.result, self._cycle.goal.progress
+        if result is None:
+            return "no result yet"
+        if not progress.done:
+            return "the streams are faulty" if progress.is_faulty else "the goal is not reached"
+        wanted = self._options.node.base_frame
+        return "" if result.base_frame == wanted else f"base_frame {wanted} is not known"
 
     def _state(self) -> NodeState:
         cycle, name, steady_s = self._cycle, self.get_fully_qualified_name(), time.monotonic()
@@ -210,13 +213,13 @@ class CalibratorNode(Node):
         self._session.reset()
         if self._mount is not None and because_of is None:
             self._mount = self._watch_mount()
-        for part in (self._log, self._cycle, self._tf, self._mount):
+        for part in (self._log, self._cycle, self._mount):
             if part is not None:
                 part.restart()
         self._saver.state = None
-        self._results.clear()
         for each in self._inputs:
             each.restart(because_of)
+        self._publish()
 
     # -------------------------------------------------------------- services
 
@@ -226,6 +229,12 @@ class CalibratorNode(Node):
         solved = Future()
         self._cycle.ask(lambda good, text: solved.set_result((good, text)))
         response.success, response.message = await solved
+        return response
+
+    def _answer(self, act: Callable[[Any], tuple[bool, str]], request: Any, response: Any) -> Any:
+        """Answer a service with what was done: whether it worked, and a line about it."""
+        response.success, response.message = act(request)
+        self._publish()
         return response
 
     def _reset(self, request: Trigger.Request) -> tuple[bool, str]:
@@ -271,9 +280,4 @@ class CalibratorNode(Node):
         if period_ns != self._solve_timer.timer_period_ns:
             self._solve_timer.timer_period_ns = period_ns
             self._solve_timer.reset()
-
-
-def _answer(act: Callable[[Any], tuple[bool, str]], request: Any, response: Any) -> Any:
-    """Answer a service with what was done: whether it worked, and a line about it."""
-    response.success, response.message = act(request)
-    return response
+        self._publish()

@@ -1,5 +1,6 @@
 """What the node publishes: its results, and its state."""
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,7 +11,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from hand_eye_calib.live.state import GRACE_S, NodeState
-from hand_eye_calib.plain import json_text, plain
+from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.ros.conversions import (
@@ -34,6 +35,7 @@ class ResultTopics:
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._newest: Calibration | None = None
         self._advertise()
 
     def _advertise(self) -> None:
@@ -42,20 +44,26 @@ class ResultTopics:
         self._transform = make(TransformStamped, "~/extrinsic", LATCHED)
         self._pose = make(PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED)
 
-    def publish(self, calibration: Calibration) -> None:
-        """Publish a result: with its covariance always, alone if the rotation and two axes of the
-        translation are determined, as the others are zeros; if not, an earlier one is withdrawn.
+    def publish(self, calibration: Calibration | None) -> None:
+        """Publish a result that is new: with its covariance always, alone if the rotation and two
+        axes of the translation are determined, as the others are zeros; if not, or with None, an
+        earlier one is withdrawn: who subscribes from now on gets none.
         """
+        if calibration is self._newest:
+            return
+        self._newest = calibration
+        if calibration is None:
+            self._withdraw()
+            return
         hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
         if hidden.isdisjoint(ROTATIONS) and len(hidden) <= 1:
             self._transform.publish(to_transform(calibration))
             self._is_told = True
         elif self._is_told:
-            self.clear()
+            self._withdraw()
         self._pose.publish(to_pose_with_covariance(calibration))
 
-    def clear(self) -> None:
-        """Withdraw the results: who subscribes from now on gets none."""
+    def _withdraw(self) -> None:
         for publisher in (self._transform, self._pose):
             self._node.destroy_publisher(publisher)
         self._advertise()
@@ -70,7 +78,7 @@ class StateTopics:
 
     def publish(self, state: NodeState, clock_ns: int) -> None:
         """Publish the state; ``clock_ns`` is the node's clock, 0 if it does not run."""
-        self._progress.publish(String(data=json_text(state)))
+        self._progress.publish(String(data=json.dumps(plain(state), allow_nan=False)))
         self._diagnostics.publish(diagnostics(state, clock_ns))
         if state.has_ended:
             self._progress.wait_for_all_acked(_LAST_WORD)

@@ -193,13 +193,7 @@ class TfBroadcaster:
         self._node, self._log, self._tree = node, log, tree
         self._is_on, self._began_s = False, 0.0
         self._publisher: Publisher | None = None
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin a new session: what was broadcast is withdrawn."""
-        self._result: Calibration | None = None
-        self._why_not = "no result yet"
-        self.look()
+        self.state: tuple[Broadcast, str] = Broadcast.OFF, ""
 
     def switch(self, on: bool) -> None:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
@@ -210,18 +204,14 @@ class TfBroadcaster:
                 self._tree.listen(DYNAMIC_TOPIC)
             else:
                 self._tree.ignore(DYNAMIC_TOPIC)
-            self.look()
 
-    def add(self, calibration: Calibration, why_not: str) -> None:
-        """Take the session's result, and why it may not be broadcast yet; empty if it may."""
-        self._result, self._why_not = calibration, why_not
-        self.look()
-
-    def look(self) -> None:
-        """Broadcast what is new, as far as the tree allows it now; to be called often."""
-        self.state = self._judged()
-        if self._result is not None and self.state[0] is Broadcast.ON:
-            self._broadcast(self._result)
+    def look(self, result: Calibration | None, why_not: str) -> None:
+        """Broadcast the session's result if it is new, as far as the tree allows it now; to be
+        called often. ``why_not`` is empty if it may be.
+        """
+        self.state = self._judged(result, why_not)
+        if result is not None and self.state[0] is Broadcast.ON:
+            self._broadcast(result)
         elif self._publisher is not None:  # new listeners get nothing; the others keep it
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
@@ -230,12 +220,11 @@ class TfBroadcaster:
                 "they are restarted"
             )
 
-    def _judged(self) -> tuple[Broadcast, str]:
-        result = self._result
+    def _judged(self, result: Calibration | None, why_not: str) -> tuple[Broadcast, str]:
         if not self._is_on:
             return Broadcast.OFF, ""
-        if result is None or self._why_not:
-            return Broadcast.WAITING, self._why_not
+        if result is None or why_not:
+            return Broadcast.WAITING, why_not
         if result.verdict is Verdict.DO_NOT_USE:
             return Broadcast.REFUSED, result.headline
         if hidden := result.unobservable():

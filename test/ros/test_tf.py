@@ -142,17 +142,13 @@ class TestNode:
         yield made
         made.switch(False)
 
-    @staticmethod
-    def settle(broadcaster, calibration):
-        broadcaster.add(calibration, why_not="")
-
     def test_a_frame_that_has_a_parent_is_refused_loudly(
         self, peer, robot, listen, broadcaster, calibration, capfd
     ):
         child = calibration.child_frame
         robot(("base_link", child))
         self.frames_of_new_listener(peer, listen, child)
-        self.settle(broadcaster, calibration)
+        broadcaster.look(calibration, "")
         told, why = broadcaster.state
         assert told is Broadcast.REFUSED
         assert why.startswith(f"{child} has the parent base_link on /tf_static")
@@ -162,12 +158,12 @@ class TestNode:
         self, peer, robot, listen, broadcaster, calibration, capfd
     ):
         child = calibration.child_frame
-        self.settle(broadcaster, calibration)
+        broadcaster.look(calibration, "")
         assert self.frames_of_new_listener(peer, listen, child) == {child}
         robot(("base_link", child))
 
         def is_refused():
-            broadcaster.look()
+            broadcaster.look(calibration, "")
             return broadcaster.state[0] is Broadcast.REFUSED
 
         peer.spin_until(is_refused, "the refusal")
@@ -176,16 +172,16 @@ class TestNode:
     def test_what_is_done_but_may_not_be_broadcast_is_refused_and_withdrawn(
         self, broadcaster, calibration
     ):
-        self.settle(broadcaster, calibration)
+        broadcaster.look(calibration, "")
         assert broadcaster.state == (Broadcast.ON, "")
         faulty = "the streams are faulty"
-        broadcaster.add(calibration, why_not=faulty)
+        broadcaster.look(calibration, faulty)
         assert broadcaster.state == (Broadcast.WAITING, faulty)
         dofs = [*calibration.observability]
         dofs[2] = dataclasses.replace(dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf)
-        self.settle(broadcaster, dataclasses.replace(calibration, observability=tuple(dofs)))
+        broadcaster.look(dataclasses.replace(calibration, observability=tuple(dofs)), "")
         assert broadcaster.state == (Broadcast.REFUSED, "z not determined")
-        self.settle(broadcaster, dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED))
+        broadcaster.look(dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), "")
         assert broadcaster.state[0] is Broadcast.REFUSED
         assert broadcaster.state[1].startswith("DO NOT USE: the solver did not converge")
 
