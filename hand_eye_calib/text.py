@@ -46,6 +46,11 @@ def change(axis: str, value: float, sigma: float) -> str:
     return f"{'+' * (value >= 0)}{told} {unit}" if math.isfinite(sigma) else told
 
 
+def capital(text: str) -> str:
+    """With a capital, unless it begins with a name such as ``/lidar`` or that of an axis."""
+    return text if re.match(r"[xyz]\b", text) else f"{text[:1].upper()}{text[1:]}"
+
+
 def axes_in_words(axes: Sequence[str]) -> str:
     """Axes as in "x and the rotation about z" for x and yaw."""
     about = [_ABOUT[axis] for axis in axes if axis in _ABOUT]

@@ -27,7 +27,7 @@ from hand_eye_calib.report.style import (
 )
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import Residuals
-from hand_eye_calib.text import amount, angle, counted, length, listing, share
+from hand_eye_calib.text import amount, angle, length, listing, share
 
 # From m and rad to the units of the figures.
 UNITS = {"x": (100.0, "translation (cm)"), "yaw": (180 / np.pi, "rotation (deg)")}
@@ -96,14 +96,13 @@ def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
     strip.tick_params(axis="y", length=0)
     strip.grid(visible=False)
     svg = as_svg(figure, "streams")
-    gaps = [counted(len(spans) - 1, "gap") for spans in seen.spans_s]
     differ = "Here the streams never overlap."
     if np.isfinite(seen.apart):
         apart = length(seen.apart) if is_speed else angle(seen.apart)
         differ = f"Here they differ by less than {apart}/s half of the time."
     said = (
         f"{_WHAT_COINCIDES[seen.quantity]} {differ} The bars below the curves show when there is "
-        f"data: {gaps[0]} in the parent stream, {gaps[1]} in the child stream."
+        "data."
     )
     return Drawn("streams", "Both streams before any solve", said, svg)
 

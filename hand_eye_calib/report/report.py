@@ -30,6 +30,7 @@ from hand_eye_calib.rig.calibrate import RigCalibration
 from hand_eye_calib.text import (
     amount,
     angle,
+    capital,
     change,
     counted,
     duration,
@@ -83,12 +84,10 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
         lstrip_blocks=True,
     )
     environment.filters |= {"number": fixed, "printable": printable}
-    environment.globals |= {"amount": amount, "counted": counted, "axis_names": _AXIS_NAMES}
-    environment.globals["change"] = change
+    environment.globals |= dict(amount=amount, change=change, counted=counted)
+    environment.globals["axis_names"] = _AXIS_NAMES
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
-    return environment.get_template(template).render(
-        **values, marks=MARKS, said=f"{said[:1].upper()}{said[1:]}"
-    )
+    return environment.get_template(template).render(**values, marks=MARKS, said=capital(said))
 
 
 def render(

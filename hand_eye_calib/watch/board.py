@@ -22,7 +22,7 @@ from hand_eye_calib.live.state import (
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.status import AXES, ROTATIONS
 from hand_eye_calib.stats import LARGEST_OF_SIX
-from hand_eye_calib.text import amount, change, duration, fixed, two_digits
+from hand_eye_calib.text import amount, capital, change, duration, fixed, two_digits
 
 # A node that has said nothing for so long (s) is silent.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
@@ -169,7 +169,7 @@ def _view(state: NodeState, silent_s: float) -> View:
         head = _of_end(state)
     elif is_old:
         text = f"No word from the node for {silent_s:.0f} s. If it has died, start it again"
-        text += ", with journal:=resume." if state.journal else "."
+        text += ", with journal:=resume." if state.journal and state.journal.directory else "."
         head = Tone.BAD, "SILENT", text
     saved_in = state.saved.directory if state.saved else ""
     health = () if state.has_ended else tuple(_health(state, is_old))
@@ -227,7 +227,7 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
         return tone, word, _sentence(mount.text)
     if at is None:
         return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
-    sentence = _sentence(at.text)
+    sentence = _sentence(at.text.removeprefix("Done: "))
     if at.progress.is_faulty:  # the result was good, the streams no longer are
         return Tone.ACT, "CHECK THE STREAMS", sentence
     if at.progress.done:
@@ -270,10 +270,9 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
 
 
 def _sentence(text: str) -> str:
-    """With a full stop, and a capital unless it begins with a name such as ``/lidar`` or ``x``."""
-    text = text.replace("+/-", "±")
-    first = text[:1] if text.partition(" ")[0] in AXES else text[:1].upper()
-    return f"{first}{text[1:]}" + ("" if text.endswith((".", "!", "?")) else ".")
+    """With a capital and a full stop."""
+    text = capital(text.replace("+/-", "±"))
+    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _facts(state: NodeState) -> str:
@@ -374,8 +373,9 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
 
 def _result(state: NodeState) -> Iterator[Line]:
     result = _result_of(state)
-    verdict = result.verdict if result else "no result yet"
+    verdict, notes = (result.verdict, result.warnings) if result else ("no result yet", ())
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
+    yield from (Line(Tone.ACT, "note", note.replace("+/-", "±")) for note in notes)
     found, tone = state.progress.comparison if state.progress else None, Tone.UNKNOWN
     text = "nothing to compare with (parameter installed)"
     if found is not None:

@@ -6,7 +6,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.watch.board import MOVED, Line, Tone, View
+from hand_eye_calib.watch.board import Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",
@@ -20,7 +20,8 @@ _BAR_CELLS = 16
 # Narrower terminals do without the last column.
 _WIDE = 76
 
-KEYS, WATCHING_KEYS = "s solve   w save   r reset   q quit", "q quit"
+# Of a request whose key is not its first letter.
+_KEYS = {"save": "w"}
 
 
 def screen(view: View, width: int, footer: str = "") -> RenderableType:
@@ -43,11 +44,10 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
         parts += [title, _lines(view.watched)]
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
-    keys = KEYS if view.bars else WATCHING_KEYS
-    keys = f"c recalibrate   a acknowledge   r reset   {keys}" if view.word == MOVED else keys
+    keys = [f"{_KEYS.get(name, name[0])} {name}   " for name in view.buttons]
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
     body = Panel(Group(*parts), title=title, title_align="left")
-    return Group(Text(f" {keys}   {footer}".rstrip(), style="dim"), body)
+    return Group(Text(f" {''.join(keys)}q quit   {footer}".rstrip(), style="dim"), body)
 
 
 def _bars(view: View, width: int) -> Table:

@@ -36,6 +36,9 @@ _LOOK_S = 0.25
 _PATIENCE_S = 10.0
 
 _PAGE = ("page.html", "page.css", "page.js")
+_FOLDER = files("hand_eye_calib.watch").joinpath("page")
+# A vehicle from its left side, on which y points to whoever looks at it.
+_SKETCH = _FOLDER.joinpath("sketch.svg").read_text(encoding="utf-8")
 _KINDS = {"css": "text/css", "js": "text/javascript", "html": "text/html", "yaml": "text/plain"}
 # Files of a saved result that the page links to.
 SAVED = ("report.html", "extrinsic.yaml")
@@ -49,16 +52,6 @@ _POLICY = (
     "frame-ancestors 'none'; base-uri 'none'"
 )
 _POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
-
-
-# A vehicle from its left side, on which y points to whoever looks at it.
-_SKETCH = (
-    '<svg class="sketch" viewBox="0 0 150 76" role="img" aria-label="x forward, y left, z up">'
-    '<path class="body" d="M34 58V40h22l12-15h42l8 15h24v18z"/><circle cx="54" cy="59" r="9"/>'
-    '<circle cx="124" cy="59" r="9"/><path d="M84 42H14m7-5l-7 5l7 5M84 42V6m-5 7l5-7l5 7'
-    'M84 42l10 28m-7-5l7 5l2-8"/><text x="2" y="47">x</text><text x="92" y="16">z</text>'
-    '<text x="100" y="74">y</text></svg>'
-)
 
 
 class WebServer(ThreadingHTTPServer):
@@ -131,7 +124,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         name = self._path() or "page.html"
         if name in _PAGE and (name != "page.html" or self._has_key()):  # the others have no secrets
-            content = files("hand_eye_calib.watch").joinpath("page", name).read_bytes()
+            content = _FOLDER.joinpath(name).read_bytes()
             self._send(HTTPStatus.OK, content, name)
         elif not self._has_key():
             text = "Open the whole address that the terminal with `hand_eye_calib watch` shows."
@@ -225,8 +218,8 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     files : sequence of str
         Saved files that the page may have.
     """
-    axes = "precision of target"
-    axes += ", change from what is installed" * any(bar.difference for bar in view.bars)
+    axes = "precision against the target"
+    axes += ", change from installed" * any(bar.difference for bar in view.bars)
     sketch = [_SKETCH] if any(bar.meaning for bar in view.bars) else []
     values = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
     reasons = (f"<li>{escape(reason)}</li>" for reason in view.reasons)

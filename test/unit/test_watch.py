@@ -44,7 +44,7 @@ PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 
 RESULT = ResultState(
     parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
-    reasons=("a: b", "c: d"), warnings=(), n_poses=9,
+    reasons=("a: b", "c: d"), warnings=("repaired",), n_poses=9,
     time_offset_s=0.0, scale=1.0,
     age_s=1.0,
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
@@ -206,23 +206,23 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     assert view.sentence.startswith("camera HAS MOVED: z by +3 cm ± 4 mm. Save.")
     assert view.sentence.endswith("Save.")
     saved = view_of(replace(state(**done), saved=SAVED))
-    assert saved.sentence.startswith("Done: known. Saved at ")
+    assert saved.sentence.startswith("Known. Saved at ")
     assert saved.sentence.endswith(" in /home/live.")
     assert (saved.tone, saved.buttons[0], saved.saved_in) == (Tone.GOOD, "solve", "/home/live")
     assert (saved.result[-1].name, saved.result[-1].tone) == ("saved", Tone.GOOD)
     assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
     assert view.reasons == ("a: b", "c: d")
-    assert (view.result[1].tone, view.result[1].text) == (Tone.ACT, "moved: z by +3 cm ± 4 mm")
+    assert (view.result[2].tone, view.result[2].text) == (Tone.ACT, "moved: z by +3 cm ± 4 mm")
     assert view.bars[2].difference == "+3.10 ± 0.40 cm"
     assert view.bars[5].difference == "unknown"
-    assert "nothing to compare with" in view_of(state()).result[1].text
-    assert len(view_of(state()).result) == 2
+    assert "nothing to compare with" in view_of(state()).result[2].text
+    assert [each.name for each in view_of(state()).result[:2]] == ["verdict", "note"]
     for verdict, tone in (("same", Tone.GOOD), ("cannot tell", Tone.UNKNOWN)):
         other = replace(comparison, verdict=verdict)
-        assert view_of(state(comparison=other)).result[1].tone is tone
+        assert view_of(state(comparison=other)).result[2].tone is tone
     for broadcast, tone in ((Broadcast.ON, Tone.GOOD), (Broadcast.REFUSED, Tone.ACT)):
         extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
-        line = view_of(state(extrinsic=extrinsic)).result[2]
+        line = view_of(state(extrinsic=extrinsic)).result[3]
         assert (line.tone, line.name) == (tone, "on /tf_static")
         assert line.text == f"{broadcast.value}: why"
 

@@ -44,7 +44,8 @@ function put(html) {
   const state = part("state"), shown = state.dataset.buttons.split(" ");
   for (const button of buttons) {
     button.hidden = !shown.includes(button.dataset.request);
-    button.classList.toggle("main", button.dataset.request === shown[0] && shown[0] !== "solve");
+    button.classList.toggle("main", shown[0] === button.dataset.request
+      && !["solve", "reset"].includes(shown[0]));
   }
   footer.hidden = ["", "reset"].includes(shown[0]);
   part("files").hidden = state.dataset.files === "";
