@@ -43,23 +43,16 @@ def lines():
 
 @pytest.fixture
 def cycle(lines, monkeypatch):
-    """A cycle whose process answers nothing, with what it has published."""
+    """A cycle whose process answers nothing."""
     jobs = []
     nothing = SimpleNamespace(submit=jobs.append, stop=lambda s: None, answers=list)
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
     levels = ("debug", "info", "warning", "error")
     write = {level: lambda text, level=level: lines.append((level, text)) for level in levels}
     log = NodeLog(SimpleNamespace(**write))
-    published = []
-    made = SolveCycle(
-        LiveSession(log, CalibratorConfig()),
-        log,
-        print,
-        lambda each: each,
-        published.append,
-        TARGETS,
-    )
-    made.published, made.jobs = published, jobs
+    session = LiveSession(log, CalibratorConfig())
+    made = SolveCycle(session, log, print, lambda each: each, print, TARGETS)
+    made.jobs = jobs
     made.ask(lambda good, text: None)
     return made
 
@@ -76,7 +69,7 @@ def reach_goal(cycle):
     return good, text
 
 
-def test_what_is_kept_is_answered_published_and_saved_and_says_why_it_is_not_the_newest(cycle):
+def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle):
     reach_goal(cycle)
     kept = cycle.result
     moved = result().T_parent_child + np.eye(4, k=3) * 0.1
@@ -89,7 +82,6 @@ def test_what_is_kept_is_answered_published_and_saved_and_says_why_it_is_not_the
     assert f"{moved[0, 3]:.4f}" in warning
     assert "(5.0, 10.0, 5.0) mm" in warning
     assert "120 poses" in warning
-    assert cycle.published[-1] is cycle.result
     np.testing.assert_array_equal(cycle.result.T_parent_child, kept.T_parent_child)
     assert cycle.goal.progress.done
     # A better one takes its place, and the note is gone.
@@ -107,10 +99,10 @@ def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minut
 
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
     reach_goal(cycle)
-    before = cycle.result, len(cycle.published)
+    before = cycle.result
     good, text = answered(cycle, 46.0, status=SolveStatus.NOT_CONVERGED)
     assert (good, text.startswith("DO NOT USE: the solver did not converge")) == (False, True)
-    assert (cycle.result, len(cycle.published)) == before
+    assert cycle.result is before
 
 
 def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cycle):
