@@ -129,8 +129,10 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
         ]
         if fitting:
             layout, is_inverted, _ = arranged(fitting, parent_frame, child_frame)
-            T = pose_of(*_of_sensors(nodes, layout.keys, {parent_frame, child_frame}))
-            return se3.inverse(T) if is_inverted else T
+            names, values = _of_sensors(nodes, layout.keys, {parent_frame, child_frame})
+            if layout.is_inverted is not None and child_frame not in names:
+                is_inverted ^= parent_frame in names  # where the format names its child
+            return se3.inverse(pose_of(*values)) if is_inverted else pose_of(*values)
     if len(numbers_of(document)) in (12, 16):
         return pose_of(document)
     raise InputError(f"expected {_EXPECTED}")
@@ -168,21 +170,25 @@ def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
     return ()
 
 
-def _of_sensors(nodes: list[_Node], keys: Sequence[str], frames: set[str]) -> list[Any]:
-    """What stands under some keys; of several, that of these frames."""
-    found = [(node, values) for node in nodes if (values := _at(node[1], keys))]
+def _of_sensors(
+    nodes: list[_Node], keys: Sequence[str], frames: set[str]
+) -> tuple[set[str], list[Any]]:
+    """What stands under some keys, and which of the frames name it, beside or else above; of
+    several, that of these frames.
+    """
+    found = []
+    for above, node in nodes:
+        if values := _at(node, keys):
+            beside = frames & {str(each).strip("/") for each in node.values()}
+            found.append((beside or frames & {*above}, values))
     if len(found) > 1:
-        found = [
-            ((above, node), values)
-            for (above, node), values in found
-            if any(name.strip("/") in frames for name in (*above, *map(str, node.values())))
-        ]
+        found = [each for each in found if each[0]]
     if len(found) != 1:
         raise InputError(
             "has several extrinsics, and none or several of them are named "
             f"{' or '.join(sorted(frames))}; leave the one that is meant"
         )
-    return found[0][1]
+    return found[0]
 
 
 def _at(node: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:

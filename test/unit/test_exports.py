@@ -141,7 +141,7 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_d
     (tmp_path / "foreign.yaml").write_text(text)
     found = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
     np.testing.assert_allclose(found.T_parent_child, calibration.T_parent_child, atol=1e-9)
-    if role_of(child) != role_of(parent) and name not in ("nuscenes", "driveworks"):
+    if name not in ("opencv", "numpy"):  # which name nothing
         found = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
         np.testing.assert_allclose(found.T_parent_child, calibration.T_child_parent, atol=1e-9)
 

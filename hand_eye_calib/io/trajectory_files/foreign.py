@@ -56,6 +56,8 @@ def foreign_table(
     try:
         header, rows, notes = read(data, choice)
         rows = [[*map(str, row)] for row in rows]
+        if not rows:
+            raise ValueError("no poses in it")
     except MissingDependencyError:
         raise
     except Exception as error:  # of many kinds, in a file that is not what it begins like
@@ -262,8 +264,8 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
             stamps, Ts = stamps[inside], attitudes.at(1000 * stamps[inside])
             Ts[:, :3, 3] = places[inside]
     except Exception as error:  # of many kinds, at damaged logs
-        reason = f"{type(error).__name__} {error}"
-        raise ValueError(f"a log of PX4 without {' or '.join(topics[:2])} ({reason})") from None
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"a log of PX4 without {' or '.join(topics[:2])}, {reason}") from None
     flip = np.diag([*np.diag(_FLIP), 1.0])
     rows = np.c_[stamps, _as_rows(flip @ Ts @ flip)].tolist()
     note = "axes: x forward, y left, z up, in north, west, up; PX4 has forward, right, down"
@@ -276,6 +278,8 @@ def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]
     good = np.isfinite(values).all(axis=1)
     for valid in {"xy_valid", "z_valid"} & data.keys():  # of local positions
         good &= data[valid] > 0
+    if not good.any():
+        raise ValueError(f"none of {', '.join(names)} is valid")
     stamps = data.get("timestamp_sample", data["timestamp"])[good].astype(np.int64)
     stamps, first = np.unique(stamps, return_index=True)
     return stamps, values[good][first]
@@ -322,7 +326,7 @@ PROGRAMS: dict[bytes, _Reader | str] = {
     "samples of an arm are a recording of their own",
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
-    rb"\A(<\?xml[^>]*>\s*)?<gpx": _of_gpx,
+    rb"<gpx[\s>]": _of_gpx,
     rb"\A(\{|\[\s*[\[{\"\d-])": _of_json,
     rb"\$[A-Z]{2}(GGA|RMC),": _of_nmea,
     rb"\A\d{9,10},\d{1,9},[^,\n]*[A-Za-z/][^,\n]*,": _of_echo,
