@@ -16,6 +16,7 @@ Gauss-Newton steps with Geman-McClure weights follow.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,25 +158,26 @@ def fit_similarity(
     return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
 
 
-def estimate_scale(pose_pairs: PosePairs, start: SimilarityFit | None = None) -> SimilarityFit:
+def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
     Parameters
     ----------
     pose_pairs : PosePairs
-    start : SimilarityFit, optional
-        Fit of the same streams to start at; a start is searched for without one.
+    known : sequence of SimilarityFit, optional
+        Fits of the same streams over the first of the times that are compared; a start is searched
+        for without any.
 
     Raises
     ------
     NotEnoughDataError
         If there are too few poses.
     """
-    fits: list[SimilarityFit] = []
-    for lag_s in _SCALE_LAGS_S:
+    fits = [*known]
+    for lag_s in _SCALE_LAGS_S[len(fits) :]:
         pairs = pairs_over(pose_pairs, lag_s)
         if len(pairs) >= MIN_PAIRS:
-            fits.append(fit_similarity(pairs, start=fits[-1] if fits else start))
+            fits.append(fit_similarity(pairs, start=fits[-1] if fits else None))
     if not fits:
         raise NotEnoughDataError(
             f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "

@@ -141,7 +141,7 @@ def check_streams(
         both = right.parent, right.child, correlation, right.max_gap_s, explanation.fit
         offset = refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
     right = right.shifted(offset.seconds)
-    sizes, fit = _check_sizes(right.synchronised, explanation, scale)
+    sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
         findings += _check_agreeing(right, streams, fit, known)
@@ -191,10 +191,10 @@ def _explained(
 
 
 def _check_sizes(
-    pose_pairs: PosePairs, explanation: Explanation, known: float
+    pose_pairs: PosePairs, explanation: Explanation, timed: SimilarityFit | None, known: float
 ) -> tuple[list[Finding], SimilarityFit]:
     """Findings about the scale, beside the one that is known, and the axes of rotation of streams
-    that agree, and the fit with the scale.
+    that agree, and the fit with the scale. ``timed`` is the fit with the time offset.
     """
     rotations, fit = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3], explanation.fit
     of_noise = fit.sigma_rotation**2 * np.eye(3)
@@ -202,7 +202,8 @@ def _check_sizes(
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
-            fit = estimate_scale(pose_pairs, start=fit)
+            of_both = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
+            fit = estimate_scale(pose_pairs, of_both)
             if scale_differs(fit):
                 values: dict[str, Any] = {"scale": fit.scale, "sigma": fit.scale_sigma}
                 values["options"] = {"scale": round(known * fit.scale, 4)}

@@ -360,8 +360,7 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
     return streams.interval_s > streams.max_gap_s or all(
-        np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
-        for each in positions
+        np.linalg.norm(each - medians(each.T), axis=1).max() < _REACH_M for each in positions
     )
 
 
@@ -381,7 +380,7 @@ def _evidence_for_inverse(
     pairs, Ts_c_cw = streams.synchronised, se3.inverse(streams.synchronised.Ts_cw_c)
     Ts_c_cw[:, :3, 3] *= fit.scale
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ Ts_c_cw
-    off = np.linalg.norm(worlds[:, :3, 3] - np.median(worlds[:, :3, 3], axis=0), axis=1)
+    off = np.linalg.norm(worlds[:, :3, 3] - medians(worlds[:, :3, 3].T), axis=1)
     inverted = replace(fit, T_parent_child=worlds[np.argmin(off)])
     Ts = np.array([fit.T_parent_child, inverted.T_parent_child])
     arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)

@@ -162,7 +162,7 @@ def _grid_step(values: FloatArray) -> float:
     step = float(differences.min())
     multiples = differences / step
     # Steady motion has equal steps, too, but not many different ones.
-    different = len(np.unique(np.round(multiples)))
+    different = len({*np.round(multiples).tolist()})
     if different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
         return 0.0
     off = np.abs(multiples - np.round(multiples))

@@ -76,7 +76,7 @@ class Problem:
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
     # The fit whose posterior of all poses was asked for last, and that posterior. It is large.
-    _last: list[tuple[Fit, Posterior]] = field(default_factory=list)
+    _last: list[tuple[dict[str, object], Posterior]] = field(default_factory=list)
 
     def known(self, fit: Fit) -> FloatArray:
         """Products (p + 1, p + 1) that what is known of the parameters beforehand adds."""
@@ -106,9 +106,13 @@ class Problem:
 
     def posterior(self, fit: Fit) -> Posterior:
         """Of all poses."""
-        if not self._last or self._last[0][0] is not fit:
+        # It does not depend on what the fit says of the stages to come.
+        of_fit = {**vars(fit), "has_heavy_tails": None}
+        if not self._last or any(
+            value is not of_fit[name] for name, value in self._last[0][0].items()
+        ):
             self._last.clear()
-            self._last.append((fit, Posterior(self.space(fit), fit.levels)))
+            self._last.append((of_fit, Posterior(self.space(fit), fit.levels)))
         return self._last[0][1]
 
     def is_noisy(self, fit: Fit) -> bool:
@@ -210,7 +214,9 @@ def sample(n_poses: int, most: int) -> IntArray | None:
     burst = np.array(TUNING.burst)
     offsets = burst[2 * len(burst) * n_poses // most > burst]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(burst)).astype(int)
-    return np.unique(starts[:, None] + offsets)
+    kept = np.zeros(n_poses, dtype=bool)
+    kept[starts[:, None] + offsets] = True
+    return np.flatnonzero(kept)
 
 
 def start(problem: Problem) -> Fit:
