@@ -22,7 +22,6 @@ from hand_eye_calib.report.style import (
     PARENT,
     as_svg,
     page_style,
-    plain_decades,
     plain_label,
 )
 from hand_eye_calib.results.calibration import Calibration
@@ -210,7 +209,8 @@ def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: 
     panel.yaxis.set_label_coords(-0.06, 0.5)
     if values.max() > 15 * np.median(values):  # the largest would hide the others
         panel.set_yscale("log")
-        plain_decades(panel.yaxis)
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.minorticks_off()
     else:
         panel.set_ylim(0, 1.08 * values.max())
 

@@ -6,14 +6,12 @@ Figures are made without pyplot: no display, no global state.
 import io
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import matplotlib
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from hand_eye_calib.errors import printable
 
@@ -94,16 +92,6 @@ def page_style(**more: Any) -> Iterator[None]:
         # Text is drawn by the browser, with its own fonts.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
-
-
-def plain_decades(axis: Axis, marks: Sequence[float] = (1,)) -> None:
-    """Ticks at powers of ten, times ``marks``, written as 0.01 and not as a power; no minor ones.
-    Zero is kept if the axis has it.
-    """
-    if axis.get_scale() == "log":
-        axis.set_major_locator(LogLocator(subs=marks))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())
 
 
 def as_svg(figure: Figure, name: str) -> str:

@@ -376,11 +376,9 @@ def _result(state: NodeState) -> Iterator[Line]:
     verdict, notes = (result.verdict, result.warnings) if result else ("no result yet", ())
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
     yield from (Line(Tone.ACT, "note", note.replace("+/-", "±")) for note in notes)
-    found, tone = state.progress.comparison if state.progress else None, Tone.UNKNOWN
-    text = "nothing to compare with (parameter installed)"
-    if found is not None:
-        text, tone = found.sentence.replace("+/-", "±"), _TONES.get(found.verdict, tone)
-    yield Line(tone, "compared with what is installed", text)
+    if state.progress and (found := state.progress.comparison):
+        text, tone = found.sentence.replace("+/-", "±"), _TONES.get(found.verdict, Tone.UNKNOWN)
+        yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
         yield Line(_TONES[broadcast], "on /tf_static", text)
