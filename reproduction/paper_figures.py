@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator
 
 from hand_eye_calib.report import style
 
@@ -145,12 +146,19 @@ def _scale(ax: Axes, lines: Sequence[Line], metric: str) -> None:
     centres = [summary.centre for line in lines for summary in line.summaries]
     if not lines[0].levels:
         ax.set_yscale("log")
-        style.plain_decades(ax.yaxis, (1, 2, 5))
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        _write_plainly(ax)
         return
     above = [centre for centre in centres if centre > _LINEAR_BELOW[metric]]
     decade = 10.0 ** math.floor(math.log10(min(above))) if above else _LINEAR_BELOW[metric]
     ax.set_yscale("symlog", linthresh=decade, linscale=0.35)
-    style.plain_decades(ax.yaxis)
+    _write_plainly(ax)
+
+
+def _write_plainly(ax: Axes) -> None:
+    """Powers of ten up the axis as 0.01, without minor ticks."""
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.minorticks_off()
 
 
 def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
@@ -248,6 +256,6 @@ def draw_components(
         for row, unit, least in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):
             row[0].set_ylabel(unit)
             row[0].set_yscale("log")
-            style.plain_decades(row[0].yaxis)
+            _write_plainly(row[0])
             row[0].set_ylim(bottom=least)
         return _save(figure, stem)
