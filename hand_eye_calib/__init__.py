@@ -33,7 +33,7 @@ _HOMES = {
     "compare": "session.together",
     "cross_check": "engine.offline",
     "load": "io.results",
-    "plot": "report.plot",
+    "plot": "report.figures",
     "read_arm_samples": "io.stops",
     "read_trajectory": "io.trajectory_files.reading",
     "save": "io.results",
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.io.stops import read_arm_samples as read_arm_samples
     from hand_eye_calib.io.trajectory_files.reading import read_trajectory as read_trajectory
     from hand_eye_calib.io.trajectory_files.table import write_trajectory as write_trajectory
-    from hand_eye_calib.report.plot import plot as plot
+    from hand_eye_calib.report.figures import plot as plot
     from hand_eye_calib.results.calibration import Calibration as Calibration
     from hand_eye_calib.results.records import Residuals as Residuals
     from hand_eye_calib.results.status import SolveStatus as SolveStatus

@@ -147,7 +147,7 @@ class Calibration(Result):
 
     def plot(self) -> Any:
         """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
-        return upstairs("report.plot", "plot")(self)
+        return upstairs("report.figures", "plot")(self)
 
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML file; a directory gets ``report.html``.
