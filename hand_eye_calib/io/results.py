@@ -16,7 +16,7 @@ from hand_eye_calib.errors import InputError, located, printable
 from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import usable_angles, usable_numbers
+from hand_eye_calib.results.document import transform_arguments, usable_angles, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
@@ -200,15 +200,9 @@ def _xacro_text(calibration: Calibration) -> str:
 def _launch_text(calibrations: Sequence[Calibration]) -> str:
     """A launch file that publishes extrinsics as static transforms."""
     comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
-    transforms = []
-    for calibration in calibrations:
-        frames = printable(calibration.mounting[0]), printable(calibration.child_frame)
-        arguments = ["--frame-id", frames[0], "--child-frame-id", frames[1]]
-        for name, value in usable_numbers(calibration).items():
-            text = value if isinstance(value, str) else f"{round(value, 12) + 0.0:.12f}"
-            arguments += [f"--{name}", text]
-        transforms.append(f"    {arguments},")
-    return _template(LAUNCH_NAME).format(comment=comment, transforms="\n".join(transforms))
+    arguments = [[*map(printable, transform_arguments(each, 12))] for each in calibrations]
+    transforms = "\n".join(f"    {each}," for each in arguments)
+    return _template(LAUNCH_NAME).format(comment=comment, transforms=transforms)
 
 
 def _template(name: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_in_parent
-from hand_eye_calib.results.document import UNKNOWN_M, document_of, usable_numbers, values_of
+from hand_eye_calib.results.document import UNKNOWN_M, document_of, transform_arguments, values_of
 from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import (
@@ -167,13 +167,9 @@ class Calibration(Result):
         is mounted on; empty if the verdict is DO NOT USE. For an axis that the motion does not
         determine it has a word that static_transform_publisher refuses.
         """
-        told = "".join(
-            f"--{name} {value if isinstance(value, str) else f'{round(value, 9) + 0.0:.9f}'} "
-            for name, value in usable_numbers(self).items()
-        )
-        parent, child = map(shlex.quote, (self.mounting[0], self.child_frame))
-        frames = f"--frame-id {parent} --child-frame-id {child}"
-        return told and f"ros2 run tf2_ros static_transform_publisher {told}{frames}"
+        told = transform_arguments(self, 9)
+        command = f"ros2 run tf2_ros static_transform_publisher {shlex.join(told)}"
+        return command if told else ""
 
     def export(self, format: str) -> str:
         """The extrinsic as a file of another program.

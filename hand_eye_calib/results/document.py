@@ -18,7 +18,7 @@ from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
-from hand_eye_calib.text import given_or_estimated, listing, printed_angle, with_sigma
+from hand_eye_calib.text import fixed, given_or_estimated, listing, printed_angle, with_sigma
 
 # Format and version of a document. A change that an older reader cannot understand raises the
 # version.
@@ -192,6 +192,17 @@ def usable_numbers(result: Result) -> dict[str, float | str]:
     if unknown.intersection(ROTATIONS):
         return numbers | usable_angles(result)
     return numbers | dict(zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True))
+
+
+def transform_arguments(result: Result, decimals: int) -> list[str]:
+    """The arguments of static_transform_publisher for a result's ``mounting``, with so many
+    decimals; empty under DO NOT USE.
+    """
+    told: list[str] = []
+    for name, value in usable_numbers(result).items():
+        told += [f"--{name}", value if isinstance(value, str) else fixed(value, decimals)]
+    frames = ["--frame-id", result.mounting[0], "--child-frame-id", result.child_frame]
+    return told and told + frames
 
 
 def usable_angles(result: Result) -> dict[str, float | str]:

@@ -48,6 +48,13 @@ _TAKEN = (
     *("time_offset_s", "time_offset_sigma_s", "scale", "scale_sigma"),
 )
 
+# What is that of all recordings together, and that of the newest of them.
+_COUNTS = ("n_poses", "n_pairs", "n_inliers")
+_OF_NEWEST = (
+    *("reference", "backend", "measured", "stamp_ns", "parent_frame", "child_frame"),
+    *("base_frame", "T_base_parent", "target_translation", "target_rotation", "target_axes"),
+)
+
 
 def calibrate_together(
     recordings: Iterable[tuple[Trajectory, Trajectory]],
@@ -256,24 +263,12 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=found.chi2,
         method=Counter(one.method for one in used).most_common(1)[0][0],
-        reference=newest.reference,
-        backend=newest.backend,
         time_offset_s=offset_s,
         scale=scale,
-        measured=newest.measured,
         findings=tuple({each.code: each for one in used for each in one.findings}.values()),
-        n_poses=sum(one.n_poses for one in used),
-        n_pairs=sum(one.n_pairs for one in used),
-        n_inliers=sum(one.n_inliers for one in used),
-        stamp_ns=newest.stamp_ns,
-        parent_frame=newest.parent_frame,
-        child_frame=newest.child_frame,
-        base_frame=newest.base_frame,
-        T_base_parent=newest.T_base_parent,
-        target_translation=newest.target_translation,
-        target_rotation=newest.target_rotation,
-        target_axes=newest.target_axes,
         together=record,
+        **{name: sum(getattr(one, name) for one in used) for name in _COUNTS},
+        **{name: getattr(newest, name) for name in _OF_NEWEST},
     )
 
 
