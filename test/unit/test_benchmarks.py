@@ -11,7 +11,7 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
-from suite import baseline, data, rows, table  # noqa: E402
+from suite import baseline, data, rows  # noqa: E402
 from suite.measuring import Row  # noqa: E402
 
 from hand_eye_calib.geometry import se3  # noqa: E402
@@ -71,23 +71,3 @@ def test_opencv_is_given_what_it_expects(method):
     T_cw_pw = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0]))
     found = rows.opencv(cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD)
     np.testing.assert_allclose(found, data.T_PARENT_CHILD, atol=1e-6)
-
-
-def test_tables_show_every_row_and_replace_those_of_an_earlier_run(tmp_path, capsys):
-    measured = [
-        dataclasses.replace(row, size=size, error_m=0.1, error_rad=0.01)
-        for size in (443, 2338)
-        for row in (Row(baseline.FLOOR, 443, 1e-6, 0.0, 5), *ROWS)
-    ]
-    measured.append(Row("add_pose, median", 40_000, 1.25e-6, 0.1, 5))
-    table.show(table.tables("published", measured, MEMORY))
-    shown = capsys.readouterr().out
-    aims = ("What is aimed at", "dnlo ipopt / dnlo fast, 443")
-    assert all(words in shown for words in ("10 ms ± 10%", "0.573", "1.25 us", *aims))
-    page = tmp_path / "page.md"
-    page.write_text((BENCHMARKS.parent / "docs" / "benchmarks.md").read_text("utf-8"), "utf-8")
-    for seconds in ("1.5 ms", "2.5 ms"):
-        growth = table.Table("Growth", ["443"], [["dnlo fast", seconds]])
-        table.write([growth], page, f"Measured, {seconds}.\n")
-    assert "| dnlo fast | 2.5 ms |\n" in page.read_text("utf-8")
-    assert "1.5 ms" not in page.read_text("utf-8")

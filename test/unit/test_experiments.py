@@ -2,8 +2,6 @@
 simulator.
 """
 
-from xml.etree import ElementTree
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +10,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.solvers import park
 from reproduction import comparison, metrics, results, runner
 from reproduction.__main__ import EXPERIMENTS, GROUPS, main
-from reproduction.published import REFERENCES, find_folder
+from reproduction.published import REFERENCES
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, Cell, solve_cell, table_of
 from reproduction.sources import SimulatedSource
 from reproduction.writing import put_into_page
@@ -149,17 +147,6 @@ def test_everything_in_the_article_is_there():
     assert set(EXPERIMENTS) - {"faults"} <= set(GROUPS)
 
 
-def test_command_draws_a_figure(tmp_path, capsys):
-    simulated = ["--data", "simulated", "--runs", "2", "--seed", "1", "--jobs", "1"]
-    assert main(["fig3", *simulated, "--out", str(tmp_path)]) == 0
-    assert "3 files written" in capsys.readouterr().out
-    assert (tmp_path / "fig3.png").read_bytes().startswith(b"\x89PNG")
-    text = " ".join(ElementTree.parse(tmp_path / "fig3.svg").getroot().itertext())
-    assert all(reference in text for reference in REFERENCES)
-    lines = (tmp_path / "fig3.csv").read_text().splitlines()
-    assert len(lines) == 1 + 19 * len(REFERENCES) * len(METRICS)
-
-
 def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# Ours\n\n<!-- study: begin -->\nold\n<!-- study: end -->\n\nThe rest.\n")
@@ -186,12 +173,3 @@ def test_misuse_is_told_in_one_line(tmp_path, capsys, arguments, code, said):
     captured = capsys.readouterr()
     assert (captured.out, captured.err.count("\n")) == ("", 1)
     assert said in captured.err
-
-
-def test_the_folder_of_the_published_data_is_looked_for(tmp_path):
-    for name in ("kitti_tests", "simulation_tests"):
-        (tmp_path / "valimaki2023" / name).mkdir(parents=True)
-    with pytest.raises(InputError, match="it has no calib"):
-        find_folder(tmp_path)
-    (tmp_path / "valimaki2023" / "calib").mkdir()
-    assert find_folder(tmp_path) == str((tmp_path / "valimaki2023").resolve())

@@ -119,13 +119,6 @@ class TestRates:
         found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, 0.0 * rates))
         assert found.verdict is hec.Verdict.DO_NOT_USE
 
-    def test_rates_of_another_body_are_not_to_be_used(self, streams):
-        parent, _ = streams
-        _, stamps_ns, rates = smooth_streams(seed=9)
-        found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, rates))
-        assert found.verdict is hec.Verdict.DO_NOT_USE
-        assert [finding.code for finding in found.findings] == ["unrelated"]
-
     @pytest.mark.parametrize(
         "options",
         [{"method": "dnlo"}, {"reference": "B5"}, {"backend": "ipopt"}, {"scale": "estimate"}],

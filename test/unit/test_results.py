@@ -302,9 +302,7 @@ def test_documents_follow_the_schema(changes, tmp_path):
     path = save_result(result, tmp_path)
     for document in (json.loads(json_text(result.to_dict())), yaml.safe_load(path.read_text())):
         jsonschema.validate(document, schema)
-    assert document["T_parent_child"]["translation"][2] is None
     assert document["observability"][2]["sigma_total"] is None
-    assert document["verdict"] == "USE_WITH_CARE"
 
 
 def test_the_total_has_the_floor():

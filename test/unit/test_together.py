@@ -5,6 +5,8 @@ import json
 
 import numpy as np
 import pytest
+import real_data
+from fleet_making import recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 from result_making import SHIFTED_FROM as X
 from result_making import shift
@@ -13,8 +15,14 @@ from result_making import shifted as result
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import Extrinsic
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.session.together import together
+from hand_eye_calib.results.status import AXES
+from hand_eye_calib.session.agreement import agreement_of
+from hand_eye_calib.session.together import compare, together, with_comparison
+
+pytestmark = pytest.mark.usefixtures("no_figures")
 
 
 def named(*results):
@@ -120,3 +128,281 @@ def test_python_takes_pairs_of_trajectories():
     assert table.x_m["1"] == pytest.approx(T_PARENT_CHILD[0, 3], abs=3e-3)
     with pytest.raises(InputError, match="monday: "):
         hec.calibrate_together([(pairs[0][0], 3)], ["monday"])
+
+
+# ---- results of one rig agree, scatter, or have one among them that does not belong there
+
+
+def results_of(seed, count, unknown_z=False, apart=(), factor=1.0):
+    """Extrinsics and their covariances along the parent's axes, some rotated by 0.06 rad."""
+    Ts, covariances = recordings_of(seed, count, unknown_z)
+    to_parent = np.kron(np.eye(2), Ts[:, :3, :3])
+    Ts, apart = Ts.copy(), list(apart)
+    Ts[apart] = se3.exp(np.array([0, 0, 0, 0, 0, 0.06])) @ Ts[apart]
+    return Ts, factor * to_parent @ covariances @ np.swapaxes(to_parent, 1, 2)
+
+
+@pytest.mark.parametrize("unknown_z", [False, True])
+@pytest.mark.parametrize("count", [2, 3, 8, 30])
+def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
+    seeds = range(40 if count < 10 else 15)
+    found = [agreement_of(*results_of(seed, count, unknown_z)) for seed in seeds]
+    alarms = sum(one.kind != "agree" for one in found)
+    assert alarms <= 4  # 0.8 expected, 5 or more once in 800
+    p_values = np.array([one.p_value for one in found])
+    assert 0.35 < p_values.mean() < 0.65
+    assert all(one.dof == (5 if unknown_z else 6) * (count - 1) for one in found)
+
+
+@pytest.mark.parametrize("unknown_z", [False, True])
+@pytest.mark.parametrize(
+    ("apart", "kind"),
+    [([4], "one off"), ([0], "one off"), ([7], "one off"), ([5, 6, 7], "moved")],
+)
+def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
+    for seed in range(10):
+        found = agreement_of(*results_of(seed, 8, unknown_z, apart))
+        assert (found.kind, list(found.apart)) == (kind, apart)
+        assert found.deviations[apart, 5] == pytest.approx(0.06, abs=0.02)
+        assert np.isnan(found.deviations[0, 2]) == unknown_z
+        assert found.p_value < 1e-6
+        assert "the rotation about z by " in found.sentence("abcdefgh")
+
+
+def test_results_that_all_scatter_more_than_stated_accuse_none():
+    found = [agreement_of(*results_of(seed, 12, factor=0.25)) for seed in range(20)]
+    scattered = [one for one in found if one.kind == "scatter"]
+    assert len(scattered) >= 19
+    assert all(1.5 < one.excess < 2.5 for one in scattered)
+
+
+def test_a_single_result_and_one_that_knows_nothing():
+    Ts, covariances = results_of(3, 2)
+    found = agreement_of(Ts[:1], covariances[:1])
+    assert (found.kind, found.dof, found.p_value) == ("single", 0, 1.0)
+    np.testing.assert_allclose(found.T_parent_child, Ts[0])
+    covariances[1] = np.diag([np.inf] * 6)
+    found = agreement_of(Ts, covariances)
+    assert (found.kind, found.dof) == ("agree", 0)
+    np.testing.assert_allclose(found.T_parent_child, Ts[0], atol=1e-9)
+    assert np.isnan(found.deviations[1]).all()
+
+
+# ---- results against what is installed, and recordings against each other
+
+
+def values(difference):
+    return np.array([each.difference for each in difference.axes.values()])
+
+
+def axes(difference, verdict):
+    return [axis for axis, each in difference.axes.items() if each.verdict == verdict]
+
+
+def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told():
+    found = compare([result(seed=1), result(seed=2), result(seed=3)])
+    assert (found.verdict, found.moved) == ("same", ())
+    one = found.differences[0]
+    assert one.sentence == "same: a change of 5.4 cm or 0.8 deg would have been seen"
+    np.testing.assert_allclose(
+        values(one), deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child)
+    )
+
+
+def test_chance_makes_a_change_less_than_once_in_a_hundred():
+    moved = [
+        compare([result(seed=2 * i), result(seed=2 * i + 1)]).verdict == "moved" for i in range(150)
+    ]
+    assert sum(moved) <= 2
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_a_change_of_the_size_that_is_said_to_be_seen_is_seen(axis):
+    seen = compare([result(), result()]).differences[0].axes[axis].visible
+    found = [
+        compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[0]
+        for i in range(20)
+    ]
+    named = [each.axes[axis].verdict == "moved" for each in found]
+    assert np.mean(named) >= 0.9  # sigmas are taken larger than stated
+
+
+def test_an_unknown_axis_is_neither_the_same_nor_moved():
+    flat = result(shift("z", 0.5), hidden="z", status=SolveStatus.UNOBSERVABLE)
+    found = compare([flat], Extrinsic(X, "drawing")).differences[0]
+    assert found.verdict == "cannot tell"
+    assert axes(found, "cannot tell") == ["z"]
+    assert np.isinf(found.axes["z"].sigma)
+    assert found.sentence.startswith("cannot tell about z; x, y, roll, pitch and yaw the same: ")
+
+
+def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
+    floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.2) ** 2)])
+    first, second = result(floor=floor), result(shift("yaw", np.radians(0.6)), floor=floor)
+    assert compare([second], Extrinsic(X, "drawing")).verdict == "same"
+    assert compare([first, second]).verdict == "moved"
+    known = Extrinsic(X, "earlier result", first.covariance, is_calibration=True)
+    assert axes(compare([second], known).differences[0], "moved") == ["yaw"]
+
+
+def test_what_a_flight_alone_is_off_by_is_no_move():
+    """Its truth is 15 mm off in y: of other flights of the same rig it is not."""
+    flight = real_data.euroc("vio_stereo", "v2_01")
+    published = Extrinsic(real_data.EUROC_TRUTH, "published")
+    found = compare([hec.calibrate(flight.parent, flight.child)], published).differences[0]
+    assert found.axes["y"].difference == pytest.approx(0.015, abs=0.002)
+    assert found.verdict == "same"
+
+
+@pytest.mark.parametrize("sigma_z", [0.002, 0.05], ids=["in hand", "vehicle"])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
+    sigmas = np.r_[0.002, 0.002, sigma_z, np.full(3, np.radians(0.05))]
+    moved = shift(AXES[axis], 0.03) + shift(AXES[axis + 3], np.radians(1.0))
+    floor = np.diag(np.r_[np.full(3, 0.005**2), np.full(3, np.radians(0.15) ** 2)])
+    for seed in range(5):
+        first, second = (
+            result(sigmas=sigmas, seed=seed, floor=floor),
+            result(moved, sigmas=sigmas, seed=100 + seed, floor=floor),
+        )
+        assert AXES[axis + 3] in axes(compare([first, second]).differences[0], "moved")
+        against = compare([second], Extrinsic(X, "drawing")).differences[0]
+        assert AXES[axis + 3] in axes(against, "moved")
+
+
+def test_an_axis_is_the_same_by_its_own_target():
+    rough, drawing = result(), Extrinsic(X, "drawing")
+    assert compare([rough], drawing).verdict == "same"
+    strict = dataclasses.replace(rough, target_axes={"y": 0.001})
+    assert axes(compare([strict], drawing).differences[0], "cannot tell") == ["y"]
+
+
+@pytest.mark.parametrize(
+    ("have_moved", "named", "sentence"),
+    [
+        ("010", ("drive 2",), "moved: drive 2 differs from the others: the rotation about y by "),
+        ("0011", ("drive 3", "drive 4"), "moved: The mount has moved before drive 3: "),
+        ("01", (), "moved: drive 1 and drive 2 differ; they do not show which of them has moved"),
+    ],
+)
+def test_which_one_moved(have_moved, named, sentence):
+    moved = shift("pitch", np.radians(0.6))
+    found = compare(
+        [result(int(each) * moved, seed=i) for i, each in enumerate(have_moved)],
+        names=[f"drive {i + 1}" for i in range(len(have_moved))],
+    )
+    assert found.moved == named
+    assert found.sentence.startswith(sentence)
+
+
+def test_files_and_python_speak_of_the_same(tmp_path):
+    changed = with_comparison(result(shift("x", 0.1), seed=1), Extrinsic(X, "drawing"))
+    hec.save(changed, tmp_path)
+    again = hec.load(tmp_path)
+    assert again.comparison == changed.comparison
+    assert again.comparison.verdict == "moved"
+    assert again.comparison.installed == "drawing"
+    assert hec.compare([again], Extrinsic(X, "drawing")).moved == ("result 1",)
+    json.dumps(again.to_dict()["comparison"], allow_nan=False)
+    with pytest.raises(InputError, match="2 different names"):
+        compare([again, again], names=["a", "a"])
+
+
+# ---- ``compare`` and the options about what is installed, as a person types them
+
+
+NUMBERS = " ".join(f"{value:.6f}" for value in (*X[:3, 3], *se3.rotation_to_rpy(X[:3, :3])))
+
+
+def urdf_of(T):
+    xyz, rpy = (
+        " ".join(map(repr, values.tolist()))
+        for values in (T[:3, 3], se3.rotation_to_rpy(T[:3, :3]))
+    )
+    return f"""<robot name="r"><link name="base"/>
+<joint name="a" type="fixed"><parent link="base"/><child link="lidar"/><origin xyz="1 0 2"/></joint>
+<joint name="b" type="fixed"><parent link="lidar"/><child link="camera"/><origin
+xyz="{xyz}" rpy="{rpy}"/></joint></robot>"""
+
+
+@pytest.fixture
+def saved(tmp_path, monkeypatch):
+    """Folders with results: two that agree, one that has moved; and a description."""
+    monkeypatch.chdir(tmp_path)
+    frames = {"parent_frame": "lidar", "child_frame": "camera"}
+    hec.save(result(seed=1, **frames), "first")
+    hec.save(result(seed=2, **frames), "second")
+    hec.save(result(shift("y", 0.05), seed=3, **frames), "third")
+    flat = {"hidden": "z", "status": SolveStatus.UNOBSERVABLE}
+    hec.save(result(seed=4, **flat, **frames), "flat")
+    (tmp_path / "robot.urdf").write_text(urdf_of(X))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["first", "--with", NUMBERS], 0, "Mount of camera on lidar: same: a change of "),
+        (["third", "--with", "robot.urdf"], 4, "moved: y by "),
+        (["flat", "--with", "first"], 3, "cannot tell about x, y and z; roll, pitch"),
+        (["first", "second"], 0, "same: none of 2 differs"),
+        (["first", "second", "third"], 4, "moved: third differs from the others: y by "),
+        (["first", "third", "--with", "second"], 4, "moved: third of 2"),
+    ],
+)
+def test_the_exit_code_is_the_verdict(saved, run, words, code, text):
+    found, out, err = run("compare", *words)
+    assert (found, err) == (code, "")
+    assert text in out
+
+
+def test_json_has_it_all(saved, run):
+    code, out, _ = run("compare", "third", "--with", "robot.urdf", "--json")
+    document = json.loads(out)
+    assert (code, document["verdict"], document["moved"]) == (4, "moved", ["third"])
+    (difference,) = document["differences"]
+    assert difference["axes"]["y"]["difference"] == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["first"], 1, "two results or more"),
+        (["first", "first"], 1, "expected different results"),
+        (["first", "--with", "absent.urdf"], 2, "file that exists"),
+        (["absent", "first"], 1, "cannot read absent"),
+        (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),
+        (["first", "--with", "0 0 0 0 1e300 0"], 2, "must be at most 1e+06 rad; got '1e300'"),
+        (["first", "--with", "x" * 5000], 2, "xxx..."),
+        (["first", "n" * 256], 1, "n...: File name too long; choose another"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line(saved, run, words, code, text):
+    found, out, err = run("compare", *words)
+    assert (found, out, err.count("\n")) == (code, "", 1)
+    assert text in err
+    assert len(err) < 400
+
+
+def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
+    assert run("simulate", "--out", "drive")[0] == 0
+    drive = saved / "drive" / "run_01"
+    truth = np.loadtxt(drive / "T_S2_S1.txt")
+    T = se3.from_quat_xyzw(truth[1:4], truth[4:])
+    (saved / "true.urdf").write_text(urdf_of(T))
+    code, out, _ = run(
+        "calibrate", drive / "T_S1_W1.txt", drive / "T_S2_W2.txt", "--installed", "true.urdf",
+        "--parent-frame", "lidar", "--child-frame", "camera", "--base-frame", "base", "--json",
+    )  # fmt: skip
+    document = json.loads(out)
+    assert code == 0
+    assert document["comparison"]["verdict"] == "same"
+    base = se3.from_rotation_translation(np.eye(3), [1.0, 0.0, 2.0])
+    in_base = base @ document["T_parent_child"]["matrix"]
+    np.testing.assert_allclose(in_base, base @ T, atol=5e-3)
+    np.testing.assert_allclose(document["T_base_child"]["matrix"], in_base, atol=1e-6)
+    saved_result = hec.Calibration.from_dict(document)
+    hec.save(saved_result, "in_base")
+    np.testing.assert_allclose(hec.load("in_base").T_base_child, in_base, atol=1e-6)
+    assert '<parent link="base"/>' in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()
+    assert "--frame-id base --child-frame-id camera" in run("info", "in_base")[1]
