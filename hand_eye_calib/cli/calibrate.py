@@ -9,15 +9,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hand_eye_calib.cli import options
 from hand_eye_calib.cli.console import note, print_result, waiting_for
-from hand_eye_calib.cli.options import (
-    add_config_arguments,
-    add_input_arguments,
-    add_output_arguments,
-    at_least,
-    options_from,
-    sources_from,
-)
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -49,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = EXAMPLES
     parser.set_defaults(parser=parser)
-    add_input_arguments(
+    options.add_input_arguments(
         parser,
         "trajectory files of parent and child, and of more sensors; or a rosbag2 directory, .mcap, "
         ".db3 or .bag file, or the URL of one, as s3://..., of which several are the parts of one "
@@ -68,8 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
     )
     add("--order", choices=("time", "none"), default="time", help=order)
-    add_config_arguments(parser)
-    add_output_arguments(parser)
+    options.add_config_arguments(parser)
+    options.add_output_arguments(parser)
     add = parser.add_argument_group("images of a target").add_argument
     target = (
         "what the images of --child-topic show, or those of a folder, the second PATH, one for "
@@ -106,7 +99,7 @@ def _add_many(parser: argparse.ArgumentParser) -> None:
     no_report = "no page for each recording: they take most time"
     add("--no-report", action="store_true", help=no_report)
     jobs = "number of worker processes. Default: one for each core"
-    add("--jobs", metavar="N", type=at_least(1), help=jobs)
+    add("--jobs", metavar="N", type=options.at_least(1), help=jobs)
     dask = "use a Dask cluster instead: address of its scheduler, tcp://..."
     add("--dask", metavar="ADDRESS", help=dask)
 
@@ -170,14 +163,14 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         from hand_eye_calib.cli.rig import calibrate_rig
 
         return calibrate_rig(arguments, as_given)
-    options = options_from(arguments)
+    given = options.options_from(arguments)
     if not are_bags:
-        recording = reading.read_pair(arguments, options)
+        recording = reading.read_pair(arguments, given)
     else:
         from hand_eye_calib.cli import bags
 
         try:
-            recording = bags.read_recording(paths, sources_from(arguments), options)
+            recording = bags.read_recording(paths, options.sources_from(arguments), given)
         except bags.SeveralRecordings as several:
             from hand_eye_calib.cli.batch.run import run_together
 

@@ -4,14 +4,8 @@ import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from hand_eye_calib.cli import options
 from hand_eye_calib.cli.console import STREAMS, fail, print_result, typed_options, waiting_for
-from hand_eye_calib.cli.options import (
-    add_config_arguments,
-    add_input_arguments,
-    add_json_argument,
-    options_from,
-    sources_from,
-)
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.text import angle, length
 
@@ -34,9 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = _EPILOG
-    add_input_arguments(parser, "a bag, or the trajectory files of parent and child")
-    add_config_arguments(parser)
-    add_json_argument(parser)
+    options.add_input_arguments(parser, "a bag, or the trajectory files of parent and child")
+    options.add_config_arguments(parser)
+    options.add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -47,9 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.engine.run import check
     from hand_eye_calib.engine.snapshot import whole_snapshot
 
-    options = options_from(arguments)
-    sources, (first, second), repairs = _opened(arguments, options)
-    snapshot = whole_snapshot(first, second, options)
+    given = options.options_from(arguments)
+    sources, (first, second), repairs = _opened(arguments, given)
+    snapshot = whole_snapshot(first, second, given)
     config, parent, child = snapshot.config, snapshot.parent, snapshot.child
     # What is to be estimated is not known yet: the checks say what it is.
     offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
@@ -72,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _opened(
-    arguments: argparse.Namespace, options: Mapping[str, Any]
+    arguments: argparse.Namespace, given: Mapping[str, Any]
 ) -> "tuple[dict[str, str], list[Trajectory], list[str]]":
     """Where both streams are from, their poses, and what was wrong with the stamps."""
     from hand_eye_calib.cli import reading
@@ -83,14 +77,14 @@ def _opened(
         raise ConfigError(f"expected one bag or two trajectory files; got {len(paths)}")
     if not is_bag:
         names = dict(zip(STREAMS, map(str, paths), strict=True))
-        return names, *reading.read_files(arguments, paths, options)
+        return names, *reading.read_files(arguments, paths, given)
     from hand_eye_calib.cli import bags
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.io.bags.reader import PoseBag
 
-    config = CalibratorConfig.from_options(options)
+    config = CalibratorConfig.from_options(given)
     with PoseBag(paths[0]) as bag:
-        sources, measures = bags.select(bag, sources_from(arguments), config)
+        sources, measures = bags.select(bag, options.sources_from(arguments), config)
         names = {stream: str(source) for stream, source in sources.items()}
         return names, *bags.read_sources(bag, zip(sources.values(), measures.values(), strict=True))
 
@@ -118,8 +112,8 @@ def _verdict(findings: "Sequence[Finding]") -> str:
     errors = [finding for finding in serious if finding.makes_unusable]
     told = f"look at the findings first ({', '.join(each.code for each in errors or serious)})"
     if all(finding.options for finding in serious):
-        options = " ".join(typed_options(finding.options.items()) for finding in serious)
-        told = f"not as they are; calibrate with {options}"
+        typed = " ".join(typed_options(finding.options.items()) for finding in serious)
+        told = f"not as they are; calibrate with {typed}"
     return f"{(Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value}: {told}."
 
 
@@ -131,8 +125,7 @@ def _table(findings: "Sequence[Finding]") -> Iterator[str]:
         yield "No findings."
     for finding in findings:
         mark = finding.severity.value
-        mark = mark if mark == "note" else mark.upper()
-        yield f"{mark:<8} {finding.code:<17} {finding.stream}"
-        options = typed_options(finding.options.items())
-        for text in (finding.what, f"-> {finding.advice}{options and f': {options}'}"):
+        yield f"{mark if mark == 'note' else mark.upper():<8} {finding.code:<17} {finding.stream}"
+        typed = typed_options(finding.options.items())
+        for text in (finding.what, f"-> {finding.advice}{typed and f': {typed}'}"):
             yield from wrapped(text, "    ", "    ")

@@ -12,6 +12,7 @@ from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.io import target_images
 from hand_eye_calib.io.stops import read_arm_samples
 from hand_eye_calib.results.calibration import Calibration
 
@@ -28,20 +29,24 @@ def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
     if len(arguments.paths) != 2:
         raise ConfigError("--order none takes two trajectory files, or the samples of an arm")
     parent_path, child_path = map(Path, arguments.paths)
-    if not arguments.target:
-        (parent, child), _ = read_files(arguments, arguments.paths, options)
-        _check_counts(arguments, len(parent), len(child))
-        n_child, found = len(child), calibrate_stops(parent.poses, child.poses, config)
-    else:
-        from hand_eye_calib.io import target_images
-
+    images: list[Path] = []
+    if arguments.target:
         if not child_path.is_dir():
             raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
+        images = target_images.images_in(child_path)
+    of_poses = [parent_path] if arguments.target else arguments.paths
+    (parent, *others), _ = read_files(arguments, of_poses, options)
+    n_child = len(others[0]) if others else len(images)
+    if len(parent) != n_child:
+        raise InputError(
+            f"{parent_path} has {len(parent)} poses and {child_path} {n_child}: stops are paired "
+            "by the rows, and by the names of images; give as many of both"
+        )
+    if others:
+        found = calibrate_stops(parent.poses, others[0].poses, config)
+    else:
         target = target_images.Target.parse(arguments.target)
         finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
-        (parent,), _ = read_files(arguments, [parent_path], options)
-        images = target_images.images_in(child_path)
-        _check_counts(arguments, len(parent), len(images))
         for image in with_progress(images, len(images), "finding the target"):
             finder.look(target_images.image_in(image.read_bytes(), image))
         seen = finder.found()
@@ -50,12 +55,3 @@ def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
         found = calibrate_arm(parent.poses[seen.images], seen.Ts_camera_target, config)
     counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
     return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}
-
-
-def _check_counts(arguments: Namespace, n_parent: int, n_child: int) -> None:
-    if n_parent != n_child:
-        parent, child = arguments.paths
-        raise InputError(
-            f"{parent} has {n_parent} poses and {child} {n_child}: stops are paired by the rows, "
-            "and by the names of images; give as many of both"
-        )

@@ -25,7 +25,8 @@ from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC
 from hand_eye_calib.methods import require_backend
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
-from hand_eye_calib.results.calibration import Calibration, Residuals
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import Residuals
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.solvers.solution import Solution
 from hand_eye_calib.text import parse_targets

@@ -30,8 +30,8 @@ from hand_eye_calib.gls.increments import (
     without_rate_bias,
 )
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, Residuals
-from hand_eye_calib.results.records import RateBias
+from hand_eye_calib.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.results.records import RateBias, Residuals
 
 # Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
 # at most, of two 0.5 and more.

@@ -11,7 +11,8 @@ from hand_eye_calib.checks.findings import finding
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import calibration_of
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import Calibration, Finding, Residuals
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
 
 # Poses of one sensor are taken for inverse if so the errors are smaller by this factor.

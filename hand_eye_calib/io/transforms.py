@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import FrameTree, check_pose
 from hand_eye_calib.text import split_frames
@@ -88,10 +88,8 @@ class TfStream:
         before = edges[frame].is_static if frame in edges else None
         row = (*transform.position, *transform.quat_xyzw)
         if is_static or frame in self._moving:
-            try:
+            with located(f"transform {parent}:{frame}"):
                 check_pose(*row)
-            except InputError as error:
-                raise InputError(f"transform {parent}:{frame}: {error}") from None
         pose = _matrices(row) if is_static else None
         is_fixed = self._tree.add(parent, frame, pose, is_static).is_static
         if before != is_fixed:

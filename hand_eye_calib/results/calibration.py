@@ -13,7 +13,6 @@ from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, transform_arguments, values_of
-from hand_eye_calib.results.records import Finding, Residuals
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.status import (
     AXES,
@@ -28,15 +27,7 @@ from hand_eye_calib.upstairs import upstairs
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = [
-    "Calibration",
-    "DofObservability",
-    "DofVerdict",
-    "Finding",
-    "Residuals",
-    "SolveStatus",
-    "Verdict",
-]
+__all__ = ["Calibration", "DofObservability", "DofVerdict", "SolveStatus", "Verdict"]
 
 
 def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":

@@ -5,7 +5,7 @@ extrinsics, and the closure test.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -111,9 +111,6 @@ def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) 
                 "correct the trajectories before"
             )
 
-
-_FORMAT = "hand_eye_calib/rig"
-_VERSION = 1
 
 # Variances (m^2, rad^2) of directions that are unknown are larger.
 _UNKNOWN = 1.0
@@ -263,14 +260,11 @@ class RigCalibration:
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain values."""
         return {
-            "format": _FORMAT,
-            "version": _VERSION,
+            "format": "hand_eye_calib/rig",
+            "version": 1,
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
-            "closures": [
-                asdict(each) | {"sensors": list(each.sensors), "closes": each.closes}
-                for each in self.closures
-            ],
+            "closures": [vars(each) | {"closes": each.closes} for each in self.closures],
             "calibrations": {each.child_frame: each.to_dict() for each in self.calibrations},
         }
 

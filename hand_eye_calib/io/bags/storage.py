@@ -21,13 +21,7 @@ from urllib.parse import quote
 import numpy as np
 
 from hand_eye_calib.errors import InputError, MissingDependencyError, printable, required
-from hand_eye_calib.io.files import (
-    BLOCK_BYTES,
-    LARGEST,
-    LARGEST_RATIO,
-    LONGEST_NAME,
-    reading_memory,
-)
+from hand_eye_calib.io import files
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
@@ -59,7 +53,7 @@ def _kind(topic: str, name: str, encoding: str, language: str, content: bytes) -
     """One for all connections that are alike, with names as they can be printed."""
     if encoding == "ros1" and name.count("/") == 1:  # as ROS 1 itself names types
         name = name.replace("/", "/msg/")
-    topic, name = (printable(each[:LONGEST_NAME]) for each in (topic, name))
+    topic, name = (printable(each[: files.LONGEST_NAME]) for each in (topic, name))
     return MessageKind(topic, name, encoding, (language, content))
 
 
@@ -108,7 +102,7 @@ class Storage(ABC):
         inside, so no defect of the rest is hidden.
         """
         try:
-            with reading_memory():
+            with files.reading_memory():
                 yield
         except MissingDependencyError:
             raise
@@ -288,7 +282,7 @@ class _WholeReads(BufferedReader):
 
     def read(self, size: int | None = -1) -> bytes:
         # A damaged length is not worth the memory: before 1.6 the library believes it.
-        data = super().read(size) if (size or 0) < LARGEST else b""
+        data = super().read(size) if (size or 0) < files.LARGEST else b""
         if len(data) < (size or 0):
             raise EOFError("it ends in the middle of a record")
         return data
@@ -312,7 +306,7 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
             data = bytes(_zstd().decompress(data))
         rows.append((kind, int(bag_ns), data))
         size += len(data)
-        if size > BLOCK_BYTES:
+        if size > files.BLOCK_BYTES:
             yield rows
             rows, size = [], 0
     if rows:
@@ -348,14 +342,14 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
 
 def _unpack(file: Path, target: Path) -> str:
     """Unpack a file that is compressed as a whole, as far as it goes; what is lost."""
-    zstd, most = _zstd(), LARGEST_RATIO * file.stat().st_size
+    zstd, most = _zstd(), files.LARGEST_RATIO * file.stat().st_size
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
         try:
-            for piece in iter(lambda: packed.read(BLOCK_BYTES), b""):
+            for piece in iter(lambda: packed.read(files.BLOCK_BYTES), b""):
                 if unpacked.tell() + unpacked.write(piece) > most:
                     raise InputError(
                         f"cannot read bag {file}: its content unpacks to more than "
-                        f"{LARGEST_RATIO} times its size, which is not believable"
+                        f"{files.LARGEST_RATIO} times its size, which is not believable"
                     )
         except (EOFError, zstd.ZstdError) as error:
             return f"its compression is damaged ({_reason_of(error)})"
