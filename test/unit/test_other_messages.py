@@ -26,6 +26,7 @@ TWIST = "geometry_msgs/msg/TwistStamped"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
 GEO, INS = "geographic_msgs/msg/GeoPoseStamped", "novatel_oem7_msgs/msg/INSPVA"
+GPS = "gps_msgs/msg/GPSFix"
 MARKER, BODY, BODIES = (f"mocap4r2_msgs/msg/{x}" for x in ("Marker", "RigidBody", "RigidBodies"))
 NAMED, NAMED_ARRAY = (
     f"motion_capture_tracking_interfaces/msg/{x}" for x in ("NamedPose", "NamedPoseArray")
@@ -48,6 +49,7 @@ for name, fields in {
     # Without what is not read.
     INS: "std_msgs/Header header\nfloat64 latitude\nfloat64 longitude\nfloat64 height\n"
     "float64 roll\nfloat64 pitch\nfloat64 azimuth",
+    GPS: "std_msgs/Header header\nfloat64 latitude\nfloat64 longitude\nfloat64 altitude",
 }.items():
     JAZZY.register(get_types_from_msg(fields, name))
 
@@ -66,7 +68,7 @@ def messages():
     px4 = [*zip(P.astype("f4"), np.roll(Q, 1, axis=1).astype("f4"), strict=True)]
     types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
     types |= {"/ins": INS, "/twists": f"{TWIST[:-7]}WithCovarianceStamped"}
-    types |= {"/bodies": BODIES, "/named": NAMED_ARRAY}
+    types |= {"/bodies": BODIES, "/named": NAMED_ARRAY, "/gps": GPS}
     found = {key: [] for key in types.items()}
     zero, nine, nothing = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9), np.zeros(3, "f4")
     for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
@@ -84,6 +86,7 @@ def messages():
             NAMED_ARRAY: (head, [made(NAMED, "cart", pose)]),
             ARRAY: (head, [pose, pose]),
             GEO: (head, made(POSE, point, quaternion)),
+            GPS: (head, lat[k], lon[k], height[k]),
             INS: (head, lat[k], lon[k], height[k], rpy[k, 0], -rpy[k, 1], 90.0 - rpy[k, 2]),
         }
         for key in found:
@@ -225,7 +228,10 @@ def test_values_that_are_not_finite_are_left_out(tmp_path):
 
 def test_fields_of_a_place_are_positions(bag):
     fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
-    assert read_bag_trajectory(bag, f"/array?{fields}").measures == "positions"
+    for source in (f"/array?{fields}", "/gps"):
+        found = read_bag_trajectory(bag, source)
+        assert found.measures == "positions"
+        np.testing.assert_allclose(from_start(found.poses)[:, :3, 3], P - P[0], atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ def test_without_a_header_the_columns_must_be_named(file):
     [
         ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
         ("t,x,y,z,rx,ry,rz,e", "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for turns"),
-        ("t,pos_a,pos_b,c,qx,qy,qz,qw", "no column for x, y, z among"),
+        ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
         (f"t,time,{XYZW[2:]}", "columns t, time could all be t; name them with `columns`"),
     ],
 )

@@ -163,6 +163,7 @@ _FIELDS = {
     "foxglove.PoseInFrame": _pose_at("pose.", "timestamp"),
     "foxglove.PosesInFrame": _pose_at("poses.0.", "timestamp"),
     _FRAME_TRANSFORM: _pose_at("", "timestamp", "translation rotation"),
+    "gps_msgs/msg/GPSFix": f"t=header.stamp,{_PLACE.format('')}",
     "foxglove.LocationFix": f"t=timestamp,{_PLACE.format('')}",
 }
 # The likeliest first.

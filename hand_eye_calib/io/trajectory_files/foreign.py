@@ -10,6 +10,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
@@ -156,7 +157,9 @@ def _of_colmap(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_json(data: bytes, _: str | None) -> _Rows:
-    document = json.loads(data)
+    document: Any = {}
+    with suppress(ValueError, RecursionError):
+        document = json.loads(data)
     frames: Any = document.get("frames") if isinstance(document, dict) else document
     is_list = isinstance(frames, list) and frames and isinstance(frames[0], dict)
     names = frames[0].keys() if is_list else ()

@@ -230,29 +230,27 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
     )
     if names == QUATERNION:
         return quats
-    # The order that motion and start speak for; the scalar is last if they say nothing.
+    # The order that motion and start speak for, or else the usual one.
     ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
+    usual, other = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
     fitting = _fitting(positions, ways)
-    if names == SCALAR_FIRST:
-        way = "last" if fitting == ["last"] else "first"
-        table.guess(f"q0, q1, q2, q3 read with the scalar {way}")
-        return ways[way]
     # An odometry starts at the identity.
     level = [way for way, (first, *_) in ways.items() if np.isclose(abs(first[3]), 1.0, rtol=0.0)]
     reason = ""
-    if fitting == ["first"]:
+    if fitting == [other]:
         reason = "the motion keeps a steady direction that way"
-    elif "first" in level and "first" in fitting:
+    elif other in level and other in fitting:
         reason = "the first orientation is the identity that way"
     if reason:
-        table.guess(f"quaternions read with the scalar first, t x y z qw qx qy qz: {reason}")
-        return ways["first"]
-    if table.format != "tum" and fitting != ["last"] and "last" not in level:
+        order = {"first": "qw qx qy qz", "last": "qx qy qz qw"}[other]
+        table.guess(f"quaternions read with the scalar {other}, t x y z {order}: {reason}")
+        return ways[other]
+    if names == UNNAMED and table.format != "tum" and fitting != ["last"] and "last" not in level:
         table.guess(
             "no columns are named, and nothing names the order of the quaternion; read with the "
             "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
         )
-    return quats
+    return ways[usual]
 
 
 def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:

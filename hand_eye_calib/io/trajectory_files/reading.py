@@ -30,6 +30,7 @@ from hand_eye_calib.io.trajectory_files.table import (
     POSITION,
     QUATERNION,
     RATES,
+    SCALAR_FIRST,
     TUM_COLUMNS,
     UNNAMED,
     Table,
@@ -333,7 +334,8 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
         header = _FORMATS[format][0] if format != "csv" else names
     else:
         if format != "tum":
-            guesses = [f"{path} looks like format {format}; to change that, give `format`"]
+            order = ", qw qx qy qz" * (format == "euroc")
+            guesses = [f"{path} looks like format {format}{order}; to change that, give `format`"]
         beside = Path(path).with_name(_TIMES)
         if format == "kitti" and beside.is_file():
             times = beside
@@ -419,7 +421,7 @@ def _beginning(
         by_default = "tum", _UNNAMED
         found = {7: ("csv", _UNNAMED[1:]), 12: ("kitti", MATRIX)}.get(n_cells, by_default)
     elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= DIGITS["ns"]:
-        found = "euroc", _FORMATS["euroc"][0]
+        found = "euroc", ("t [ns]", *POSITION, *SCALAR_FIRST)
     else:
         found = "csv", _UNNAMED if n_cells == 8 else None
     return number, cells, names, *found

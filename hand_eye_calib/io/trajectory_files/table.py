@@ -76,13 +76,14 @@ _ALIASES = {
         for axis in "xyzw"
     },
     **{name: f"{name} quat_{name}" for name in (*SCALAR_FIRST, *UNNAMED)},
-    **{name: name for name in (*MATRIX, *ROTATION_VECTOR)},
+    **{name: name for name in ROTATION_VECTOR},
+    **{name: f"{name} t{int(name[1:]) - 11:02d}" for name in MATRIX},
 }
 # Names that stand for a part of an orientation, or of a position, even if it is not known which.
 _ORIENTED = re.compile(
     r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude|^([abcpwr]|r[xyz])$", re.I
 ).search
-_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord)", re.I).search
+_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)", re.I).search
 
 # Units as names have them, with a slash for what separates words.
 _UNITS = {
