@@ -186,7 +186,7 @@ def _view(state: NodeState, silent_s: float) -> View:
         title = f"pose of {result.child_frame} in {result.parent_frame}"
         view = replace(view, title=title, values=tuple(_values(result)), reasons=result.reasons)
     if at := state.progress:
-        asks = at.progress.will_not_get_there
+        asks = at.progress.will_not_get_there and view.word == "CHANGE THE MOTION"
         bars, by_hand = tuple(_bar(axis, state) for axis in AXES), at.progress.limiting_axis * asks
         view = replace(view, bars=bars, by_hand=by_hand)
     shown = () if is_old else buttons
@@ -264,9 +264,9 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
     if state.saved is not None:
         text = f"The node has ended. The result was saved {_where(state.saved)}."
         return Tone.GOOD, "ENDED", text
-    is_lost = _result_of(state) is not None
-    why = "is not saved: output_directory is not set" if is_lost else "was not there yet"
-    return Tone.ACT, "ENDED", f"The node has ended. A result {why}."
+    lost = "The result is not saved: output_directory is not set."
+    text = lost if _result_of(state) else "There was no result yet."
+    return Tone.ACT, "ENDED", f"The node has ended. {text}"
 
 
 def _sentence(text: str) -> str:

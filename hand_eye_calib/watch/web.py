@@ -235,13 +235,15 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         _section("health", "result and inputs", [*result, *map(_line, view.health)]),
         "</div>",
     )
-    facts = f'<p class="facts">{escape(view.facts)}</p>' if view.facts else ""
+    said, _, advice = view.sentence.partition("; ")
+    told = (("advice", advice), ("facts", view.facts))
+    more = [f'<p class="{name}">{escape(text)}</p>' for name, text in told if text]
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
         f'data-by-hand="{escape(view.by_hand)}" data-files="{" ".join(files)}">'
         f'<p class="node">{escape(view.node or "no node")}</p>'
         f'<section class="headline"><h1>{_sign(view.tone)} {escape(view.word)}</h1>'
-        f"<p>{escape(view.sentence)}</p>{facts}</section>{''.join(sections)}</div>"
+        f"<p>{escape(said)}</p>{''.join(more)}</section>{''.join(sections)}</div>"
     )
 
 

@@ -140,7 +140,7 @@ ERROR = {"level": Level.ERROR}
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
         (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
-        (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. A result"),
+        (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. The"),
         (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: nobody"),
         (
             replace(state(), has_ended=True, saved=SAVED),
