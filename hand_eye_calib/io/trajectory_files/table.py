@@ -79,11 +79,12 @@ _ALIASES = {
     **{name: name for name in ROTATION_VECTOR},
     **{name: f"{name} t{int(name[1:]) - 11:02d}" for name in MATRIX},
 }
-# Names that stand for a part of an orientation, or of a position, even if it is not known which.
+# Names, after each other, that stand for a part of an orientation, or of a position, even if it is
+# not known which.
 _ORIENTED = re.compile(
-    r"(^|[^a-z])q(\d|uat|$)|orient|rot|angle|euler|attitude|^([abcpwr]|r[xyz])$", re.I
+    r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|(^|,)(a,b,c|w,p,r|rx,ry,rz)(,|$)"
 ).search
-_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)", re.I).search
+_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)").search
 
 # Units as names have them, with a slash for what separates words.
 _UNITS = {
@@ -229,10 +230,11 @@ def _measured(
     if measures == "auto":
         oriented = {*sum((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), ())}
         measures = "poses"
-        if flat and not (found.keys() & oriented or any(map(_ORIENTED, names))):
+        listed = ",".join(_split(name)[0] for name in names)
+        if flat and not (found.keys() & oriented or _ORIENTED(listed)):
             measures = "positions"
         elif not found.keys() & {*sum(_POSITIONS, ())}:
-            is_turning = turn and not any(map(_PLACED, names))
+            is_turning = turn and not _PLACED(listed)
             measures = (
                 "rates" if {*RATES} <= found.keys() else "rotations" if is_turning else "poses"
             )
