@@ -214,20 +214,26 @@ def linearise(
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-    by = np.zeros((len(step), 6, 6 + N_SYSTEMATIC + 1))
-    by_xi, by_parameter, residuals = by[:, :, :6], by[:, :, 6:-1], by[:, :, -1]
+    by_scale = np.zeros((len(step), 6, 1))
+    by_scale[:, :3] = -turned(back[:, :3, :3], step)[:, :, None]
+    of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
+    by_xi, by_parameter, residuals = of_all[:, :, :6], of_all[:, :, 6:-1], of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)
-    by_parameter[:, :3, SCALE] = -turned(back[:, :3, :3], step)
-    by_parameter[:, :3, BIAS] = back[:, :3, :3] @ metres
-    by_parameter[:, :, TIME] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
-    if has_rates:
-        by_parameter[:, 3:, RATE] = by_rate
+    by_bias = back[:, :3, :3] @ metres
+    for k, column in enumerate(columns):
+        if column == SCALE:
+            by_parameter[:, :, k] = by_scale[:, :, 0]
+        elif column in BIAS:
+            by_parameter[:, :3, k] = by_bias[:, :, BIAS.index(column)]
+        elif column == TIME:
+            by_parameter[:, :, k] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+        else:
+            by_parameter[:, 3:, k] = by_rate[:, :, RATE.index(column)]
     moved = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(by_child.shape)
     residuals[:] = se3.log(back @ (se3.inverse(T_parent_child) @ moved))
     if error is not None:
         residuals += error[1:] - turned(adjoints, error[:-1])
-    asked = [*range(6), *(6 + column for column in columns), by.shape[2] - 1]
-    return Linearisation(np.take(by, asked, axis=2), adjoints, by_parameter[:, :, [SCALE]])
+    return Linearisation(of_all, adjoints, by_scale)
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:

@@ -107,7 +107,7 @@ class NoiseModel:
             relative=np.clip(intervals_s / self.interval_s, *TUNING.relative),
             columns=linearisation.columns,
             ahead=np.concatenate(ahead, axis=2),
-            behind=np.concatenate(behind, axis=2),
+            behind=np.concatenate(behind, axis=2) if self.slow else behind[0],
             white=(TRANSLATIONS[None], self._swing(streams, to_child) if is_swung else both[None]),
             walk=(TRANSLATIONS, both),
             twists=twists,

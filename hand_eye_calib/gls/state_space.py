@@ -94,7 +94,8 @@ class StateSpace:
 
     def ahead_times(self, blocks: FloatArray) -> FloatArray:
         """H1 of the increments times blocks (n, d, k): (n, 6, k)."""
-        return blocks[:, :WHITE] + self.ahead @ blocks[:, WHITE:]
+        white = blocks[:, :WHITE]
+        return white + self.ahead @ blocks[:, WHITE:] if self.sizes else white
 
     def gathered(self, columns: FloatArray) -> FloatArray:
         """The transpose of :meth:`observed`: (N, d, k) of columns (n, 6, k)."""
@@ -102,7 +103,8 @@ class StateSpace:
         np.matmul(-transposed(self.behind), columns, out=states[:-1])
         states[-1] = 0.0
         states[1:, :WHITE] += columns
-        states[1:, WHITE:] += transposed(self.ahead) @ columns
+        if self.sizes:
+            states[1:, WHITE:] += transposed(self.ahead) @ columns
         return states
 
 
@@ -187,8 +189,8 @@ class Posterior:
         kept, given = ~space.cut, space.weights != 0.0
         self.white, of_white = space.white_precision(levels)
         weights = space.weights[:, None, None]
-        free = TUNING.free * np.eye(WHITE)
-        self._of_poses = np.where(weights > 0.0, weights * self.white, free)
+        self._of_poses = weights * self.white
+        self._of_poses[~(space.weights > 0.0)] = TUNING.free * np.eye(WHITE)
         self.walk_covariance = combined(levels[n_white:], space.walk)
         self.walk = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
@@ -199,8 +201,7 @@ class Posterior:
             self.markov.append(Markov(*of_group, space.intervals_s))
             start, at = start + size, at + 2
         diagonal, below = self._blocks(0, n_poses - 1)
-        states = range(start)
-        diagonal[:, states, states] *= 1.0 + TUNING.raised
+        np.einsum("nii->ni", diagonal)[:] *= 1.0 + TUNING.raised
         self.factor = Factor(diagonal, below)
         white = WHITE * np.log(np.where(given, space.weights, 1.0)) - of_white
         prior = float(white[given].sum()) + WHITE * np.log(TUNING.free) * int((~given).sum())
@@ -229,13 +230,15 @@ class Posterior:
         n, _, size = behind.shape
         diagonal, below = np.zeros((n + 1, size, size)), np.zeros((n, size, size))
         diagonal[here, :WHITE, :WHITE] = weights
-        weighed = weights @ behind
-        np.negative(weighed, out=below[:, :WHITE])
-        beside = weights @ ahead
-        diagonal[here, :WHITE, WHITE:], diagonal[here, WHITE:, :WHITE] = beside, transposed(beside)
-        diagonal[here, WHITE:, WHITE:] = transposed(ahead) @ beside
-        below[:, WHITE:] = transposed(ahead) @ below[:, :WHITE]
+        weighed = np.matmul(weights, behind, out=below[:, :WHITE])
+        if self.markov:
+            beside = weights @ ahead
+            diagonal[here, :WHITE, WHITE:] = beside
+            diagonal[here, WHITE:, :WHITE] = transposed(beside)
+            diagonal[here, WHITE:, WHITE:] = transposed(ahead) @ beside
+            below[:, WHITE:] = -(transposed(ahead) @ weighed)
         diagonal[:-1] += transposed(behind) @ weighed
+        np.negative(weighed, out=weighed)
         diagonal[here, :WHITE, :WHITE] += self._of_poses[start + 1 : end + 1]
         for process in self.markov:
             states, variance = range(size)[process.states], process.variance
