@@ -326,7 +326,8 @@ def restarted(child: Trajectory, gap_s: float, _: Random) -> Trajectory:
     return Trajectory(child.stamps_ns[~gone], poses[~gone])
 
 
-@_both("U7", "parent's orientations smoothed", _SECONDS, "s")
+@_both("U7", "parent's orientations smoothed", _SECONDS, "s",
+       "smoothed_orientations position_clock")  # fmt: skip
 def smooth_parent(parent: Trajectory, child: Trajectory, tau_s: float, _: Random) -> Streams:
     """Low-passed and shifted back by the delay."""
     smooth = with_parts(parent, filtered_rotations(parent, tau_s))
@@ -355,11 +356,11 @@ def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
     return posed(child, child.poses[first[steps]])
 
 
-_both("V1", "parent's positions late", (0.02, 0.05, 0.1), "s")(
+_both("V1", "parent's positions late", (0.02, 0.05, 0.1), "s", "position_clock")(
     lambda parent, child, s, random: (late_positions(parent, s, random), child)
 )
 
-_child("V2", "child's orientations late", (0.02, 0.05, 0.1), "s")(
+_child("V2", "child's orientations late", (0.02, 0.05, 0.1), "s", "position_clock")(
     lambda child, s, _: with_parts(child, delayed(child, s)[:, :3, :3])
 )
 

@@ -56,10 +56,10 @@ _MOST, _SOME = 0.3, 0.1
 
 # Delays and smoothing are looked for in motions over this time (s), so many at most. Vehicles whose
 # streams are as they should be are off by some milliseconds: a delay counts from the second line on
-# (s), and is an error from so many times that. Smallest smoothing (s^2) that counts; that of
-# interpolation is a share of the squared interval.
+# (s), and is an error from so many times that; the offset of the clocks is shown by so much of the
+# evidence. Smallest smoothing (s^2); that of interpolation is a share of the squared interval.
 _SHORT_S, _MOST_SHORT = 1.0, 6000
-_DELAY_S, _GRAVE = 2.5 * FLOOR_TRAVEL_S, 2.0
+_DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
 
 # Orientations are copies if they agree to this angle, several times better than any two sensors of
@@ -79,7 +79,7 @@ _NEAREST = (40, 300)
 
 
 def check_agreement(
-    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray, known: Known
+    pose_pairs: PosePairs, motions: MotionPairs, X: FloatArray, known: Known, offset_s: float
 ) -> list[Finding]:
     """Findings about two streams that agree.
 
@@ -93,27 +93,27 @@ def check_agreement(
         On one clock, in one unit of length.
     motions : MotionPairs
         Over some seconds.
-    T_parent_child : (4, 4) array
-        X by a fit to these motions.
+    X : (4, 4) array
+        By a fit to these motions.
     known : ((4, 4) array, (6,) array)
         X as well as it is known, and its standard deviations.
+    offset_s : float
+        By which the clocks differed, by the orientations.
     """
     if same := check_same(*known):
         return same
-    change = find_change(pose_pairs, T_parent_child)
-    slow, axes = response(pose_pairs, motions, T_parent_child, change.at_ns if change else None)
+    change = find_change(pose_pairs, X)
+    slow, axes = response(pose_pairs, motions, X, change.at_ns if change else None)
     speed = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
-    drift = slow.fit("drift")
-    tried = [(drift.share, _world_drift(drift, pose_pairs, speed))]
-    tried += [_rotation_gain(slow, axes)]
+    tried = [_world_drift(slow, pose_pairs, speed), _rotation_gain(slow, axes)]
     tried += [_turned(slow, stream) for stream in (*_STREAMS, "both")]
     tried += [_axis_gain(slow, stream) for stream in _STREAMS]
     if change:
         tried += [_moved_mount(slow, change, int(pose_pairs.stamps_ns[0]))]
     suspects = [max(tried, key=lambda each: each[0])]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
-    if fast := delays(pose_pairs, motions, T_parent_child):
-        suspects += _delays(fast, pose_pairs, speed)
+    if fast := delays(pose_pairs, motions, X):
+        suspects += _delays(fast, pose_pairs, speed, offset_s)
         interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
         suspects += _smoothing(fast, _OF_INTERVAL * interval_s**2, speed)
     found = [(share, each) for share, each in suspects if each and share > 0.0]
@@ -219,28 +219,30 @@ def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspe
     return share, graded("mount_moved", "both", size, **values)
 
 
-def _world_drift(drift: Fitted, pose_pairs: PosePairs, usual: float) -> Finding | None:
+def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> _Suspect:
     """A world that moves against the other."""
-    positions = pose_pairs.Ts_cw_c[:, :3, 3]
+    drift, positions = slow.fit("drift"), pose_pairs.Ts_cw_c[:, :3, 3]
     turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(usual, 1e-9)
     if (np.abs(drift.values) < LIMITS["world_drift"][0] * drift.sigmas).all():
-        return None
+        return drift.share, None
     speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
     values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
-    return graded("world_drift", "both", share, **values, percent=100 * share)
+    return drift.share, graded("world_drift", "both", share, **values, percent=100 * share)
 
 
-def _delays(fast: Regression, pose_pairs: PosePairs, speed: float) -> Iterator[_Suspect]:
+def _delays(
+    fast: Regression, pairs: PosePairs, speed: float, offset_s: float
+) -> Iterator[_Suspect]:
     """Positions that are late, or early, against orientations of their stream: all, or those along
-    one axis of its world.
+    one axis of its world. Less evidence does for positions that do not share the offset of clocks.
     """
-    for stream, Ts in zip(_STREAMS, (pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p), strict=True):
+    for stream, Ts in zip(_STREAMS, (pairs.Ts_cw_c, pairs.Ts_pw_p), strict=True):
         beside = [f"{part}_{stream}" for part in _SMOOTHING_S2]
         whole, by_axis = (fast.fit(f"late_{each}{stream}", *beside) for each in ("", "axes_"))
         k, off_s, off_sigma_s = _odd_one(by_axis)
-        delay_s, along = float(whole.values[0]), usual_speed(pose_pairs.stamps_ns, Ts[:, [k], 3])
+        delay_s, along = float(whole.values[0]), usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
         of_axis = (f"{'xyz'[k]} coordinates", "others")
         for fitted, late_s, sigma_s, speed_m_s, code, (part, others) in (
@@ -253,6 +255,8 @@ def _delays(fast: Regression, pose_pairs: PosePairs, speed: float) -> Iterator[_
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
                 if late_s < _GRAVE * _DELAY_S:
                     shift_m = min(shift_m, LIMITS["late"][-1])
+                if abs(late_s - abs(offset_s)) < 2.0 * sigma_s:
+                    sigma_m *= _EXPECTED
                 values |= {"part": part, "others": others}
                 yield fitted.share, graded("late", stream, shift_m, sigma_m, **values)
 

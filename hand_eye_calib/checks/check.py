@@ -144,7 +144,7 @@ def check_streams(
     sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
-        findings += _check_agreeing(right, streams, fit, known)
+        findings += _check_agreeing(right, streams, fit, known, time_offset_s + offset.seconds)
     return CheckResult(gravest_first(findings), explanation.fit, offset)
 
 
@@ -213,18 +213,18 @@ def _check_sizes(
 
 
 def _check_agreeing(
-    aligned: StreamPair, streams: StreamPair, fit: SimilarityFit, known: Known | None
+    right: StreamPair, given: StreamPair, fit: SimilarityFit, known: Known | None, offset_s: float
 ) -> list[Finding]:
     """What else there is to say of streams that agree as they are, on one clock, and of the same
     streams as they were given.
     """
     of_fit = fit.T_parent_child, fit.sigmas[:6]
     best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-    if copied := check_independent(streams.parent, streams.child, aligned.child):
+    if copied := check_independent(given.parent, given.child, right.child):
         return [*copied, *check_same(*best)]
-    pose_pairs = aligned.synchronised.child_scaled(fit.scale)
+    pose_pairs = right.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
-    return check_agreement(pose_pairs, motions, fit.T_parent_child, best)
+    return check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:

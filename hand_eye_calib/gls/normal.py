@@ -157,7 +157,8 @@ class NormalEquations:
     def __init__(self, products: FloatArray) -> None:
         information, gradient = products[..., :-1, :-1], products[..., :-1, -1]
         diagonal = np.einsum("...ii->...i", information)
-        scale = 1.0 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
+        rounding = np.finfo(float).eps * diagonal.max(axis=-1, keepdims=True)
+        scale = 1.0 / np.sqrt(np.maximum(diagonal, rounding + np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
         self._seen = values > TUNING.least_information_share
         values = np.where(self._seen, values, 1.0)

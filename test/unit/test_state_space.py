@@ -163,6 +163,9 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     np.testing.assert_allclose(parts[:n_known].sum(axis=0), expected, atol=1e-8)
     steps = answers_without(parts, 2)
     np.testing.assert_allclose(steps[1], NormalEquations(parts[:7].sum(axis=0)).step, atol=1e-9)
+    rounding = 1e-12 * np.random.default_rng(0).normal(size=(7, 7))
+    known = NormalEquations(rounding + rounding.T + np.diag([0, 0, 1e-9, 1e-9, 1e-9, 1e11, 1.0]))
+    assert not known.is_complete
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 90])
