@@ -12,17 +12,17 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from hand_eye_calib.errors import printable
-from hand_eye_calib.report.figures import Drawn
-from hand_eye_calib.report.report import TONES, page
-from hand_eye_calib.report.style import (
+from hand_eye_calib.report.figures import (
     BAD,
     GRID,
     INK,
     LOOK,
     PARENT,
+    Drawn,
     as_svg,
     page_style,
 )
+from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import axes_in_words, counted, listing, with_sigma

@@ -20,8 +20,7 @@ from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.report.figures import figure_of_views, figures_of
-from hand_eye_calib.report.style import LOOK
+from hand_eye_calib.report.figures import LOOK, figure_of_views, figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
 from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
