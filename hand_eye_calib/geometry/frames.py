@@ -11,11 +11,7 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import (
-    FARTHEST_M,
-    QUATERNION_NORM_TOLERANCE,
-    far_position,
-)
+from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 
 # A matrix whose rotation is further than this from one is none.
 _ROTATION_WITHIN = 1e-2

@@ -12,16 +12,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from hand_eye_calib.errors import printable
-from hand_eye_calib.report.figures import (
-    BAD,
-    GRID,
-    INK,
-    LOOK,
-    PARENT,
-    Drawn,
-    as_svg,
-    page_style,
-)
+from hand_eye_calib.report.figures import BAD, GRID, INK, LOOK, PARENT, Drawn, as_svg, page_style
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result

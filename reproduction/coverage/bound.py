@@ -14,12 +14,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
-from reproduction.coverage.sensor_errors import (
-    DrawnErrors,
-    SensorErrors,
-    directions,
-    scale_columns,
-)
+from reproduction.coverage.sensor_errors import DrawnErrors, SensorErrors, directions, scale_columns
 
 # Variances below this (m^2 or rad^2) count as this: a component without error has no inverse.
 _LEAST_VARIANCE = 1e-18

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
 
-from hand_eye_calib.assessment.covariance import (
-    assess,
-    judged,
-)
+from hand_eye_calib.assessment.covariance import assess, judged
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.normal import answers_without

@@ -5,12 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import real_data
-from motions import (
-    as_trajectory,
-    child_of,
-    disturbed,
-    wandering_poses,
-)
+from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.metrics import absolute_errors

@@ -2,14 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from motions import (
-    T_PARENT_CHILD,
-    as_trajectory,
-    child_of,
-    disturbed,
-    feed,
-    wandering_poses,
-)
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, feed, wandering_poses
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator

@@ -7,13 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_eye_calib.errors import printable
-from hand_eye_calib.io.bags.messages import (
-    MALFORMED,
-    MESSAGE_TYPES,
-    POSE_TYPES,
-    Run,
-    unpack_poses,
-)
+from hand_eye_calib.io.bags.messages import MALFORMED, MESSAGE_TYPES, POSE_TYPES, Run, unpack_poses
 from hand_eye_calib.io.bags.storage import MessageKind
 
 ENCODINGS = ("cdr", "ros1")
