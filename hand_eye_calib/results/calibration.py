@@ -14,14 +14,9 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, transform_arguments, values_of
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import (
-    AXES,
-    TRANSLATIONS,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.status import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
+from hand_eye_calib.text import AXIS_UNITS
 from hand_eye_calib.upstairs import upstairs
 
 if TYPE_CHECKING:
@@ -91,7 +86,7 @@ class Calibration(Result):
                 "axis": dof.name,
                 "value": value,
                 "sigma": sigma,
-                "unit": "m" if dof.name in TRANSLATIONS else "rad",
+                "unit": AXIS_UNITS[dof.name],
                 "verdict": dof.verdict.value,
             }
             for dof, value, sigma in rows

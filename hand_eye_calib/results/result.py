@@ -19,13 +19,7 @@ from hand_eye_calib.results.records import (
     RateBias,
     Residuals,
 )
-from hand_eye_calib.results.status import (
-    ROTATIONS,
-    TRANSLATIONS,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.status import AXES, DofObservability, DofVerdict, SolveStatus
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -284,6 +278,6 @@ class Result:
     @property
     def out_of_reach(self) -> tuple[str, ...]:
         """Axes that streams of this kind say nothing about, and no prior either."""
-        silent = {"rotations": TRANSLATIONS, "positions": ROTATIONS}.get(self.measured, ())
+        silent = {"rotations": AXES[:3], "positions": AXES[3:]}.get(self.measured, ())
         unknown = self.unobservable()
         return tuple(axis for axis in silent if axis in unknown)

@@ -19,13 +19,7 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
 from hand_eye_calib.geometry.extrinsic import Extrinsic, turned
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    DofVerdict,
-    SolveStatus,
-    Verdict,
-    data_frame,
-)
+from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame
 from hand_eye_calib.results.context import (
     AxisDifference,
     Comparison,
@@ -33,7 +27,7 @@ from hand_eye_calib.results.context import (
     Recorded,
     Together,
 )
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.status import AXES, DofVerdict, SolveStatus
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions
 from hand_eye_calib.text import listing

@@ -48,7 +48,6 @@ PUBLISHED_DRIVE = DriveConfig(attitude="published")
 # freedom, sensors at different rates without a common stamp.
 HILLY_DRIVE = DriveConfig(
     poses=1200,
-    parent_rate=10.0,
     child_rate=20.0,
     child_delay=0.0137,
     start_time=1.7e9,
