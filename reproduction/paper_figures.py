@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
-from hand_eye_calib.report import style
+from hand_eye_calib.report.figures import page_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,7 +101,7 @@ def draw_errors(
     the paths.
     """
     datasets = [name for name in _DATASET_TITLES if any(key[0] == name for key in panels)]
-    with style.page_style(**_STYLE):
+    with page_style(**_STYLE):
         figure = _new_page(2.05 * len(datasets) + 0.7, title, note)
         axes = figure.subplots(len(datasets), len(METRIC_TITLES), squeeze=False)
         for row, dataset in zip(axes, datasets, strict=True):
@@ -242,7 +242,7 @@ def draw_components(
     """Box plots of the components of the relative motions, by component with its unit and by
     reference; gives the paths.
     """
-    with style.page_style(**_STYLE):
+    with page_style(**_STYLE):
         figure = _new_page(4.0, title, note)
         axes = figure.subplots(2, 3, sharey="row")
         for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
