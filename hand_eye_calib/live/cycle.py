@@ -387,7 +387,8 @@ def describe(calibration: Calibration) -> str:
     mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
     deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
     return (
-        f"{calibration.headline}. {calibration.child_frame} in {calibration.parent_frame}: "
+        f"{calibration.headline.rstrip('.')}. "
+        f"{calibration.child_frame} in {calibration.parent_frame}: "
         f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
         f"status {calibration.status.value}; {calibration.method} {calibration.reference}"
         f": {calibration.n_poses} poses, {calibration.n_pairs} pairs, "

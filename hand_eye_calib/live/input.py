@@ -245,6 +245,7 @@ class PoseInput:
     def _use(self, judgement: Judgement) -> None:
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
+            text = text if stamp_ns else "its stamp is 0: have its publisher set header.stamp"
             self.refuse(with_stamp(stamp_ns), "corrupt stamp", text)
         for stamp_ns, read in judgement.taken:
             try:
@@ -306,7 +307,9 @@ class PoseInput:
         if lost_share < _MUCH_LOST:
             return Level.OK, f"{rate_hz:.1f} Hz"
         advice = "give the node more processor time, or publish at a lower rate"
-        return Level.WARN, f"{rate_hz:.1f} Hz; {lost_share:.1%} of the messages are lost: {advice}"
+        text = f"{lost_share:.1%} of the messages are lost: {advice}"
+        self._log.warning(f"{self.topic}: {text}")
+        return Level.WARN, f"{rate_hz:.1f} Hz; {text}"
 
 
 def with_stamp(stamp_ns: int) -> str:

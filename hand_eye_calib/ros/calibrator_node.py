@@ -31,9 +31,10 @@ from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.state import REPORT_PERIOD_S, NodeState
 from hand_eye_calib.ros.inputs import TfInput, TopicInput
-from hand_eye_calib.ros.outputs import ResultTopics, StateTopics
+from hand_eye_calib.ros.outputs import PROGRESS_TOPIC, ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
 from hand_eye_calib.ros.tf import TF, Robot, RobotTree, TfBroadcaster, message_type
+from hand_eye_calib.text import listing
 
 
 class CalibratorNode(Node):
@@ -74,6 +75,9 @@ class CalibratorNode(Node):
         self._tf = TfBroadcaster(self, self._log, tree)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
         self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
+        if len({each.topic for each in self._inputs}) < len(self._inputs):
+            topics = listing([each.topic for each in self._inputs])
+            raise ConfigError(f"two inputs have one topic: remap one to another sensor's: {topics}")
         self._session.start_journal(options, is_first=True)
         for each in self._inputs:
             each.resume()
@@ -162,6 +166,9 @@ class CalibratorNode(Node):
     def _discover(self) -> None:
         for each in self._inputs:
             each.discover()
+        name = self.get_fully_qualified_name()
+        if self.count_publishers(f"{name}/{PROGRESS_TOPIC}") > 1:
+            self._log.warning(f"another node is called {name}, too: start one with -r __node:=NAME")
 
     def _on_solve_timer(self) -> None:
         silent = [each for each in self._inputs if not each.has_poses]

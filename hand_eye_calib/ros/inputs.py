@@ -20,7 +20,7 @@ from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.ros.conversions import LISTENING, from_transform, message_class, quick
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
-from hand_eye_calib.text import counted
+from hand_eye_calib.text import counted, listing
 
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
@@ -60,22 +60,22 @@ class TopicInput(PoseInput):
         self.problem = self._why_deaf(publishers) or counted(len(publishers), "publisher")
         is_wanted = self._wanted_type != "auto"
         offered = {each.topic_type for each in publishers}
-        usable = [self._wanted_type] if is_wanted else [each for each in _TYPES if each in offered]
-        if self._subscription is not None:
+        wanted = [self._wanted_type] if is_wanted else _TYPES
+        usable = [each for each in wanted if each in offered]
+        if offered and not usable:
+            self.problem = f"has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
+            self._log.warning(
+                f"{self.topic} {self.problem}: remap {self._relative_topic} to a topic with poses"
+            )
+        if self._subscription is not None or not (usable or is_wanted):
             return
         try:
-            if usable:
-                self._subscribe(usable[0])
+            self._subscribe((usable or wanted)[0])
         except ConfigError as error:
             if is_wanted:
                 raise
             self.problem = str(error)
             self._log.error(f"{self.topic} is not used: {error}")
-        if offered and not usable:
-            self._log.warning(
-                f"{self.topic} has type {', '.join(sorted(offered))}; expected "
-                f"{', '.join(_TYPES)}: remap {self._relative_topic} to a topic with poses"
-            )
 
     def _why_deaf(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Why the middleware brings nothing of these publishers; empty if it does."""

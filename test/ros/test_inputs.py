@@ -245,3 +245,4 @@ class TestLoss:
             return True
 
         peer.spin_until(accounted, "all messages received or lost")
+        assert "of the messages are lost: give the node more processor time" in node.log

@@ -88,12 +88,26 @@ def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
 
 
 def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, peer):
-    node = start_node()
+    node = start_node("-p child_type:=geometry_msgs/msg/PoseStamped", "-p solve_period:=0.1")
+    node.wait_for_log("no pose yet on /parent_odom: 0 publishers; no pose")
     peer.publisher(String, "parent_odom")
+    peer.publisher(Odometry, "child_odom")
     node.wait_for_log(
         "/parent_odom has type std_msgs/msg/String; expected nav_msgs/msg/Odometry, "
-        "geometry_msgs/msg/PoseStamped"
+        "geometry_msgs/msg/PoseStamped",
+        "/child_odom has type nav_msgs/msg/Odometry; expected geometry_msgs/msg/PoseStamped: remap",
     )
+    statuses = peer.diagnostics()
+    said = "no message on /child_odom yet: has type nav_msgs/msg/Odometry; expected"
+    peer.spin_until(lambda: said in str(statuses.get("/calibrator: child input")), "the status")
+
+
+def test_two_nodes_of_one_name_are_told_and_one_topic_for_two_inputs_is_refused(start_node):
+    first, _ = start_node(), start_node()
+    first.wait_for_log("another node is called /calibrator, too")
+    refused = start_node("-r parent_odom:=/odom", "-r child_odom:=/odom", "-r __node:=third")
+    assert refused.wait() == 1
+    assert refused.log.startswith("calibrator: two inputs have one topic: remap one")
 
 
 def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer):
