@@ -62,14 +62,9 @@ def quantile(values: ArrayLike, share: float) -> float:
     return float(parted[low] + (rank - low) * (parted[high] - parted[low]))
 
 
-def robust_sigmas(vectors: FloatArray) -> FloatArray:
+def robust_sigma(vectors: FloatArray) -> FloatArray:
     """Standard deviations (...) per axis of vectors (..., K, 3), of which some may be far off."""
     return medians(np.linalg.norm(vectors, axis=-1)) / MEDIAN_LENGTH
-
-
-def robust_sigma(vectors: FloatArray) -> float:
-    """Standard deviation per axis of vectors (K, 3), of which some may be far off."""
-    return float(robust_sigmas(vectors))
 
 
 def student_weights(squared: FloatArray, dimension: int = 6) -> FloatArray:

@@ -11,10 +11,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from hand_eye_calib.assessment.covariance import assess
-from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import absolute_errors
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.writer import write_bag

@@ -79,11 +79,17 @@ class Assessment:
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
     """Covariance and observability of the solution of K motion pairs in order of time;
     ``solve_without(left_out)`` gives the answers (B, 4, 4) without the pairs in each row of
-    ``left_out`` (B, K).
+    ``left_out`` (B, K): blocks for a jackknife, if there are pairs enough.
     """
+    T_parent_child, resampled = solution.T_parent_child, None
     model, unknown = model_covariance(pairs, solution)
-    resampled = jackknife_covariance(len(pairs), solution.T_parent_child, solve_without)
-    return combined(solution.T_parent_child, model, resampled, unknown)
+    n_blocks = min(_BLOCKS, len(pairs) // _FEWEST[1])
+    if n_blocks >= _FEWEST[0]:
+        block_of_pair = np.arange(len(pairs)) * n_blocks // len(pairs)
+        left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
+        answers = solve_without(left_out)
+        resampled = _spread_of_blocks(se3.log(se3.inverse(T_parent_child) @ answers))
+    return combined(T_parent_child, model, resampled, unknown)
 
 
 def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
@@ -284,26 +290,11 @@ def basis(directions: list[FloatArray]) -> FloatArray:
     return left[:, sizes > 1e-6 * sizes[0]]
 
 
-def jackknife_covariance(
-    n_pairs: int, T_parent_child: FloatArray, solve_without: SolveWithout
-) -> FloatArray | None:
-    """Delete-a-block jackknife covariance (6, 6), or None if there are too few pairs for blocks.
-
-    ``(B - 1) / B * sum (xi_b - mean)(xi_b - mean)'`` over the B answers without a block (Efron,
-    Tibshirani, *An introduction to the bootstrap*, 1993, eq. 11.5), with xi_b the tangent vector
-    from the full answer.
-    """
-    n_blocks = min(_BLOCKS, n_pairs // _FEWEST[1])
-    if n_blocks < _FEWEST[0]:
-        return None
-    block_of_pair = np.arange(n_pairs) * n_blocks // n_pairs
-    left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
-    deviations = se3.log(se3.inverse(T_parent_child) @ solve_without(left_out))
-    return _spread_of_blocks(deviations)
-
-
 def _spread_of_blocks(deviations: FloatArray) -> FloatArray:
-    """Jackknife covariance (6, 6) of the deviations (B, 6) of the answers without a block."""
+    """Jackknife covariance (6, 6) of the deviations (B, 6) of the B answers without a block:
+    ``(B - 1) / B * sum (xi_b - mean)(xi_b - mean)'`` (Efron, Tibshirani, *An introduction to the
+    bootstrap*, 1993, eq. 11.5).
+    """
     n_blocks, centred = len(deviations), deviations - deviations.mean(axis=0)
     return (n_blocks - 1) / n_blocks * centred.T @ centred
 

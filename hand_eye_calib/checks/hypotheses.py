@@ -34,7 +34,7 @@ from hand_eye_calib.pairing.motion_pairs import (
     pairs_over,
     synchronise,
 )
-from hand_eye_calib.stats import medians, robust_sigmas
+from hand_eye_calib.stats import medians, robust_sigma
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
 # so many at most, and in closed form.
@@ -302,7 +302,7 @@ def _left_unexplained(A: FloatArray, B: FloatArray) -> FloatArray:
         turned = np.swapaxes(se3.rotation_exp(angle[:, None] * axis), 1, 2)
         column = -(moved @ turned)[..., None]
         x, left_m = _fit_robustly(np.concatenate([chords, column], axis=-1), -t_a)
-        left_rad = robust_sigmas(a - b @ back @ turned)
+        left_rad = robust_sigma(a - b @ back @ turned)
         sizes_m = np.linalg.norm(t_a, axis=(1, 2)), np.linalg.norm(moved, axis=(1, 2))
         size_m = np.minimum(sizes_m[0], np.maximum(x[:, 3], 0.0) * sizes_m[1])
         size_rad = np.linalg.norm(a, axis=(1, 2))
@@ -321,7 +321,7 @@ def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
         inverse = np.linalg.pinv(products[:, :-1, :-1], rcond=1e-12, hermitian=True)
         x = (inverse @ products[:, :-1, -1:])[..., 0]
         left = (rows @ x[:, None, :, None])[..., 0] - target
-        sigmas = robust_sigmas(left)
+        sigmas = robust_sigma(left)
         weights = 1.0 / (1.0 + (left**2).sum(axis=-1) / (6.0 * sigmas[:, None] + 1e-12) ** 2)
     return x, sigmas
 

@@ -290,7 +290,8 @@ def _regression(
     displaced = child.moved - parent.moved
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
     unexplained = displaced - _times(parent.chords, X[:3, 3])
-    sizes = [max(robust_sigma(v), least) for v, least in ((unexplained, 1e-7), (turned, 1e-8))]
+    of_both = ((unexplained, 1e-7), (turned, 1e-8))
+    sizes = [max(float(robust_sigma(v)), least) for v, least in of_both]
     units, of_mount = np.repeat(sizes, 3)[:, None], _of_mount(parent, child)
     columns = of_mount | dict(groups) | {"target": _rows(displaced, turned)}
     ends = np.cumsum([each.shape[2] for each in columns.values()]).tolist()

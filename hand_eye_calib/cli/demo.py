@@ -114,8 +114,8 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 
 def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> Iterator[str]:
     """The verdict, each result beside the truth, and how far it is off."""
-    from hand_eye_calib.assessment.metrics import absolute_errors
     from hand_eye_calib.geometry import se3
+    from hand_eye_calib.geometry.extrinsic import absolute_errors
 
     yield offline.headline
     heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import Solved, solve_poses
 from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.geometry.extrinsic import deviation
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration

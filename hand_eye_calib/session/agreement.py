@@ -24,8 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import deviation
 from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import amount, axes_in_words, listing
 

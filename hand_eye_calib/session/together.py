@@ -13,11 +13,10 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import combined
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
-from hand_eye_calib.geometry.extrinsic import Extrinsic, turned
+from hand_eye_calib.geometry.extrinsic import Extrinsic, deviation, turned
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame
 from hand_eye_calib.results.context import (

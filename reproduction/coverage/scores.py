@@ -8,10 +8,10 @@ import numpy as np
 from scipy.stats import norm
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.assessment.metrics import absolute_errors, deviation
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import absolute_errors, deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.results.status import AXES

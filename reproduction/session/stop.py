@@ -15,11 +15,11 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import prior_fields
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.geometry.extrinsic import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.goal import Goal

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import deviation
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import compare, together
 from reproduction.coverage.classes import CLASSES, simulate

@@ -8,9 +8,9 @@ import real_data
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine import estimation
+from hand_eye_calib.geometry.extrinsic import absolute_errors
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.verdict import Verdict

@@ -8,8 +8,8 @@ from motions import child_of, disturbed, wandering_poses
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.assessment.metrics import absolute_errors
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import absolute_errors
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.solvers import dnl, park, zhuang
 from reproduction import ali_as_published

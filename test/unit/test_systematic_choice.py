@@ -6,8 +6,8 @@ import real_data
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import assess_adaptive
-from hand_eye_calib.assessment.metrics import deviation
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.extrinsic import deviation
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.simulation.drive import add_noise, simulate_drive
