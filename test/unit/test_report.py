@@ -23,6 +23,7 @@ from hand_eye_calib.engine import evidence
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic
+from hand_eye_calib.report.figures import _VIEWS
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.records import Finding, Severity
@@ -390,3 +391,10 @@ def test_no_sentence_speaks_against_a_green_verdict():
             green += 1
             assert not re.findall(AGAINST, Page(render(calibration, snapshot)).text.lower())
     assert green >= 2
+
+
+def test_views_are_named_by_where_one_looks_from():
+    from_where = {"from above": [0, 0, 1], "from the side": [0, -1, 0], "from the front": [1, 0, 0]}
+    for (across, up), name in _VIEWS.items():
+        axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
+        assert np.cross(*axes).tolist() == from_where[name]
