@@ -300,6 +300,9 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),
         (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
         (b"[1, 2]", "ego_pose.json of nuScenes"),
+        (b"2023-11-14T22:13:20Z" + b" 1e999" * 15, "expected 8 numbers, .* found 16"),
+        (b"1e999" + b",1" * 15 + b"\n", "so that their order is unknown; name the 16"),
+        (b",1" * 12, "so that their order is unknown; name the 13"),
         (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n", "a g2o graph without vertices"),
         (
             b"source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw\n1,2,0,0,0,0,0,0\n",

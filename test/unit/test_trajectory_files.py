@@ -68,6 +68,8 @@ def test_stamps_are_exactly_the_decimal_text(file, text, stamp_ns):
 def test_comments_empty_lines_tabs_and_a_byte_order_mark_are_skipped(file):
     path = file(["\ufeff# timestamp tx ty tz", "", f"  0\t{POSE}\r", "   ", "#1 2", f"1  {POSE}"])
     assert hec.read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
+    path.write_bytes(path.read_bytes().replace(b"\r\n", b"\r"))
+    assert hec.read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
 
 
 def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp_path):

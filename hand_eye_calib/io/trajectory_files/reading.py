@@ -6,6 +6,7 @@ import csv
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from os import PathLike
@@ -61,7 +62,7 @@ _BY_NUMBER = {
     17: ("t", *MATRIX, *_LAST_ROW),
 }
 _TIMES = "times.txt"
-_LINE = re.compile(r"\S[^\n]*")
+_LINE = re.compile(r"\S[^\r\n]*")
 _COMMENTS = ("#", "//")
 _DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+([eE][-+]?\d+)?)")
 # Time between poses that are paired without stamps.
@@ -429,8 +430,10 @@ def _beginning(
 
 def _has_rotation(cells: Sequence[str]) -> bool:
     """Whether rows of a matrix have a rotation in their first three columns."""
-    R = np.array(cells[:12], dtype=float).reshape(3, 4)[:, :3]
-    return bool(np.allclose(R @ R.T, np.eye(3), atol=ROTATION_TOLERANCE))
+    with suppress(ValueError), np.errstate(all="ignore"):  # one may be a time, or empty
+        R = np.array(cells[:12], dtype=float).reshape(3, 4)[:, :3]
+        return bool(np.allclose(R @ R.T, np.eye(3), atol=ROTATION_TOLERANCE))
+    return False
 
 
 def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
