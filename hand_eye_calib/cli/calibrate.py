@@ -109,7 +109,16 @@ def run(arguments: argparse.Namespace) -> int:
     if not (arguments.paths or arguments.batch):
         print(f"{arguments.parser.format_usage()}\n{EXAMPLES}", file=sys.stderr)
         return 2
-    _check_usage(arguments)
+    if arguments.batch and (arguments.paths or arguments.list):
+        raise ConfigError("--batch cannot be combined with PATH or --list")
+    if not arguments.batch and (arguments.dask or arguments.vehicle):
+        raise ConfigError("--dask and --vehicle are for --batch")
+    if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
+        raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
+    never = ("parent_topic", "child_topic", "batch", "list")
+    others = [name for name in never if getattr(arguments, name)]
+    if arguments.topics and others:
+        raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
     if arguments.batch:
         from hand_eye_calib.cli.batch.run import run_batch
 
@@ -126,19 +135,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     with local_copies(arguments.paths) as (arguments.paths, as_given):
         return _run_here(arguments, as_given)
-
-
-def _check_usage(arguments: argparse.Namespace) -> None:
-    if arguments.batch and (arguments.paths or arguments.list):
-        raise ConfigError("--batch cannot be combined with PATH or --list")
-    if not arguments.batch and (arguments.dask or arguments.vehicle):
-        raise ConfigError("--dask and --vehicle are for --batch")
-    if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
-        raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
-    never = ("parent_topic", "child_topic", "batch", "list")
-    others = [name for name in never if getattr(arguments, name)]
-    if arguments.topics and others:
-        raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
 
 
 def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:

@@ -7,7 +7,7 @@ when it is asked for, so that a missing optional package breaks no other command
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -45,7 +45,8 @@ _OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; without one, print the help.
+    """Run a command; without one, print the help. An error that a person can act on becomes one line
+    on stderr and an exit code.
 
     Parameters
     ----------
@@ -63,19 +64,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     SystemExit
         From argparse: code 2 for wrong usage, 0 after ``--help``.
     """
-    return exit_code_of(lambda: _run(sys.argv[1:] if argv is None else argv))
-
-
-def exit_code_of(run: Callable[[], int]) -> int:
-    """What ``run()`` returns; an error that a person can act on becomes one line on stderr and an
-    exit code.
-    """
     # The matrices are small. Several threads would wait for each other, and take three times as
     # long if other programs run.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_memory()
     try:
-        code = run()
+        code = _run(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()
         return code
     except HandEyeCalibError as error:

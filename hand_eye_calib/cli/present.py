@@ -101,7 +101,8 @@ def as_lines(
     calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False
 ) -> list[str]:
     """What a person needs to see: verdict and reasons, the extrinsic in both directions, the steps
-    to take next; with details also quaternions, and how it was solved.
+    to take next, the recordings, the goal of the session and the comparison with what is
+    installed; with details also quaternions, and how it was solved.
     """
     parent, child = calibration.parent_frame, calibration.child_frame
     document = calibration.to_dict()
@@ -121,7 +122,15 @@ def as_lines(
         by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
-    details = list(_comparisons(calibration))
+    details = []
+    if joint := calibration.together:
+        details += [joint.sentence] * (joint.sentence not in calibration.headline)
+        told = {one.name: f"left out, {one.left_out}" for one in joint.recordings if one.left_out}
+        details += [f"{one.name}: {told.get(one.name, one.headline)}" for one in joint.recordings]
+    if calibration.goal:
+        details.append(f"the session: {calibration.goal.sentence}")
+    if found := calibration.comparison:
+        details.append(f"compared with what is installed ({found.installed}): {found.sentence}")
     if with_details:
         details += [f"{name}: {value}" for name, value in summary(calibration).items()]
     lines += ["Details"] * bool(details)
@@ -192,20 +201,3 @@ def transform_lines(
         named = zip("xyzw", transform["quat_xyzw"] or (), strict=False)
         quaternion = " ".join(f"{name} {value:.6f}" for name, value in named)
         yield f"  quaternion {quaternion or 'unknown'}"
-
-
-def _comparisons(calibration: Calibration) -> Iterator[str]:
-    """The recordings, the goal of the session, and the comparison with what is installed."""
-    if calibration.together:
-        if calibration.together.sentence not in calibration.headline:
-            yield calibration.together.sentence
-        for one in calibration.together.recordings:
-            told = f"left out, {one.left_out}" if one.left_out else one.headline
-            yield f"{one.name}: {told}"
-    if calibration.goal:
-        yield f"the session: {calibration.goal.sentence}"
-    if calibration.comparison:
-        yield (
-            f"compared with what is installed ({calibration.comparison.installed}): "
-            f"{calibration.comparison.sentence}"
-        )
