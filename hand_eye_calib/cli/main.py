@@ -45,19 +45,14 @@ _OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; without one, print the help. An error that a person can act on becomes one line
-    on stderr and an exit code.
+    """Run a command; without one, print the help. Returns the exit code, one of
+    :class:`~hand_eye_calib.cli.console.Exit`. An error that a person can act on is one line on
+    stderr.
 
     Parameters
     ----------
     argv : list of str, optional
         Arguments after the program's name; by default those of the process.
-
-    Returns
-    -------
-    int
-        The exit code: 0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is
-        unobservable or the verdict is DO NOT USE; 130 interrupted.
 
     Raises
     ------
