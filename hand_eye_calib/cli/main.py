@@ -7,7 +7,7 @@ when it is asked for, so that a missing optional package breaks no other command
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -45,26 +45,37 @@ _OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; without one, print the help. Returns the exit code, one of
-    :class:`~hand_eye_calib.cli.console.Exit`. An error that a person can act on is one line on
-    stderr.
+    """Run a command; without one, print the help.
 
     Parameters
     ----------
     argv : list of str, optional
         Arguments after the program's name; by default those of the process.
 
+    Returns
+    -------
+    int
+        The exit code: 0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is
+        unobservable or the verdict is DO NOT USE; 130 interrupted.
+
     Raises
     ------
     SystemExit
         From argparse: code 2 for wrong usage, 0 after ``--help``.
+    """
+    return exit_code_of(lambda: _run(sys.argv[1:] if argv is None else argv))
+
+
+def exit_code_of(run: Callable[[], int]) -> int:
+    """What ``run()`` returns; an error that a person can act on becomes one line on stderr and an
+    exit code.
     """
     # The matrices are small. Several threads would wait for each other, and take three times as
     # long if other programs run.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_memory()
     try:
-        code = _run(sys.argv[1:] if argv is None else argv)
+        code = run()
         sys.stdout.flush()
         return code
     except HandEyeCalibError as error:
