@@ -140,7 +140,8 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
             size = live.console.size
             if shown != (view, size, shows_code):
                 of_view = screen(view, size.width, footer)
-                live.update(Text.from_ansi(code) if code and shows_code else of_view, refresh=True)
+                of_code = Text.from_ansi(code, style="bright_white on black")  # on light ones, too
+                live.update(of_code if code and shows_code else of_view, refresh=True)
                 shown = view, size, shows_code
 
         yield show
