@@ -29,6 +29,7 @@ from hand_eye_calib.io.trajectory_files.table import (
     MATRIX,
     POSITION,
     QUATERNION,
+    ROTATION_VECTOR,
     Table,
     columns_of_array,
 )
@@ -228,18 +229,16 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
     body = _chosen(starts, choice, "segments")
     at, place = starts[body], columns.index("TX", starts[body])
-    rows = [cells for cells in lines[5:] if len(cells) >= place + 3 and all(cells[at : place + 3])]
-    values = np.array([[float(each) for each in cells[at : place + 3]] for cells in rows])
-    positions = values[:, -3:] * {"m": 1.0, "cm": 0.01, "mm": 0.001}[units[place]]
+    rows = (
+        [int(cells[0]) / rate_hz, *cells[at : place + 3]]
+        for cells in lines[5:]
+        if len(cells) >= place + 3 and all(cells[at : place + 3])
+    )
+    kind, turns = "rotation vectors", [f"{name} [{units[at]}]" for name in ROTATION_VECTOR]
     if "RW" in columns[at:place]:
-        kind, poses = "quaternions", se3.from_quat_xyzw(positions, values[:, :4])
-    else:
-        angles = values[:, :3] * (np.pi / 180 if units[at].startswith("deg") else 1.0)
-        rotations = se3.rotation_exp(angles)
-        kind, poses = "rotation vectors", se3.from_rotation_translation(rotations, positions)
-    stamps = [int(cells[0]) / rate_hz for cells in rows]
-    note = f"poses of {body}; rotations read as {kind}"
-    return ("t [s]", *MATRIX), np.c_[stamps, _as_rows(poses)].tolist(), [note]
+        kind, turns = "quaternions", [*QUATERNION]
+    header = ("t [s]", *turns, *(f"{axis} [{units[place]}]" for axis in POSITION))
+    return header, rows, [f"poses of {body}; rotations read as {kind}"]
 
 
 def _of_numpy(data: bytes, _: str | None) -> _Rows:
