@@ -142,7 +142,7 @@ class Table:
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among {listed}; name all columns "
                 "with `columns`, such as t,x,y,z,qw,qx,qy,qz, or roll_deg,pitch_deg,yaw_deg or "
-                "rotvec_x,rotvec_y,rotvec_z for turns"
+                "rotvec_x,rotvec_y,rotvec_z for turns; remove other text above the rows"
             )
         for name in (*stamp, *measured):
             if len(found[name]) > 1:
