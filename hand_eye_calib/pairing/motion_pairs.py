@@ -48,7 +48,7 @@ class PosePairs:
         return len(self.stamps_ns)
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        return type(self)(self.stamps_ns[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
+        return type(self)(*(each[index] for each in vars(self).values()))
 
     def child_scaled(self, factor: float) -> Self:
         """The same poses with the child's translations times ``factor``."""
@@ -64,7 +64,7 @@ class PosePairs:
     @classmethod
     def concatenate(cls, *parts: Self) -> Self:
         """All parts in the given order."""
-        columns = zip(*((one.stamps_ns, one.Ts_pw_p, one.Ts_cw_c) for one in parts), strict=True)
+        columns = zip(*(vars(one).values() for one in parts), strict=True)
         return cls(*map(np.concatenate, columns))
 
 
@@ -230,12 +230,7 @@ class MotionPairs:
         return len(self.i)
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        return type(self)(
-            self.Ts_parenti_parentj[index],
-            self.Ts_childi_childj[index],
-            self.i[index],
-            self.j[index],
-        )
+        return type(self)(*(each[index] for each in vars(self).values()))
 
     def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (K, 3) of translation and of rotation at X (4, 4).
