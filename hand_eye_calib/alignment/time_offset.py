@@ -336,8 +336,8 @@ def _fine_offset(
     """
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
-    offset_s, rate = correlation.offset_s, ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
-    most_pairs = MAX_PAIRS
+    offset_s, most_pairs, settled_s = correlation.offset_s, MAX_PAIRS, max(_SETTLED_S, least_s / 20)
+    rate = ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
     for _ in range(_MAX_ROUNDS):
         shifted = child.shifted(offset_s, rate.used, rate.at_ns)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
@@ -362,7 +362,6 @@ def _fine_offset(
         span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))
         offset_s = float(offset_s + fit.offset_s)
         is_small = abs(offset_s) + abs(fit.offset_s) < least_s / 2
-        settled_s = max(_SETTLED_S, least_s / 20)
         if abs(fit.offset_s) < settled_s or is_small:
             found = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
             is_settled = abs(found.used - rate.used) * child.duration_s < settled_s

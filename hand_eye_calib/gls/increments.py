@@ -204,36 +204,45 @@ def linearise(
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
     step = turned(back_c, np.diff(course.path, axis=0))
     metres = back_c @ np.diff(course.along, axis=0)
-    Ts_cw_c, has_rates = streams.Ts_cw_c, RATE[0] in columns
-    if parameters[TIME]:
-        Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
-    by_child = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
-    if has_rates:
-        by_rate = _by_rate_bias(by_child[:, :3, :3], np.diff(streams.stamps_s))
-        by_child[:, :3, :3] = by_child[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
+    by_child, by_rate = _child_motions(streams, course, parameters, RATE[0] in columns)
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-    by_scale = np.zeros((len(step), 6, 1))
+    by_scale, by_bias = np.zeros((len(step), 6, 1)), back[:, :3, :3] @ metres
     by_scale[:, :3] = -turned(back[:, :3, :3], step)[:, :, None]
     of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
-    by_xi, by_parameter, residuals = of_all[:, :, :6], of_all[:, :, 6:-1], of_all[:, :, -1]
+    by_xi, residuals = of_all[:, :, :6], of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)
-    by_bias = back[:, :3, :3] @ metres
-    for k, column in enumerate(columns):
+    for k, column in enumerate(columns, start=6):
         if column == SCALE:
-            by_parameter[:, :, k] = by_scale[:, :, 0]
-        elif column in BIAS:
-            by_parameter[:, :3, k] = by_bias[:, :, BIAS.index(column)]
+            of_all[:, :, k] = by_scale[:, :, 0]
         elif column == TIME:
-            by_parameter[:, :, k] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+            of_all[:, :, k] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+        elif column in BIAS:
+            of_all[:, :3, k] = by_bias[:, :, BIAS.index(column)]
         else:
-            by_parameter[:, 3:, k] = by_rate[:, :, RATE.index(column)]
+            of_all[:, 3:, k] = by_rate[:, :, RATE.index(column)]
     moved = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(by_child.shape)
     residuals[:] = se3.log(back @ (se3.inverse(T_parent_child) @ moved))
     if error is not None:
         residuals += error[1:] - turned(adjoints, error[:-1])
     return Linearisation(of_all, adjoints, by_scale)
+
+
+def _child_motions(
+    streams: Streams, course: Course, parameters: FloatArray, has_rates: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Motions (n, 4, 4) of the child, freed of a time offset and of a bias of its rates; and what
+    that adds to their rotations, if they have rates.
+    """
+    Ts_cw_c, by_rate = streams.Ts_cw_c, np.empty(0)
+    if parameters[TIME]:
+        Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
+    found = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
+    if has_rates:
+        by_rate = _by_rate_bias(found[:, :3, :3], np.diff(streams.stamps_s))
+        found[:, :3, :3] = found[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
+    return found, by_rate
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
