@@ -253,10 +253,10 @@ def _delays(
             if late_s > _DELAY_S:
                 shift_m, sigma_m = late_s * speed_m_s, sigma_s * speed_m_s
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
-                if late_s < _GRAVE * _DELAY_S:
-                    shift_m = min(shift_m, LIMITS["late"][-1])
-                if abs(late_s - abs(offset_s)) < 2.0 * sigma_s:
+                if is_expected := abs(late_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED:
                     sigma_m *= _EXPECTED
+                if is_expected or late_s < _GRAVE * _DELAY_S:
+                    shift_m = min(shift_m, LIMITS["late"][-1])
                 values |= {"part": part, "others": others}
                 yield fitted.share, graded("late", stream, shift_m, sigma_m, **values)
 
