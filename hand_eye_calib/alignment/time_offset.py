@@ -363,9 +363,8 @@ def _fine_offset(
         offset_s = float(offset_s + fit.offset_s)
         is_small = abs(offset_s) + abs(fit.offset_s) < least_s / 2
         if abs(fit.offset_s) < settled_s or is_small:
-            found = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
-            is_settled = abs(found.used - rate.used) * child.duration_s < settled_s
-            rate = found
+            earlier, rate = rate, _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
+            is_settled = abs(rate.used - earlier.used) * child.duration_s < settled_s
             if is_settled and (most_pairs > MAX_PAIRS or not rate.is_used):
                 break
             most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
