@@ -41,8 +41,9 @@ def _with(**numbers: object) -> dict[str, Any]:
 
 # Options of ``estimator.solve`` that switch one part off.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "outliers": {"without": ("outliers", "tails")},
+    "outliers": {"without": ("outliers", "tails", "steps")},
     "heavy tails": {"without": ("tails",)},
+    "heavy tails of steps": {"without": ("steps",)},
     "errors that last": {"without": ("lasting",)},
     "turning about a world's origin": _with(decisive_centre=0.0),
     "systematic errors": {"systematic": ()},

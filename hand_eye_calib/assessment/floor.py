@@ -34,12 +34,11 @@ _SPEED_OVER_S = 1.0
 _MIN_INFORMATION = 1e-6
 
 
-def common_mode_floor(speed_m_s: float = 0.0, lasting_m: float = 0.0) -> FloatArray:
+def common_mode_floor(speed_m_s: float = 0.0) -> FloatArray:
     """Covariance (6, 6) of xi = (rho, phi) that the floor stands for, in the child sensor's frame,
-    with a scale that is part of the model; ``speed_m_s`` is the usual one of the recording,
-    ``lasting_m`` the standard deviation per axis of errors of the translation that last.
+    with a scale that is part of the model; ``speed_m_s`` is the usual one of the recording.
     """
-    translation = FLOOR_TRANSLATION**2 + (FLOOR_TRAVEL_S * speed_m_s) ** 2 + lasting_m**2
+    translation = FLOOR_TRANSLATION**2 + (FLOOR_TRAVEL_S * speed_m_s) ** 2
     return np.diag(np.repeat([translation, FLOOR_ROTATION**2], 3))
 
 

@@ -3,7 +3,6 @@ assess, add the prior, judge.
 """
 
 import contextlib
-import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -221,8 +220,7 @@ def _floor(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> F
     found, odometries = solved.solution, [config.parent_kind, config.child_kind].count("odometry")
     speed_m_s = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
     if isinstance(found, AdaptiveSolution):
-        lasting = [slow.sigma for slow in found.noise.lasting if slow.part == "translation"]
-        return odometries / 2 * common_mode_floor(speed_m_s, math.hypot(*lasting))
+        return odometries / 2 * common_mode_floor(speed_m_s)
     T = found.T_parent_child
     return odometries / 2 * floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
 

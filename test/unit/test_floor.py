@@ -51,10 +51,6 @@ class TestFloor:
             found = open_scale_floor(by_scale, variance)
             assert np.sqrt(found[0, 0]) == pytest.approx(expected, rel=1e-3)
 
-    def test_errors_that_last_belong_to_it(self):
-        found = np.sqrt(np.diag(common_mode_floor(lasting_m=0.012)))
-        np.testing.assert_allclose(found[:3], 0.013)
-
     def test_what_is_far_away_moves_the_centre_of_a_fast_odometry(self):
         found = np.sqrt(np.diag(common_mode_floor(speed_m_s=2.4)))
         np.testing.assert_allclose(found[:3], 0.013)
