@@ -327,7 +327,7 @@ GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "journal": ("off", "off"),
     "publish_tf": ("true", True),
     **{f"{each}_measures": ("poses", "poses") for each in STREAMS},
-    **{f"{each}_tf": ("odom:lidar", "odom:lidar") for each in STREAMS},
+    **{f"{each}_tf": (f"odom:{each}", f"odom:{each}") for each in STREAMS},
     "other_children": ("2", 2),
     "report": ("false", False),
     "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
