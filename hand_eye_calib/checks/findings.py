@@ -124,6 +124,12 @@ _ROWS = {
         "{whose} positions are in other axes than its orientations: (x, y, z) should be ({detail})",
         "write positions and orientations in the same right-handed axes",
     ),
+    "ambiguous": _Row(
+        "this motion does not tell that from {whose} positions in other axes, (x, y, z) for "
+        "({detail}), which gives another rotation",
+        "look at the result, or rotate about other axes, too (a vehicle: over slopes or kerbs)",
+        severity=_WARNING,
+    ),
     "inverse": _Row(
         "the {stream} stream seems to hold inverse poses (of the world in the sensor, not of the "
         "sensor in its world)",
@@ -237,7 +243,7 @@ LIMITS = {
     "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
     "frozen": (0.0, 0.02, 0.02, 0.02),  # share of the time
     "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m
-    "inverse_both": (0.0, 0.3, 0.3, 1.0),  # logarithm of lengths
+    "inverse_both": (0.0, 0.12, 0.12, 0.5),  # logarithm of lengths
     # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
     # smoothing does not contain noise of the columns. Both by the shift of positions, m.
     "late": (4.5, 0.008, 0.008, 0.05),
@@ -301,19 +307,20 @@ def finding(
     )
 
 
-# Code of a finding to the option that puts a stream right, and its value.
-_CONVENTIONS = {
+# Code of a finding to the option that puts a stream right, and its value, in the order in which
+# mistakes are undone.
+CONVENTIONS = {
+    "quaternion_order": ("quaternion", "wxyz"),
     "inverse": ("invert", "poses"),
     "inverse_orientation": ("invert", "orientations"),
-    "quaternion_order": ("quaternion", "wxyz"),
 }
 
 
 def conventions(code: str, stream: str) -> dict[str, float | str]:
     """The options that put the convention of a stream, or of both, right; empty if none can."""
-    if code not in _CONVENTIONS:
+    if code not in CONVENTIONS:
         return {}
-    kind, value = _CONVENTIONS[code]
+    kind, value = CONVENTIONS[code]
     return {f"{each}_{kind}": value for each in ("parent", "child") if stream in (each, "both")}
 
 
@@ -324,7 +331,7 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
     given, told = config.to_options(), []
     for each in findings:
         options = dict(each.options)
-        if each.code in _CONVENTIONS:
+        if each.code in CONVENTIONS:
             # A stream that was put right already, and needs it again, was right before.
             set_so = [name for name, value in options.items() if given[name] == value]
             options |= {name: getattr(CalibratorConfig, name) for name in set_so}

@@ -14,40 +14,53 @@ longer than that between the sensors.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, conventions, finding
+from hand_eye_calib.checks.findings import (
+    CONVENTIONS,
+    LIMITS,
+    Finding,
+    Severity,
+    conventions,
+    finding,
+)
 from hand_eye_calib.checks.streams import PATH_STEP_S, coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import (
+    CLEARLY,
+    STEADY,
+    Trajectory,
+    scatter_of_direction,
+)
 from hand_eye_calib.pairing.motion_pairs import (
     MotionPairs,
     PosePairs,
-    motions,
+    pairs_between,
     pairs_over,
     synchronise,
 )
-from hand_eye_calib.stats import medians, robust_sigma
+from hand_eye_calib.stats import median
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
-# so many at most, and in closed form.
+# so many at most, and to see which mistake it is.
 LAGS_S = (3.0, 1.0, 0.4)
 MAX_PAIRS, _MAX_ROUGH = 400, 120
 MIN_PAIRS = 12
 
-# A hypothesis holds if it leaves at most this share of the motion unexplained. It replaces the
-# plain one if it leaves this many times less. The closed form is right to this factor.
-HOLDS, _DECISIVE, _ROUGHLY = 0.12, 3.0, 2.0
+# A hypothesis holds if it leaves at most this share of the motion unexplained. If the plain one
+# does not hold, another replaces it that leaves this many times less.
+HOLDS, _DECISIVE = 0.12, 2.0
 
-# Rounds of weights for motions that are far off, in the closed form.
-_ROUNDS = 2
+# A direction of motion is that of so many poses, or up to twice as many.
+_MANY = 1000
 
 # Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
 _NOISY = 0.3
@@ -56,12 +69,16 @@ _NOISY = 0.3
 # the parent's. A scale farther from 1 than this (logarithm) makes one less simple.
 _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 
+# A camera that looks at its target moves around it: the path of a point before it is shorter than
+# this share of its own. Rounds of weights of the shortest path.
+_AROUND, _ROUNDS_OF_PATH = 0.5, 5
+
 # Frames this close (m, rad) may be one: of one world for both streams, the lever arm between the
 # worlds says nothing.
 _SAME_FRAME = 0.01
 
-# An arm about its base, or a camera around its target, moves less than the base or target seen from
-# it. Sensors that stay within this distance (m), an arm's reach, may be such; stops too.
+# An arm about its base may move more than the base seen from it. Sensors that stay within this
+# distance (m), an arm's reach, may be such; stops too.
 _REACH_M = 3.0
 
 
@@ -77,6 +94,11 @@ class StreamPair:
     def interval_s(self) -> float:
         """Median time between poses of the faster stream, s."""
         return min(self.parent.interval_s, self.child.interval_s)
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether nothing is interpolated between most poses: stops, or too few a second."""
+        return self.interval_s > self.max_gap_s
 
     def shifted(self, offset_s: float) -> "StreamPair":
         """The same with another clock of the child."""
@@ -103,32 +125,61 @@ class StreamPair:
         return pairs
 
 
+#: Codes of the conventions that a stream breaks.
+_Way: TypeAlias = tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that ``correct`` undoes in the poses (N, 4, 4) of a stream, "parent", "child" or
-    "both". ``code`` is that of its finding, empty if nothing is wrong; ``complexity`` counts what
-    is wrong; ``detail`` says of wrong axes what (x, y, z) should be.
+    """What is wrong with each stream, as codes of findings. ``axes`` (3, 3) undoes wrong axes,
+    which ``detail`` names as what (x, y, z) should be.
     """
 
-    code: str
-    stream: str
-    correct: Callable[[FloatArray], FloatArray]
-    complexity: int = 1
+    parent: _Way = ()
+    child: _Way = ()
+    axes: FloatArray | None = None
     detail: str = ""
 
+    @property
+    def mistakes(self) -> list[tuple[str, str]]:
+        """Code and stream of each mistake; one exporter often makes it in "both"."""
+        streams = {(False, True): "child", (True, False): "parent", (True, True): "both"}
+        codes = dict.fromkeys((*self.parent, *self.child))
+        return [(code, streams[code in self.parent, code in self.child]) for code in codes]
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """How many mistakes there are, those of axes by how many are wrong; for equal numbers, the
+        child's come first.
+        """
+        n_axes = 0 if self.axes is None else int((self.axes != np.eye(3)).any(axis=1).sum())
+        return len(self.mistakes) + n_axes, 2 * len(self.parent) + len(self.child)
+
     def corrected(self, stream: str, poses: FloatArray) -> FloatArray:
-        """The poses of a stream without the mistake."""
-        return self.correct(poses) if self.stream in (stream, "both") else poses
+        """The poses (N, 4, 4) of a stream without its mistakes."""
+        way = self.child if stream == "child" else self.parent
+        if way and self.axes is not None:
+            return se3.from_rotation_translation(poses[:, :3, :3], poses[:, :3, 3] @ self.axes.T)
+        return se3.put_right(poses, **dict(CONVENTIONS[code] for code in way))
 
     def undo(self, streams: StreamPair) -> StreamPair:
-        """Both streams without the mistake."""
-        if not self.code:
-            return streams
+        """Both streams without the mistakes."""
         parent, child = (
-            Trajectory(stream.stamps_ns, self.corrected(name, stream.poses))
-            for name, stream in (("parent", streams.parent), ("child", streams.child))
+            Trajectory(given.stamps_ns, self.corrected(stream, given.poses)) if way else given
+            for stream, way, given in (
+                ("parent", self.parent, streams.parent),
+                ("child", self.child, streams.child),
+            )
         )
         return replace(streams, parent=parent, child=child)
+
+    def inverted(self) -> "Hypothesis":
+        """The one with both streams inverted besides, which fits as well."""
+        parent, child = (
+            tuple([code for code in CONVENTIONS if (code in way) != (code == "inverse")])
+            for way in (self.parent, self.child)
+        )
+        return Hypothesis(parent, child)
 
 
 @dataclass(frozen=True)
@@ -150,55 +201,48 @@ class Explanation:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of things that would have to be wrong; for equal numbers, the child's first."""
-        odd_scale = abs(np.log(self.fit.scale)) > _ODD_SCALE
-        by_stream = ("child", "parent", "both").index(self.hypothesis.stream)
-        return self.hypothesis.complexity + int(odd_scale), by_stream
+        """That of the hypothesis; an odd scale is one more mistake."""
+        n_mistakes, of_streams = self.hypothesis.complexity
+        return n_mistakes + int(abs(np.log(self.fit.scale)) > _ODD_SCALE), of_streams
 
 
-def _with_axes(matrix: FloatArray, poses: FloatArray) -> FloatArray:
-    poses = poses.copy()
-    poses[:, :3, 3] = poses[:, :3, 3] @ matrix.T
-    return poses
-
-
+_PLAIN = Hypothesis()
 _MIRROR = -np.eye(3)
-_REORDERED = partial(se3.put_right, quaternion="wxyz")
-_INVERTED_POSES = partial(se3.put_right, invert="poses")
-_PLAIN = Hypothesis("", "child", lambda poses: poses, 0)
-_USUAL = [
-    *(
-        Hypothesis(code, stream, correct)
-        for stream in ("child", "parent")
-        for code, correct in (
-            ("quaternion_order", _REORDERED),
-            ("inverse", _INVERTED_POSES),
-            ("left_handed", partial(_with_axes, _MIRROR)),
-        )
-    ),
-    # One exporter often writes both streams.
-    Hypothesis("quaternion_order", "both", _REORDERED),
+# Orientations that are inverted and written w x y z are those of other axes.
+_WAYS: list[_Way] = [
+    (),
+    ("inverse",),
+    ("inverse_orientation",),
+    ("quaternion_order",),
+    ("quaternion_order", "inverse"),
 ]
+_ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child in _WAYS]
 
 
-def _unusual() -> Iterator[Hypothesis]:
-    """Inverted orientations, on flat ground the same as two axes swapped; and all permutations and
-    flips of the axes of the positions, except the mirror of all three.
+def _conventions() -> Iterator[Hypothesis]:
+    """The conventions of both streams, and mirrors; without those that invert both besides, which
+    fit as well over longer paths.
     """
-    for stream in ("child", "parent", "both"):
-        yield Hypothesis(
-            "inverse_orientation", stream, partial(se3.put_right, invert="orientations"), 2
-        )
+    for each in _ALL_WAYS[1:]:
+        if ("inverse", "both") not in each.mistakes:
+            yield each
+    yield Hypothesis(child=("left_handed",), axes=_MIRROR)
+    yield Hypothesis(parent=("left_handed",), axes=_MIRROR)
+
+
+def _axes() -> Iterator[Hypothesis]:
+    """All permutations and flips of the axes of the positions, except the mirror of all three. On
+    flat ground some of them are the same as an inverted orientation.
+    """
     for order, signs in itertools.product(
         itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     ):
         matrix = np.diag(signs) @ np.eye(3)[list(order)]
-        n_changed = int(3 - np.isclose(matrix.diagonal(), 1.0).sum())
         parts = zip(order, signs, strict=True)
         detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in parts)
-        if n_changed and not np.array_equal(matrix, _MIRROR):
-            for stream in ("child", "parent"):
-                yield Hypothesis("axes", stream, partial(_with_axes, matrix), n_changed, detail)
+        if not (np.array_equal(matrix, np.eye(3)) or np.array_equal(matrix, _MIRROR)):
+            yield Hypothesis((), ("axes",), matrix, detail)
+            yield Hypothesis(("axes",), (), matrix, detail)
 
 
 def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None) -> Explanation:
@@ -220,15 +264,16 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         except NotEnoughDataError as error:
             too_few = error
             continue
-        chosen = _or_rival(plain, _USUAL, streams, lag_s, _NOISY if thorough else HOLDS)
+        chosen = _or_rival(plain, _conventions(), streams, lag_s, _NOISY if thorough else HOLDS)
         if chosen is plain and not plain.holds:
             # A body that rotates about one of its sensors: that one's translations are noise.
             in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
             chosen = in_one_unit if in_one_unit.holds else plain
         if not chosen.holds and thorough and not failed:
-            chosen = _or_rival(chosen, _unusual(), streams, lag_s, HOLDS)
+            chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:
-            return _attributed(chosen, streams)
+            found = _attributed(chosen, streams, lag_s)
+            return replace(found, findings=(*found.findings, *_doubts(chosen, streams, lag_s)))
         # Jumps spoil long motions more than short ones.
         failed.append(chosen)
     if not failed:
@@ -236,7 +281,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
     best = min(failed, key=lambda tried: tried.fit.unexplained)
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
-        attributed = _attributed(best, streams)
+        attributed = _attributed(best, streams, LAGS_S[0])
         findings = (*attributed.findings, finding("noisy", share=unexplained))
         return replace(attributed, findings=findings, limit=_NOISY)
     share = min(unexplained, 1.0)
@@ -253,21 +298,26 @@ def _or_rival(
 ) -> Explanation:
     """The simplest of the rivals that explain the motion best, if they are decisively better."""
     most = min(limit, plain.fit.unexplained / _DECISIVE)
-    if plain.fit.unexplained < EXPLAINED:
+    if plain.holds or not (best := _below(most, rivals, streams, lag_s)):
         return plain
-    pairs, rivals = streams.pairs(lag_s, _MAX_ROUGH), [*rivals]
-    few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
-    moved = []
-    for stream, Ts in (("parent", few.Ts_pw_p), ("child", few.Ts_cw_c)):
-        corrected = np.stack([rival.corrected(stream, Ts) for rival in rivals])
-        moved.append(motions(*np.split(corrected, 2, axis=1)))
-    left = zip(rivals, _left_unexplained(*moved), strict=True)
-    tried = [_fitted(rival, streams, lag_s) for rival, share in left if share < _ROUGHLY * most]
-    least = min((each.fit.unexplained for each in tried), default=np.inf)
-    if least >= most:
-        return plain
-    best = [each for each in tried if each.fit.unexplained <= _ABOUT_EQUAL * least]
-    return min(best, key=lambda each: each.complexity)
+    return _fitted(min(best, key=lambda each: each.complexity).hypothesis, streams, lag_s)
+
+
+def _below(
+    most: float, rivals: Iterable[Hypothesis], streams: StreamPair, lag_s: float
+) -> list[Explanation]:
+    """The best of the rivals, and those about as good, that leave less than this unexplained."""
+    pairs = streams.pairs(lag_s, _MAX_ROUGH)
+    rows, n_pairs = np.concatenate([pairs.i, pairs.j]), len(pairs)
+    few = streams.synchronised[rows]
+    tried = []
+    for rival in rivals:
+        poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
+        motions = pairs_between(*poses, np.arange(n_pairs), np.arange(n_pairs) + n_pairs)
+        tried.append(Explanation(rival, fit_similarity(motions)))
+    least = min(each.fit.unexplained for each in tried)
+    limit = min(most, _ABOUT_EQUAL * least)
+    return [each for each in tried if least < most and each.fit.unexplained <= limit]
 
 
 def _fitted(
@@ -282,108 +332,116 @@ def _fitted(
     return Explanation(hypothesis, fit, same_unit=same_unit)
 
 
-def _left_unexplained(A: FloatArray, B: FloatArray) -> FloatArray:
-    """About the share of the motion that no extrinsic and scale explain, in closed form: (H,) of H
-    sets (H, K, 4, 4) of motions each of parent and child.
+def _doubts(chosen: Explanation, streams: StreamPair, lag_s: float) -> list[Finding]:
+    """The finding that wrong axes would explain the motion as well."""
+    if chosen.hypothesis.axes is not None or not chosen.hypothesis.mistakes:
+        return []
+    most = max(EXPLAINED, _ABOUT_EQUAL * chosen.fit.unexplained)
+    rivals = (each.hypothesis for each in _below(most, _axes(), streams, lag_s))
+    doubts = (finding("ambiguous", each.mistakes[0][1], detail=each.detail) for each in rivals)
+    return [*itertools.islice(doubts, 1)]
+
+
+def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[Explanation, bool]:
+    """The explanation, or one that holds, too, with which both sensors move in a steady direction
+    of their own, as those of vehicles do; and whether they do.
     """
-    (a, t_a), (b, t_b) = ((se3.rotation_log(Ts[..., :3, :3]), Ts[..., :3, 3]) for Ts in (A, B))
-    # No extrinsic changes an angle: where angles differ, one is of a jump.
-    apart = np.abs(np.linalg.norm(a, axis=-1) - np.linalg.norm(b, axis=-1))
-    kept = a * (apart <= 3.0 * medians(apart)[:, None])[..., None]
-    back = np.swapaxes(se3.nearest_rotation(np.swapaxes(kept, 1, 2) @ b), 1, 2)
-    # The rotations may leave the angle about their main axis open: the translations show it then.
-    axis = np.linalg.eigh(np.swapaxes(kept, 1, 2) @ kept)[1][..., -1]
-    chords, moved = A[..., :3, :3] - np.eye(3), t_b @ back
-    along = (moved @ axis[..., None]) * axis[:, None]
-    columns = np.stack([along - moved, np.cross(moved, axis[:, None]), -along], axis=-1)
-    of_path, _ = _fit_robustly(np.concatenate([chords, columns], axis=-1), -t_a)
-    shares = []
-    for angle in (np.zeros(len(A)), np.arctan2(of_path[:, 4], of_path[:, 3])):
-        turned = np.swapaxes(se3.rotation_exp(angle[:, None] * axis), 1, 2)
-        column = -(moved @ turned)[..., None]
-        x, left_m = _fit_robustly(np.concatenate([chords, column], axis=-1), -t_a)
-        left_rad = robust_sigma(a - b @ back @ turned)
-        sizes_m = np.linalg.norm(t_a, axis=(1, 2)), np.linalg.norm(moved, axis=(1, 2))
-        size_m = np.minimum(sizes_m[0], np.maximum(x[:, 3], 0.0) * sizes_m[1])
-        size_rad = np.linalg.norm(a, axis=(1, 2))
-        shares.append(np.hypot(left_m / (size_m + 1e-12), left_rad / (size_rad + 1e-12)))
-    return np.asarray(np.minimum(*shares) * np.sqrt(A.shape[1]))
+    scatter: list[dict[_Way, float]] = [{}, {}]
+
+    def largest(each: Hypothesis) -> float:
+        for known, way, stream in zip(
+            scatter, (each.parent, each.child), (streams.parent, streams.child), strict=True
+        ):
+            if way not in known:
+                few = stream.poses[:: 1 + len(stream) // _MANY]
+                known[way] = scatter_of_direction(Hypothesis(way).corrected("parent", few))
+        return max(scatter[0][each.parent], scatter[1][each.child])
+
+    if chosen.hypothesis.axes is not None:
+        return chosen, True
+    of_chosen = largest(chosen.hypothesis)
+    if of_chosen > STEADY / CLEARLY:
+        least = min(map(largest, _ALL_WAYS))
+        if least < min(STEADY, of_chosen / CLEARLY):
+            best = [each for each in _ALL_WAYS if largest(each) <= _ABOUT_EQUAL * least]
+            steady = _fitted(min(best, key=lambda each: each.complexity), streams, lag_s)
+            if steady.holds:
+                return steady, True
+    return chosen, of_chosen < STEADY
 
 
-def _fit_robustly(rows: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unknowns (H, p) of the equations ``rows @ x = target`` of (H, K, 3, p) and (H, K, 3), of
-    which some are far off, and the standard deviations (H,) per axis of what is left.
+def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+    """The explanation with its findings, after deciding by paths which stream is inverted, or both:
+    the fits do not differ.
     """
-    both, weights = np.concatenate([rows, target[..., None]], axis=-1), np.ones(target.shape[:2])
-    for _ in range(_ROUNDS):
-        flat = (weights[..., None, None] * both).reshape(len(both), -1, both.shape[-1])
-        products = np.swapaxes(flat, 1, 2) @ flat
-        inverse = np.linalg.pinv(products[:, :-1, :-1], rcond=1e-12, hermitian=True)
-        x = (inverse @ products[:, :-1, -1:])[..., 0]
-        left = (rows @ x[:, None, :, None])[..., 0] - target
-        sigmas = robust_sigma(left)
-        weights = 1.0 / (1.0 + (left**2).sum(axis=-1) / (6.0 * sigmas[:, None] + 1e-12) ** 2)
-    return x, sigmas
-
-
-def _attributed(explanation: Explanation, streams: StreamPair) -> Explanation:
-    """The explanation with its finding, after deciding by path lengths which stream is inverted, or
-    both: the fits do not differ.
-    """
-    code, stream = explanation.hypothesis.code, explanation.hypothesis.stream
-    if code not in ("", "inverse"):
-        detail, options = explanation.hypothesis.detail, conventions(code, stream)
-        found = finding(code, stream, options=options, detail=detail)
-        return replace(explanation, findings=(found,))
-    evidence, inverted = _evidence_for_inverse(streams, explanation)
-    likely, clear = LIMITS["inverse_both"][-2:]
-    if code:
-        fit = explanation.fit
-        if evidence >= likely:
-            stream, fit = ("parent" if stream == "child" else "child"), inverted
+    explanation, is_settled = _steadier(explanation, streams, lag_s)
+    hypothesis, is_clear = explanation.hypothesis, True
+    if not is_settled and (inverted := hypothesis.inverted()) in _ALL_WAYS:
+        right = hypothesis.undo(streams)
+        likely, clear = LIMITS["inverse_both"][-2:]
+        paths, arms, looks_at_a_point = _evidence_for_inverse(right, explanation.fit)
+        if {("inverse", "parent"), ("inverse", "child")} & {*hypothesis.mistakes}:
+            is_other, is_clear = paths + arms > 0.0, abs(paths + arms) > likely
+        else:
+            is_other = paths > (clear if looks_at_a_point else likely)
+            is_clear = paths > clear or not _may_be_an_arm(right)
+            is_doubtful = abs(paths) <= likely and paths + arms > clear
+            if is_other and not is_clear or is_doubtful and not right.is_slow:
+                found = finding("inverse_both", "both", Severity.WARNING)
+                return replace(explanation, findings=(found,))
+        if is_other:
+            explanation, hypothesis = _fitted(inverted, streams, lag_s), inverted
+    findings = []
+    for code, stream in hypothesis.mistakes:
+        key = "inverse_both" if (code, stream) == ("inverse", "both") else code
         # An option mends only what is clear.
-        options = conventions(code, stream) if abs(evidence) > likely else {}
-        found = finding(code, stream, options=options)
-        hypothesis = Hypothesis(code, stream, _INVERTED_POSES)
-        return replace(explanation, hypothesis=hypothesis, fit=fit, findings=(found,))
-    if evidence < likely:
-        return explanation
-    if evidence <= clear or _may_be_an_arm(streams):
-        found = finding("inverse_both", "both", Severity.WARNING)
-        return replace(explanation, findings=(found,))
-    found = finding("inverse_both", options=conventions("inverse", "both"))
-    return Explanation(Hypothesis("inverse_both", "both", _INVERTED_POSES), inverted, (found,))
+        options = conventions(code, stream) if is_clear or code != "inverse" else {}
+        findings.append(finding(key, stream, options=options, detail=hypothesis.detail))
+    return replace(explanation, findings=tuple(findings))
 
 
 def _may_be_an_arm(streams: StreamPair) -> bool:
-    """Whether inverse poses may be right, or path lengths deceive: stops, or a small space."""
+    """Whether inverse poses may be right, or paths deceive: stops, or a small space."""
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
-    return streams.interval_s > streams.max_gap_s or all(
-        np.linalg.norm(each - medians(each.T), axis=1).max() < _REACH_M for each in positions
+    return streams.is_slow or all(
+        np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
+        for each in positions
     )
 
 
-def _evidence_for_inverse(
-    streams: StreamPair, explanation: Explanation
-) -> tuple[float, SimilarityFit]:
-    """Sum of logarithms by which paths and lever arm are shorter with both streams inverted, and
-    the fit then: its X is the pose of the child's world in the parent's.
+def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, float, bool]:
+    """Logarithms by which the paths, and half of that by which the lever arm, are shorter with both
+    streams inverted; and whether the sensors rather move around a point that they look at.
+
+    A body moves little beside some point of its own, such as an axle. The inverse of its path is
+    that of some point of the world, seen from the body.
     """
-    streams, fit = explanation.hypothesis.undo(streams), explanation.fit
-    evidence = 0.0
-    for stream in (streams.parent, streams.child):
+    paths = []
+    for stream in (right.parent, right.child):
         poses = coarse(stream, PATH_STEP_S).poses
-        steps = (np.diff(Ts[:, :3, 3], axis=0) for Ts in (poses, se3.inverse(poses)))
-        path_m, inverted_m = (np.linalg.norm(each, axis=1).sum() + 1e-9 for each in steps)
-        evidence += float(np.log(path_m / inverted_m))
-    pairs, Ts_c_cw = streams.synchronised, se3.inverse(streams.synchronised.Ts_cw_c)
-    Ts_c_cw[:, :3, 3] *= fit.scale
-    worlds = pairs.Ts_pw_p @ fit.T_parent_child @ Ts_c_cw
-    off = np.linalg.norm(worlds[:, :3, 3] - medians(worlds[:, :3, 3].T), axis=1)
-    inverted = replace(fit, T_parent_child=worlds[np.argmin(off)])
-    Ts = np.array([fit.T_parent_child, inverted.T_parent_child])
+        shortest, path = _shortest_path(poses)
+        paths.append(np.log([shortest / _shortest_path(se3.inverse(poses))[0], shortest / path]))
+    shorter, around = np.mean(paths, axis=0)
+    pairs = right.synchronised.child_scaled(fit.scale)
+    worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
+    Ts = np.array([fit.T_parent_child, np.median(worlds, axis=0)])
     arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)
-    if (np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])) > _SAME_FRAME).all():
-        evidence += 0.5 * float(np.log(arms_m[0] / arms_m[1]))
-    return evidence, inverted
+    is_same = np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])).min() <= _SAME_FRAME
+    arms = 0.0 if is_same else 0.5 * np.log(arms_m[0] / arms_m[1])
+    return float(shorter), float(arms), bool(around < np.log(_AROUND))
+
+
+def _shortest_path(poses: FloatArray) -> tuple[float, float]:
+    """Lengths of the shortest path of a point that is fixed to a body with these poses, and of the
+    path of its origin, m.
+    """
+    steps, chords = np.diff(poses[:, :3, 3], axis=0), np.diff(poses[:, :3, :3], axis=0)
+    lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
+    for _ in range(_ROUNDS_OF_PATH):
+        roots = 1.0 / np.sqrt(np.maximum(lengths[-1], 0.01 * median(lengths[-1])))
+        rows, target = (roots[:, None, None] * chords).reshape(-1, 3), roots[:, None] * steps
+        point = np.linalg.lstsq(rows, target.ravel(), rcond=1e-6)[0]
+        lengths.append(np.linalg.norm(steps - chords @ point, axis=1) + 1e-9)
+    paths_m = [float(each.sum()) for each in lengths]
+    return min(paths_m), paths_m[0]

@@ -21,7 +21,7 @@ from hand_eye_calib.checks.check import (
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
-from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
@@ -85,11 +85,19 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     """
     tell = progress or (lambda share, step: None)
     tell(0.0, "solving")
-    calibration = snapshot.estimate(cross_check=checks)
-    found = Run(calibration, snapshot)
-    if checks is not False:
-        tell(0.8, "checking the streams")
-        found = review(calibration, snapshot)
+    try:
+        found = Run(snapshot.estimate(cross_check=checks), snapshot)
+    except NotEnoughDataError:
+        # With some mistakes the scale cannot be estimated, or poses not be paired.
+        is_asked = checks is not False and snapshot.config.measured == "poses"
+        repaired = _repaired(snapshot, check(snapshot).findings) if is_asked else None
+        if not repaired:
+            raise
+        found = repaired
+    else:
+        if checks is not False:
+            tell(0.8, "checking the streams")
+            found = review(found.calibration, snapshot)
     tell(1.0, "done")
     return found
 
@@ -103,15 +111,15 @@ def review(
     of the time offset or of the scale, and neither the user nor an earlier check has ``settled``
     it, solve once more with it, and keep that if there is less to say against it.
     """
-    first = _checked(calibration, snapshot)
+    return _reviewed(_checked(calibration, snapshot), settled)
+
+
+def _reviewed(first: Run, settled: Collection[str]) -> Run:
+    calibration, snapshot, found = first.calibration, first.snapshot, first.check.findings
     given = snapshot.config.given.union(settled)
-    options, found = _certain(first.check.findings, given), first.check.findings
+    options = _certain(found, given)
     if {*options} & {*_REPAIRS}:
-        # The scale was compared with that of a solve of streams as they should not be.
-        options = {name: value for name, value in options.items() if value != "estimate"}
-        second = _solved_with(snapshot, options) if options else None
-        is_clear = second and not any(each.makes_unusable for each in second.check.findings)
-        return _repaired(first, second, options) if second and is_clear else first
+        return _repaired(snapshot, found, settled, calibration.verdict.value) or first
     least = int(bool(options))
     moved_s = calibration.time_offset_s - float(snapshot.resolved.config.time_offset)
     is_free = not METHODS[snapshot.config.method].uses_reference
@@ -143,16 +151,52 @@ def _improved(first: Run, options: Options, by: int) -> Run | None:
     return second if is_sound or is_better else None
 
 
-def _repaired(first: Run, second: Run, options: Options) -> Run:
-    """The second of two runs, with the options that repair the streams, saying so."""
-    what = [each.what for each in first.check.findings if {*each.options} & {*options}]
+def _repaired(
+    snapshot: Snapshot,
+    findings: Collection[Finding],
+    settled: Collection[str] = (),
+    as_they_are: str = "no result",
+) -> Run | None:
+    """The run with the options of the findings that repair the streams, saying so; None if there
+    are none, or the streams do not agree then. ``as_they_are`` is the verdict without them.
+
+    Clock and scale are compared again after the repair, unless nothing can be solved without the
+    clock.
+    """
+    certain = _certain(findings, snapshot.config.given.union(settled))
+    options = {name: value for name, value in certain.items() if value != "estimate"}
+    second = _solved_with(snapshot, options) if options else None
+    if not second and "time_offset" in certain:
+        options["time_offset"] = "estimate"
+        second = _solved_with(snapshot, options)
+    second = _reviewed(second, {*settled, *options}) if second else None
+    if not second or any(each.makes_unusable for each in second.check.findings):
+        return None
+    what = [each.what for each in findings if {*each.options} & {*options}]
     done = ", ".join(f"{name} {value}" for name, value in options.items())
     undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
     told = (
         f"repaired: {'; '.join(what)}. Solved with {done}: {second.calibration.verdict.value}; as "
-        f"the streams are: {first.calibration.verdict.value} (undo with {undo})"
+        f"the streams are: {as_they_are} (undo with {undo})"
     )
-    return _saying(second, options, (told,))
+    second = _saying(second, {**options, **second.options}, (told, *second.told))
+    return _doubting(second, [each for each in findings if each.code == "ambiguous"])
+
+
+def _doubting(found: Run, doubts: Collection[Finding]) -> Run:
+    """With findings about options that were set; a large offset that nobody gave is one."""
+    offset_s = found.calibration.time_offset_s
+    if "time_offset" in found.options and abs(offset_s) > UNASKED_S:
+        sizes: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
+        sizes |= {"total_s": round(offset_s, 4), "direction": _direction(offset_s)}
+        large = finding("large_time_offset", "child", **sizes)
+        doubts = [*doubts, *([] if large in found.calibration.findings else [large])]
+    findings = gravest_first((*found.calibration.findings, *doubts))
+    return replace(found, calibration=replace(found.calibration, findings=findings))
+
+
+def _direction(offset_s: float) -> str:
+    return "behind" if offset_s > 0 else "ahead of"
 
 
 def _saying(found: Run, options: Options, told: tuple[str, ...]) -> Run:
@@ -205,10 +249,9 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     """With warnings about options that were set because of findings, and what they gave."""
     what = {name: each.what for each in findings for name in each.options}
     offset_s = found.calibration.time_offset_s
-    direction = "behind" if offset_s > 0 else "ahead of"
     what["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {found.calibration.time_offset_sigma_s:.4f} "
-        f"s {direction} the parent's"
+        f"s {_direction(offset_s)} the parent's"
     )
     if (rate := found.calibration.clock_rate) and rate.is_used:
         what["time_offset"] += f" and {rate}"
@@ -217,14 +260,7 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
         f"{getattr(CalibratorConfig, name)}"
         for name, value in options.items()
     )
-    found = _saying(found, options, told)
-    if "time_offset" not in options or abs(offset_s) <= UNASKED_S:
-        return found
-    sizes: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
-    sizes |= {"total_s": round(offset_s, 4), "direction": direction}
-    large = finding("large_time_offset", "child", **sizes)
-    findings = gravest_first((*found.calibration.findings, large))
-    return replace(found, calibration=replace(found.calibration, findings=findings))
+    return _doubting(_saying(found, options, told), ())
 
 
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:

@@ -30,6 +30,14 @@ ROTATION_TOLERANCE = 1e-3
 _NEARBY = 4
 REACH = _NEARBY + 2
 
+# Directions of steps that are this share of the extent of the positions are compared, of a fifth of
+# that number at least.
+_STEPS_IN_EXTENT = 50
+
+# In a wrong convention the direction scatters at least so much, and so many times as much as in the
+# right one.
+STEADY, CLEARLY = 0.05, 4.0
+
 # Of white noise: covariance of neighbouring changes over their variance, and variance of the mean
 # of two of them over theirs.
 _CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
@@ -46,6 +54,25 @@ def chained(steps: FloatArray) -> FloatArray:
         rotations[span:] = rotations[:-span] @ rotations[span:]
         span *= 2
     return rotations
+
+
+def scatter_of_direction(poses: FloatArray) -> float:
+    """How much the direction of a sensor's motion scatters in its own axes: 0 if it is always the
+    same, as on vehicles, 1 if it goes everywhere, or if there are too few steps.
+    """
+    positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
+    step = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
+    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    rows = np.flatnonzero(np.diff(np.floor(travelled / (step or np.inf)), prepend=-1.0))
+    steps = np.diff(positions[rows], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    # Of a sensor that stands still, the noise of the positions adds up to a path.
+    is_step = lengths > step / 3
+    if is_step.sum() < _STEPS_IN_EXTENT / 5:
+        return 1.0
+    directions = steps[is_step] / lengths[is_step, None]
+    in_sensor = np.einsum("nji,nj->ni", rotations[rows[:-1][is_step]], directions)
+    return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
 class RateIntegrator:

@@ -64,15 +64,15 @@ def test_both_streams_in_millimetres_are_never_used(streams):
 
 def written_otherwise(trajectory, convention):
     """As another program writes it: what the option of that name puts right."""
-    if convention == {"quaternion": "wxyz"}:
-        quats = np.roll(se3.to_quat_xyzw(trajectory.poses), 1, axis=1)
-        poses = se3.from_quat_xyzw(trajectory.poses[:, :3, 3], quats)
-    else:
-        poses = se3.put_right(trajectory.poses, **convention)
+    poses = se3.put_right(trajectory.poses, convention.get("invert", "none"))
+    if "quaternion" in convention:
+        quats = np.roll(se3.to_quat_xyzw(poses), 1, axis=1)
+        poses = se3.from_quat_xyzw(poses[:, :3, 3], quats)
     return replace(trajectory, poses=poses)
 
 
 REPAIRS = [{"invert": "poses"}, {"invert": "orientations"}, {"quaternion": "wxyz"}]
+REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}]
 
 
 @pytest.mark.parametrize("convention", REPAIRS, ids=str)
@@ -80,13 +80,25 @@ REPAIRS = [{"invert": "poses"}, {"invert": "orientations"}, {"quaternion": "wxyz
 def test_a_stream_in_another_convention_is_repaired_and_that_is_said(streams, stream, convention):
     given = dict(zip(("parent", "child"), streams, strict=False))
     given[stream] = written_otherwise(given[stream], convention)
-    ((name, value),) = convention.items()
     result = hec.calibrate(**given, reference="B5")
     np.testing.assert_allclose(result.T_parent_child, streams[2], atol=1e-9)
     assert result.verdict is Verdict.USE
     (said,) = (text for text in result.warnings if text.startswith("repaired: "))
-    assert f"Solved with {stream}_{name} {value}: USE; as the streams are: DO NOT USE" in said
-    assert f"undo with {stream}_{name} {getattr(CalibratorConfig, f'{stream}_{name}')}" in said
+    done = {f"{stream}_{name}": value for name, value in convention.items()}
+    usual = {name: getattr(CalibratorConfig, name) for name in done}
+    solved, undo = (", ".join(map(" ".join, each.items())) for each in (done, usual))
+    assert f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})" in said
+
+
+@pytest.mark.parametrize("scale", [{}, {"scale": "estimate"}])
+def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
+    parent, child, expected = streams
+    child = written_otherwise(child, REPAIRS[0]).shifted(3600.0).scaled(1 / 0.3048)
+    result = hec.calibrate(parent, child, reference="B5", **scale)
+    np.testing.assert_allclose(result.T_parent_child, expected, atol=1e-3)
+    assert result.verdict is Verdict.USE_WITH_CARE
+    assert result.time_offset_s == pytest.approx(-3600.0, abs=1e-3)
+    assert any("as the streams are: no result" in text for text in result.warnings)
 
 
 def test_a_convention_that_was_given_is_kept_and_the_advice_undoes_it(streams):

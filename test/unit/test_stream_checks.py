@@ -296,14 +296,13 @@ def around_a_target(n_poses, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_arm_about_its_base_may_have_inverse_poses_and_that_is_no_error(seed):
+def test_a_camera_around_its_target_is_no_sign_of_inverse_poses(seed):
     camera = around_a_target(40, seed)
     hand = child_of(camera, se3.exp(np.array([0.03, -0.05, 0.08, 0.1, -0.2, 1.5])), np.eye(4))
     hand[:, :3, 3] -= [0.05, 0.05, -0.1]
     parent = as_trajectory(disturbed(hand, seed, 2e-4, 2e-4), 1.0)
     child = as_trajectory(disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0)
-    found = check_streams(parent, child).findings
-    assert [(each.code, each.severity) for each in found] == [("inverse_both", Severity.WARNING)]
+    assert grave(check_streams(parent, child)) == []
 
 
 def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():

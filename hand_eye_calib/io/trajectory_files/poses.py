@@ -15,10 +15,13 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import (
+    CLEARLY,
     FARTHEST_M,
     QUATERNION_NORM_TOLERANCE,
     ROTATION_TOLERANCE,
+    STEADY,
     far_position,
+    scatter_of_direction,
 )
 from hand_eye_calib.io.trajectory_files.table import (
     DIGITS,
@@ -49,13 +52,6 @@ _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
 # The inverse rotation in roll, pitch and yaw, as pyboreas has it.
 _INVERSE = "that of the world in the sensor's frame"
-
-# Directions of steps that are this share of the extent of the positions are compared, of a fifth of
-# that number at least.
-_STEPS_IN_EXTENT = 50
-# The wrong convention scatters the direction at least so much, and so many times as much as the
-# right one.
-_SMALLEST_SCATTER, _CLEARLY = 0.05, 4.0
 
 # ---- stamps
 
@@ -288,21 +284,9 @@ def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]
     """Of ways to read the sensor's orientations (N, 4) in the frame of the positions (N, 3), those
     that the motion does not contradict: another does not fit it clearly better.
     """
-    step = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
-    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
-    rows = np.flatnonzero(np.diff(np.floor(travelled / (step or np.inf)), prepend=-1.0))
-    steps = np.diff(positions[rows], axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    # Of a sensor that stands still, the noise of the positions adds up to a path.
-    is_step = lengths > step / 3
-    if is_step.sum() < _STEPS_IN_EXTENT / 5:
-        return [*ways]
-    directions, rows = steps[is_step] / lengths[is_step, None], rows[:-1][is_step]
-    scatters = {}
-    for way, quats in ways.items():
-        # Of the directions in the sensor's frame: 0 if all are the same, 1 if they go everywhere.
-        rotations = se3.from_quat_xyzw(directions, quats[rows])[:, :3, :3]
-        in_sensor = np.einsum("nji,nj->ni", rotations, directions)
-        scatters[way] = 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
-    largest = max(_SMALLEST_SCATTER, _CLEARLY * min(scatters.values()))
+    scatters = {
+        way: scatter_of_direction(se3.from_quat_xyzw(positions, quats))
+        for way, quats in ways.items()
+    }
+    largest = max(STEADY, CLEARLY * min(scatters.values()))
     return [way for way, scatter in scatters.items() if scatter <= largest]
