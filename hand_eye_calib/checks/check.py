@@ -135,7 +135,7 @@ def check_streams(
     is_sound = not any(each.makes_unusable for each in findings)
     lengths = check_lengths(parent) if is_sound else []
     right = explanation.hypothesis.undo(streams)
-    if right.is_slow:  # too slow to refine it
+    if right.interval_s > right.max_gap_s:  # too slow to refine it
         offset = TimeOffset(correlation.offset_s, right.interval_s, correlation)
     else:
         both = right.parent, right.child, correlation, right.max_gap_s, explanation.fit
@@ -157,7 +157,7 @@ def _on_one_clock(
     """
     moved = streams.shifted(known_s)
     from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
-    if not streams.is_slow:  # most poses have others to interpolate between
+    if streams.interval_s <= streams.max_gap_s:  # most poses have others to interpolate between
         return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s

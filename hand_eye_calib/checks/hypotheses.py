@@ -160,10 +160,12 @@ class Hypothesis:
         way = self.child if stream == "child" else self.parent
         if way and self.axes is not None:
             return se3.from_rotation_translation(poses[:, :3, :3], poses[:, :3, 3] @ self.axes.T)
-        return se3.put_right(poses, **dict(CONVENTIONS[code] for code in way))
+        return se3.put_right(poses, **dict(map(CONVENTIONS.__getitem__, way)))
 
     def undo(self, streams: StreamPair) -> StreamPair:
         """Both streams without the mistakes."""
+        if self is _PLAIN:
+            return streams
         parent, child = (
             Trajectory(given.stamps_ns, self.corrected(stream, given.poses)) if way else given
             for stream, way, given in (
@@ -206,7 +208,6 @@ class Explanation:
         return n_mistakes + int(abs(np.log(self.fit.scale)) > _ODD_SCALE), of_streams
 
 
-_PLAIN = Hypothesis()
 _MIRROR = -np.eye(3)
 # Orientations that are inverted and written w x y z are those of other axes.
 _WAYS: list[_Way] = [
@@ -217,17 +218,15 @@ _WAYS: list[_Way] = [
     ("quaternion_order", "inverse"),
 ]
 _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child in _WAYS]
+_PLAIN = _ALL_WAYS[0]
 
 
-def _conventions() -> Iterator[Hypothesis]:
-    """The conventions of both streams, and mirrors; without those that invert both besides, which
-    fit as well over longer paths.
-    """
-    for each in _ALL_WAYS[1:]:
-        if ("inverse", "both") not in each.mistakes:
-            yield each
-    yield Hypothesis(child=("left_handed",), axes=_MIRROR)
-    yield Hypothesis(parent=("left_handed",), axes=_MIRROR)
+# Those that invert both streams besides fit as well, over longer paths.
+_USUAL = [
+    *(each for each in _ALL_WAYS[1:] if ("inverse", "both") not in each.mistakes),
+    Hypothesis(child=("left_handed",), axes=_MIRROR),
+    Hypothesis(parent=("left_handed",), axes=_MIRROR),
+]
 
 
 def _axes() -> Iterator[Hypothesis]:
@@ -264,7 +263,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         except NotEnoughDataError as error:
             too_few = error
             continue
-        chosen = _or_rival(plain, _conventions(), streams, lag_s, _NOISY if thorough else HOLDS)
+        chosen = _or_rival(plain, _USUAL, streams, lag_s, _NOISY if thorough else HOLDS)
         if chosen is plain and not plain.holds:
             # A body that rotates about one of its sensors: that one's translations are noise.
             in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
@@ -273,6 +272,8 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
             chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:
             found = _attributed(chosen, streams, lag_s)
+            if chosen.hypothesis is _PLAIN or chosen.hypothesis.axes is not None:
+                return found
             return replace(found, findings=(*found.findings, *_doubts(chosen, streams, lag_s)))
         # Jumps spoil long motions more than short ones.
         failed.append(chosen)
@@ -334,39 +335,31 @@ def _fitted(
 
 def _doubts(chosen: Explanation, streams: StreamPair, lag_s: float) -> list[Finding]:
     """The finding that wrong axes would explain the motion as well."""
-    if chosen.hypothesis.axes is not None or not chosen.hypothesis.mistakes:
-        return []
     most = max(EXPLAINED, _ABOUT_EQUAL * chosen.fit.unexplained)
-    rivals = (each.hypothesis for each in _below(most, _axes(), streams, lag_s))
-    doubts = (finding("ambiguous", each.mistakes[0][1], detail=each.detail) for each in rivals)
-    return [*itertools.islice(doubts, 1)]
+    rivals = [each.hypothesis for each in _below(most, _axes(), streams, lag_s)][:1]
+    return [finding("ambiguous", each.mistakes[0][1], detail=each.detail) for each in rivals]
 
 
 def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[Explanation, bool]:
     """The explanation, or one that holds, too, with which both sensors move in a steady direction
     of their own, as those of vehicles do; and whether they do.
     """
-    scatter: list[dict[_Way, float]] = [{}, {}]
-
-    def largest(each: Hypothesis) -> float:
-        for known, way, stream in zip(
-            scatter, (each.parent, each.child), (streams.parent, streams.child), strict=True
-        ):
-            if way not in known:
-                few = stream.poses[:: 1 + len(stream) // _MANY]
-                known[way] = scatter_of_direction(Hypothesis(way).corrected("parent", few))
-        return max(scatter[0][each.parent], scatter[1][each.child])
-
     if chosen.hypothesis.axes is not None:
         return chosen, True
-    of_chosen = largest(chosen.hypothesis)
-    if of_chosen > STEADY / CLEARLY:
-        least = min(map(largest, _ALL_WAYS))
-        if least < min(STEADY, of_chosen / CLEARLY):
-            best = [each for each in _ALL_WAYS if largest(each) <= _ABOUT_EQUAL * least]
-            steady = _fitted(min(best, key=lambda each: each.complexity), streams, lag_s)
-            if steady.holds:
-                return steady, True
+    scatters: list[list[float]] = []
+    for stream in (streams.parent, streams.child):
+        few = stream.poses[:: 1 + len(stream) // _MANY]
+        scatters.append([])
+        for way in _WAYS:
+            right = Hypothesis(way).corrected("parent", few)
+            scatters[-1].append(scatter_of_direction(right))
+    scatter = dict(zip(_ALL_WAYS, np.maximum.outer(*scatters).flat, strict=True))
+    of_chosen, least = scatter[chosen.hypothesis], min(scatter.values())
+    if least < min(STEADY, of_chosen / CLEARLY):
+        best = [each for each in _ALL_WAYS if scatter[each] <= _ABOUT_EQUAL * least]
+        steady = _fitted(min(best, key=lambda each: each.complexity), streams, lag_s)
+        if steady.holds:
+            return steady, True
     return chosen, of_chosen < STEADY
 
 
@@ -376,21 +369,25 @@ def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> 
     """
     explanation, is_settled = _steadier(explanation, streams, lag_s)
     hypothesis, is_clear = explanation.hypothesis, True
-    if not is_settled and (inverted := hypothesis.inverted()) in _ALL_WAYS:
+    ways = (hypothesis.parent, hypothesis.child)
+    if not (is_settled or any("inverse_orientation" in way for way in ways)):
         right = hypothesis.undo(streams)
         likely, clear = LIMITS["inverse_both"][-2:]
         paths, arms, looks_at_a_point = _evidence_for_inverse(right, explanation.fit)
-        if {("inverse", "parent"), ("inverse", "child")} & {*hypothesis.mistakes}:
+        if ("inverse" in ways[0]) != ("inverse" in ways[1]):
             is_other, is_clear = paths + arms > 0.0, abs(paths + arms) > likely
         else:
             is_other = paths > (clear if looks_at_a_point else likely)
-            is_clear = paths > clear or not _may_be_an_arm(right)
-            is_doubtful = abs(paths) <= likely and paths + arms > clear
-            if is_other and not is_clear or is_doubtful and not right.is_slow:
+            is_doubtful = paths > -likely and paths + arms > clear and not right.is_slow
+            is_clear = is_other and (paths > clear or not _may_be_an_arm(right))
+            if (is_doubtful or is_other) and not is_clear:
                 found = finding("inverse_both", "both", Severity.WARNING)
                 return replace(explanation, findings=(found,))
         if is_other:
-            explanation, hypothesis = _fitted(inverted, streams, lag_s), inverted
+            hypothesis = hypothesis.inverted()
+            explanation = _fitted(hypothesis, streams, lag_s)
+    if hypothesis is _PLAIN:
+        return explanation
     findings = []
     for code, stream in hypothesis.mistakes:
         key = "inverse_both" if (code, stream) == ("inverse", "both") else code
