@@ -59,9 +59,6 @@ MIN_PAIRS = 12
 # does not hold, another replaces it that leaves this many times less.
 HOLDS, _DECISIVE = 0.12, 2.0
 
-# A direction of motion is that of so many poses, or up to twice as many.
-_MANY = 1000
-
 # Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
 _NOISY = 0.3
 
@@ -69,9 +66,8 @@ _NOISY = 0.3
 # the parent's. A scale farther from 1 than this (logarithm) makes one less simple.
 _ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
 
-# A camera that looks at its target moves around it: the path of a point before it is shorter than
-# this share of its own. Rounds of weights of the shortest path.
-_AROUND, _ROUNDS_OF_PATH = 0.5, 5
+# Rounds of weights of the shortest path.
+_ROUNDS = 5
 
 # Frames this close (m, rad) may be one: of one world for both streams, the lever arm between the
 # worlds says nothing.
@@ -94,11 +90,6 @@ class StreamPair:
     def interval_s(self) -> float:
         """Median time between poses of the faster stream, s."""
         return min(self.parent.interval_s, self.child.interval_s)
-
-    @property
-    def is_slow(self) -> bool:
-        """Whether nothing is interpolated between most poses: stops, or too few a second."""
-        return self.interval_s > self.max_gap_s
 
     def shifted(self, offset_s: float) -> "StreamPair":
         """The same with another clock of the child."""
@@ -348,7 +339,7 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
         return chosen, True
     scatters: list[list[float]] = []
     for stream in (streams.parent, streams.child):
-        few = stream.poses[:: 1 + len(stream) // _MANY]
+        few = stream.poses[:: 1 + len(stream) // MAX_PAIRS]
         scatters.append([])
         for way in _WAYS:
             right = Hypothesis(way).corrected("parent", few)
@@ -378,7 +369,7 @@ def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> 
             is_other, is_clear = paths + arms > 0.0, abs(paths + arms) > likely
         else:
             is_other = paths > (clear if looks_at_a_point else likely)
-            is_doubtful = paths > -likely and paths + arms > clear and not right.is_slow
+            is_doubtful = paths > -likely and paths + arms > clear
             is_clear = is_other and (paths > clear or not _may_be_an_arm(right))
             if (is_doubtful or is_other) and not is_clear:
                 found = finding("inverse_both", "both", Severity.WARNING)
@@ -401,7 +392,7 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
     """Whether inverse poses may be right, or paths deceive: stops, or a small space."""
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
-    return streams.is_slow or all(
+    return streams.interval_s > streams.max_gap_s or all(
         np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
         for each in positions
     )
@@ -409,7 +400,8 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
 
 def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, float, bool]:
     """Logarithms by which the paths, and half of that by which the lever arm, are shorter with both
-    streams inverted; and whether the sensors rather move around a point that they look at.
+    streams inverted; and whether the sensors rather move around a point that they look at, whose
+    path is less than half of theirs.
 
     A body moves little beside some point of its own, such as an axle. The inverse of its path is
     that of some point of the world, seen from the body.
@@ -426,7 +418,7 @@ def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float,
     arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)
     is_same = np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])).min() <= _SAME_FRAME
     arms = 0.0 if is_same else 0.5 * np.log(arms_m[0] / arms_m[1])
-    return float(shorter), float(arms), bool(around < np.log(_AROUND))
+    return float(shorter), float(arms), bool(around < np.log(0.5))
 
 
 def _shortest_path(poses: FloatArray) -> tuple[float, float]:
@@ -435,7 +427,7 @@ def _shortest_path(poses: FloatArray) -> tuple[float, float]:
     """
     steps, chords = np.diff(poses[:, :3, 3], axis=0), np.diff(poses[:, :3, :3], axis=0)
     lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
-    for _ in range(_ROUNDS_OF_PATH):
+    for _ in range(_ROUNDS):
         roots = 1.0 / np.sqrt(np.maximum(lengths[-1], 0.01 * median(lengths[-1])))
         rows, target = (roots[:, None, None] * chords).reshape(-1, 3), roots[:, None] * steps
         point = np.linalg.lstsq(rows, target.ravel(), rcond=1e-6)[0]

@@ -257,7 +257,7 @@ def child_with(**fields):
     ("changed", "message"),
     [
         ({"parent": drive(count=5)[0]}, "10 synchronised pose pairs are needed, found 5"),
-        ({"child": drive(first_ns=START_NS + 10**12)[1]}, "the streams do not overlap in time"),
+        ({"child": drive(30, first_ns=START_NS + 10**12)[1]}, "the streams do not overlap in time"),
         ({"child": drive()[1][:0]}, "no poses on the child stream"),
         (
             child_with(sensor_frame=""),
