@@ -368,7 +368,7 @@ def steps(problem: Problem, fit: Fit) -> Fit:
         for _ in range(problem.tuning.tail_rounds):
             fit = replace(fit, walk_weights=step_weights(problem.posterior(fit), fit.walk_weights))
         fit = noise(problem, fit)
-    return _outliers_found(problem, fit, 2, with_spikes=False)
+    return fit
 
 
 def systematic(problem: Problem, fit: Fit) -> Fit:
