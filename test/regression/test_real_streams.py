@@ -135,10 +135,10 @@ class TestArms:
         assert [f.code for f in result.findings if f.severity == "error"] == []
 
     @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
-    def test_a_fixed_camera_beside_an_arm_may_have_inverse_poses(self, interval_s):
+    def test_a_fixed_camera_beside_an_arm_has_inverse_poses_by_right(self, interval_s):
         parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand())
-        (finding,) = calibrate(parent, child).findings
-        assert (finding.code, finding.severity) == ("inverse_both", "warning")
+        codes = {f.code for f in calibrate(parent, child).findings if f.severity != "note"}
+        assert codes <= {"inverse_both"}
 
     def test_the_axis_of_one_axis_motion_is_named(self):
         recording = real_data.robot_arm("sim")
