@@ -41,9 +41,8 @@ def _with(**numbers: object) -> dict[str, Any]:
 
 # Options of ``estimator.solve`` that switch one part off.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "outliers": {"without": ("outliers", "tails", "steps")},
+    "outliers": {"without": ("outliers", "tails")},
     "heavy tails": {"without": ("tails",)},
-    "heavy tails of steps": {"without": ("steps",)},
     "errors that last": {"without": ("lasting",)},
     "turning about a world's origin": _with(decisive_centre=0.0),
     "systematic errors": {"systematic": ()},

@@ -44,7 +44,7 @@ from hand_eye_calib.stats import median
 from hand_eye_calib.text import angle, counted, length
 
 # Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
-_SLOW, _FIRST = frozenset({"tails", "steps", "lasting"}), 3
+_SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
@@ -295,10 +295,9 @@ def _solved(problem: Problem) -> AdaptiveSolution:
         fewer = replace(problem, streams=problem.streams[kept], _last=[])
         return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
     fit = _passed(problem, first, STAGES[_FIRST:])
-    for stage in ("steps", "lasting"):
-        if not is_settled(problem, fit):
-            problem = replace(problem, without=problem.without | {stage})
-            fit = _passed(problem, first, STAGES[_FIRST:])
+    if not is_settled(problem, fit):
+        problem = replace(problem, without=problem.without | {"lasting"})
+        fit = _passed(problem, first, STAGES[_FIRST:])
     return _solution(problem, fit)
 
 

@@ -19,14 +19,7 @@ from hand_eye_calib.gls.normal import transposed
 from hand_eye_calib.gls.reml import walk_covariance
 from hand_eye_calib.gls.state_space import WHITE, Posterior, combined
 from hand_eye_calib.gls.tuning import TUNING
-from hand_eye_calib.stats import (
-    CHI2,
-    MEDIAN_LENGTH,
-    STUDENT,
-    chi_square_quantile,
-    median,
-    student_weights,
-)
+from hand_eye_calib.stats import CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
 
 
 @dataclass(frozen=True)
@@ -189,14 +182,6 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     best = int(np.argmin(losses))
     level = levels[best if losses[best] < losses[0] - TUNING.least_gain_of_widths else 0]
     return np.asarray((STUDENT + 6.0) / (STUDENT * level + expected))
-
-
-def step_weights(posterior: Posterior, before: FloatArray) -> FloatArray:
-    """Weights (n,) of the steps of a walk with Student's t distribution, from those before."""
-    walk = posterior.restricted()[1][:, :, 0]
-    moments = walk_covariance(posterior) + walk[:, :, None] * walk[:, None]
-    squares = np.tensordot(moments, posterior.walk, 2)
-    return student_weights(squares / (before * posterior.space.relative))
 
 
 def _around(values: FloatArray, width: int) -> FloatArray:

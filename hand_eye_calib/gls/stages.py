@@ -44,7 +44,6 @@ from hand_eye_calib.gls.outliers import (
     bridged,
     first_outliers,
     judged,
-    step_weights,
     surprises,
     tail_weights,
 )
@@ -89,15 +88,13 @@ class Problem:
     ) -> StateSpace:
         """State space of all or some of the poses, with a model other than that of the fit."""
         poses, course, error, weights = fit.poses, fit.course, fit.error, fit.weights
-        outliers, walk_weights = fit.outliers, fit.walk_weights
+        outliers = fit.outliers
         if kept is not None:
             course = Course(course.twists[kept], course.path[kept], course.along[kept])
             poses, error, weights = poses[kept], error[kept], weights[kept]
             outliers = outliers.across(kept)
-            variances = np.add.reduceat(1.0 / walk_weights[: kept[-1]], kept[:-1])
-            walk_weights = np.diff(kept) / variances
         known = error if error.any() else None
-        space = (model or fit.model).state_space(
+        return (model or fit.model).state_space(
             poses,
             linearise(poses, course, fit.T, fit.parameters, self.columns, known),
             course.twists,
@@ -106,7 +103,6 @@ class Problem:
             outliers.jumps,
             self.known(fit),
         )
-        return replace(space, relative=space.relative / walk_weights)
 
     def posterior(self, fit: Fit) -> Posterior:
         """Of all poses."""
@@ -141,8 +137,8 @@ class Fit:
     model, levels
         Noise model and its log levels.
     outliers : Outliers
-    weights, walk_weights : (N,) and (n,) arrays
-        Of white errors and of steps of the walk; other than 1 where tails are heavy.
+    weights : (N,) array
+        Of white errors; other than 1 where tails are heavy.
     sigmas : (8,) array
         What systematic errors are known to beforehand.
     has_heavy_tails : bool
@@ -158,7 +154,6 @@ class Fit:
     levels: FloatArray
     outliers: Outliers
     weights: FloatArray
-    walk_weights: FloatArray
     sigmas: FloatArray
     has_heavy_tails: bool = False
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
@@ -244,7 +239,6 @@ def start(problem: Problem) -> Fit:
         levels=rough_levels(residuals, beside),
         outliers=outliers,
         weights=np.ones(len(streams)),
-        walk_weights=np.ones(len(streams) - 1),
         sigmas=np.array(tuning.sizes),
     )
 
@@ -359,18 +353,6 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     return replace(fit, model=replace(model, slow=slow), levels=left)
 
 
-def steps(problem: Problem, fit: Fit) -> Fit:
-    """Weights of the steps of the walk, if what lasts leaves their tails heavy."""
-    of_walk = surprises(problem.posterior(fit), fit.outliers.spikes)[0][~fit.outliers.jumps]
-    if np.mean(of_walk**2) <= TUNING.walk_kurtosis * np.mean(of_walk) ** 2:
-        return fit
-    for _ in range(2):
-        for _ in range(problem.tuning.tail_rounds):
-            fit = replace(fit, walk_weights=step_weights(problem.posterior(fit), fit.walk_weights))
-        fit = noise(problem, fit)
-    return fit
-
-
 def systematic(problem: Problem, fit: Fit) -> Fit:
     """The likeliest systematic errors; and a step of X and of these, at poses freed of errors.
 
@@ -434,4 +416,4 @@ def is_settled(problem: Problem, fit: Fit) -> bool:
     return bool((np.abs(steps) < limits).all())
 
 
-STAGES = (noise, outliers, tails, lasting, steps, systematic, polish)
+STAGES = (noise, outliers, tails, lasting, systematic, polish)
