@@ -4,13 +4,12 @@ follows shows whether the streams agree without it.
 For every motion pair and any X, both sensors rotate through the same angle and move by the same
 distance along the same screw axis. The robust fit of :mod:`~hand_eye_calib.alignment.similarity`
 measures how much of the motion breaks this. The plain hypothesis, nothing is wrong, is kept unless
-another leaves several times less of the motion unexplained. Before a fit, a closed form says about
-how much another one leaves: a fit that cannot win is not made.
+another leaves several times less of the motion unexplained.
 
 Two inverted streams agree with each other as well as two correct ones: X is then the pose of one
-world in the other. Path lengths tell them apart. The path of the world's origin, seen from a
-rotating sensor, is longer than the sensor's own path, and the lever arm between the worlds is
-longer than that between the sensors.
+world in the other. Vehicles move in a steady direction of their own. Of other bodies, some point
+moves less than any point of the world does, seen from the sensor; and the lever arm between the
+worlds is longer than that between the sensors.
 """
 
 import itertools
@@ -262,10 +261,9 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         if not chosen.holds and thorough and not failed:
             chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:
+            chosen, doubts = _or_axes(chosen, streams, lag_s)
             found = _attributed(chosen, streams, lag_s)
-            if chosen.hypothesis is _PLAIN or chosen.hypothesis.axes is not None:
-                return found
-            return replace(found, findings=(*found.findings, *_doubts(chosen, streams, lag_s)))
+            return replace(found, findings=(*found.findings, *doubts))
         # Jumps spoil long motions more than short ones.
         failed.append(chosen)
     if not failed:
@@ -290,7 +288,7 @@ def _or_rival(
 ) -> Explanation:
     """The simplest of the rivals that explain the motion best, if they are decisively better."""
     most = min(limit, plain.fit.unexplained / _DECISIVE)
-    if plain.holds or not (best := _below(most, rivals, streams, lag_s)):
+    if plain.fit.unexplained < EXPLAINED or not (best := _below(most, rivals, streams, lag_s)):
         return plain
     return _fitted(min(best, key=lambda each: each.complexity).hypothesis, streams, lag_s)
 
@@ -324,11 +322,23 @@ def _fitted(
     return Explanation(hypothesis, fit, same_unit=same_unit)
 
 
-def _doubts(chosen: Explanation, streams: StreamPair, lag_s: float) -> list[Finding]:
-    """The finding that wrong axes would explain the motion as well."""
-    most = max(EXPLAINED, _ABOUT_EQUAL * chosen.fit.unexplained)
-    rivals = [each.hypothesis for each in _below(most, _axes(), streams, lag_s)][:1]
-    return [finding("ambiguous", each.mistakes[0][1], detail=each.detail) for each in rivals]
+def _or_axes(
+    chosen: Explanation, streams: StreamPair, lag_s: float
+) -> tuple[Explanation, list[Finding]]:
+    """The explanation, but for inverted orientations wrong axes that explain clearly more, or the
+    finding that wrong axes would explain about as much.
+    """
+    if "inverse_orientation" not in dict(chosen.hypothesis.mistakes):
+        return chosen, []
+    unexplained = chosen.fit.unexplained
+    rivals = _below(max(EXPLAINED, _ABOUT_EQUAL * unexplained), _axes(), streams, lag_s)
+    if not rivals:
+        return chosen, []
+    best = min(rivals, key=lambda each: each.complexity)
+    if _ABOUT_EQUAL * best.fit.unexplained < unexplained:
+        return _fitted(best.hypothesis, streams, lag_s), []
+    detail, (_, stream) = best.hypothesis.detail, best.hypothesis.mistakes[0]
+    return chosen, [finding("ambiguous", stream, detail=detail)]
 
 
 def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[Explanation, bool]:
@@ -370,7 +380,8 @@ def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> 
         else:
             is_other = paths > (clear if looks_at_a_point else likely)
             is_doubtful = paths > -likely and paths + arms > clear
-            is_clear = is_other and (paths > clear or not _may_be_an_arm(right))
+            agrees = paths + arms > 0.0 and not _may_be_an_arm(right)
+            is_clear = is_other and (paths > clear or agrees)
             if (is_doubtful or is_other) and not is_clear:
                 found = finding("inverse_both", "both", Severity.WARNING)
                 return replace(explanation, findings=(found,))

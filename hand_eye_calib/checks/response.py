@@ -114,7 +114,8 @@ class Regression:
 
 def _solved(products: FloatArray, columns: list[int]) -> FloatArray:
     normal = products[..., columns, :][..., columns]
-    units = 1.0 / np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)) + 1e-300)
+    sizes = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
+    units = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > 1e-30)
     balanced = normal * units[..., :, None] * units[..., None, :] + 1e-9 * np.eye(len(columns))
     pushed = (units * products[..., columns, -1])[..., None]
     return np.asarray(units * np.linalg.solve(balanced, pushed)[..., 0])
