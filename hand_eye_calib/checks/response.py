@@ -135,12 +135,12 @@ class _Stream:
         self.chords = self.ends[1] - self.ends[0]
         self.rotations = turned @ np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3] @ turned.T
         self.displaced = end[:, :3, 3] - start[:, :3, 3]
-        self.moved = _times(self.from_world, self.displaced)
+        self.moved = se3.times(self.from_world, self.displaced)
 
     def back(self, vectors: FloatArray) -> FloatArray:
         """Vectors (N, 3) of the poses at the start less those at the end, in axes of the start."""
         start, _, end = (vectors[rows] for rows in self.rows)
-        return start - _times(self.rotations, end)
+        return start - se3.times(self.rotations, end)
 
     def derivatives(self, step: int, h: float) -> tuple[FloatArray, ...]:
         """Velocity and acceleration (N, 3) of all poses in their world, angular velocity and
@@ -182,9 +182,9 @@ def response(
     parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
     child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
     # What the other stream makes of the displacements of each.
-    arm = _times(parent.chords, T_parent_child[:3, 3])
-    p_seen = _times(np.swapaxes(parent.from_world, 1, 2), child.moved - arm)
-    c_seen = _times(np.swapaxes(child.from_world, 1, 2), parent.moved + arm)
+    arm = se3.times(parent.chords, T_parent_child[:3, 3])
+    p_seen = se3.times(np.swapaxes(parent.from_world, 1, 2), child.moved - arm)
+    c_seen = se3.times(np.swapaxes(child.from_world, 1, 2), parent.moved + arm)
     stamps_ns = pose_pairs.stamps_ns
     seconds = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
     drifted = child.from_world * seconds[:, None, None]
@@ -255,13 +255,13 @@ def _of_filters(
         start, middle, end = stream.rows
         faster = sign * (velocity[end] - velocity[start])
         bent = sign * (acceleration[start] - acceleration[end])
-        late, positions = _times(stream.from_world, faster), _times(stream.from_world, bent)
+        late, positions = se3.times(stream.from_world, faster), se3.times(stream.from_world, bent)
         orientations = sign * se3.cross(bend[middle], stream.moved)
         if name == "child":
             groups["late"] = _rows(late + se3.cross(rate[middle], stream.moved), stream.back(rate))
         else:
             arms = [se3.cross(bend[rows], arm) for rows in (start, end)]
-            orientations += _times(stream.ends[0], arms[0]) - _times(stream.ends[1], arms[1])
+            orientations += se3.times(stream.ends[0], arms[0]) - se3.times(stream.ends[1], arms[1])
         groups[f"late_{name}"] = _rows(late)
         groups[f"late_axes_{name}"] = _rows(stream.from_world * faster[:, None, :])
         groups[f"positions_{name}"] = _rows(positions)
@@ -290,7 +290,7 @@ def _regression(
     """Regression on groups of columns, and on those of X and the scale."""
     displaced = child.moved - parent.moved
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
-    unexplained = displaced - _times(parent.chords, X[:3, 3])
+    unexplained = displaced - se3.times(parent.chords, X[:3, 3])
     of_both = ((unexplained, 1e-7), (turned, 1e-8))
     sizes = [max(float(robust_sigma(v)), least) for v, least in of_both]
     units, of_mount = np.repeat(sizes, 3)[:, None], _of_mount(parent, child)
@@ -304,7 +304,3 @@ def _regression(
     for name, each in (_of_mount(child, child) | dict(probes)).items():
         probing[:, :, where[name]] = each / units
     return Regression(rows, probing, where, *of_mount, *base)
-
-
-def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.asarray((matrices @ vectors[..., None])[..., 0])

@@ -257,6 +257,11 @@ def log(transforms: ArrayLike) -> FloatArray:
     return np.concatenate([rho, phi], axis=-1)
 
 
+def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Matrices (..., k, m) times vectors (..., m)."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
 def adjoint(transforms: ArrayLike) -> FloatArray:
     """Adjoint matrices (..., 6, 6) of transforms (..., 4, 4).
 

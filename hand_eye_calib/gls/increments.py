@@ -132,7 +132,7 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,
-        summed(turned(axes_c, step)),
+        summed(se3.times(axes_c, step)),
         summed(axes_c * metres_c[:, None, None]),
     )
 
@@ -147,11 +147,6 @@ def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> Floa
     variance = max(median((steps - smooth) ** 2), TUNING.least_variance)
     believed = max(1.0 - TUNING.caution * noise_m**2 / variance, 0.0)
     return smooth + believed * (steps - smooth)
-
-
-def turned(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Matrices (n, k, 3) times vectors (n, 3)."""
-    return (rotations @ vectors[:, :, None])[:, :, 0]
 
 
 def summed(steps: FloatArray) -> FloatArray:
@@ -202,14 +197,14 @@ def linearise(
         Errors that the poses were freed of.
     """
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
-    step = turned(back_c, np.diff(course.path, axis=0))
+    step = se3.times(back_c, np.diff(course.path, axis=0))
     metres = back_c @ np.diff(course.along, axis=0)
     by_child, by_rate = _child_motions(streams, course, parameters, RATE[0] in columns)
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
     by_scale, by_bias = np.zeros((len(step), 6, 1)), back[:, :3, :3] @ metres
-    by_scale[:, :3] = -turned(back[:, :3, :3], step)[:, :, None]
+    by_scale[:, :3] = -se3.times(back[:, :3, :3], step)[:, :, None]
     of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
     by_xi, residuals = of_all[:, :, :6], of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)
@@ -217,7 +212,7 @@ def linearise(
         if column == SCALE:
             of_all[:, :, k] = by_scale[:, :, 0]
         elif column == TIME:
-            of_all[:, :, k] = turned(adjoints, course.twists[:-1]) - course.twists[1:]
+            of_all[:, :, k] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
         elif column in BIAS:
             of_all[:, :3, k] = by_bias[:, :, BIAS.index(column)]
         else:
@@ -225,7 +220,7 @@ def linearise(
     moved = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(by_child.shape)
     residuals[:] = se3.log(back @ (se3.inverse(T_parent_child) @ moved))
     if error is not None:
-        residuals += error[1:] - turned(adjoints, error[:-1])
+        residuals += error[1:] - se3.times(adjoints, error[:-1])
     return Linearisation(of_all, adjoints, by_scale)
 
 

@@ -37,7 +37,6 @@ from hand_eye_calib.gls.increments import (
     course_of,
     linearise,
     summed,
-    turned,
 )
 from hand_eye_calib.gls.noise_model import (
     N_FAST,
@@ -212,7 +211,7 @@ class _State:
         worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
         return replace(
             course,
-            path=summed(turned(worlds, np.diff(course.path, axis=0))),
+            path=summed(se3.times(worlds, np.diff(course.path, axis=0))),
             along=summed(worlds @ np.diff(course.along, axis=0)),
         )
 
@@ -220,7 +219,7 @@ class _State:
         """Increments between poses, with the columns of the lever arm and of the parameters."""
         course, moving = self.course, _accelerations(self.streams, self.X)
         found = linearise(self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED)
-        answering = turned(found.adjoints, moving[:-1]) - moving[1:]
+        answering = se3.times(found.adjoints, moving[:-1]) - moving[1:]
         columns = np.insert(found.columns, -1, answering, axis=2)
         return replace(found, columns=np.delete(columns, [3, 4, 5], axis=2))
 
@@ -283,7 +282,7 @@ class _State:
         boost = np.where(found.jumps, np.maximum(TUNING.jump_factor * of_walk, self.boost), 1.0)
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
-        path = Ts_cw_c[:, :3, 3] + turned(Ts_cw_c[:, :3, :3], states)
+        path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], states)
         spread = posterior.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
@@ -377,7 +376,7 @@ def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:
     changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
     back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
     is_near = spans_s < TUNING.near * 4 * k * interval_s
-    found[2 * k : -2 * k, :3] = np.where(is_near, turned(back, changes), 0.0)
+    found[2 * k : -2 * k, :3] = np.where(is_near, se3.times(back, changes), 0.0)
     return found
 
 

@@ -25,7 +25,6 @@ from hand_eye_calib.gls.increments import (
     Streams,
     course_of,
     linearise,
-    turned,
 )
 from hand_eye_calib.gls.noise_model import (
     CENTRES,
@@ -180,7 +179,7 @@ class Fit:
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
         error = states[:, :WHITE] + self.model.lasting(states, self.poses, T)
         other_error = error - white_error
-        of_white = turned(self.model.shares(self.levels, self.poses, T), white_error)
+        of_white = se3.times(self.model.shares(self.levels, self.poses, T), white_error)
         by_parent = of_white + 0.5 * other_error
         by_child = of_white - white_error - 0.5 * other_error
         given = bridged(streams, T, spikes)
