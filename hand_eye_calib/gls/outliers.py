@@ -171,10 +171,11 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)
     hidden = 6.0 * (1.0 - kept) / np.where(free, 1.0, weights)
     expected = np.where(free, 0.0, squares + hidden)
-    levels = [np.ones(len(expected))]
-    for width in TUNING.widths:
-        around = STUDENT + 6.0 * _around((~free).astype(float), width)
-        levels.append((STUDENT + _around(expected, width)) / around)
+    levels, of_all = [np.ones(len(expected))], np.array([~free, expected])
+    for width in TUNING.widths:  # so many neighbours on either side
+        sums = np.cumsum(np.pad(of_all, ((0, 0), (width + 1, width))), axis=1)
+        n_around, around = sums[:, 2 * width + 1 :] - sums[:, : len(free)] - of_all
+        levels.append((STUDENT + around) / (STUDENT + 6.0 * n_around))
     losses = [
         float(np.mean((3.0 * np.log(m) + 5.0 * np.log1p(expected / (STUDENT * m)))[~free]))
         for m in levels
@@ -182,9 +183,3 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     best = int(np.argmin(losses))
     level = levels[best if losses[best] < losses[0] - TUNING.least_gain_of_widths else 0]
     return np.asarray((STUDENT + 6.0) / (STUDENT * level + expected))
-
-
-def _around(values: FloatArray, width: int) -> FloatArray:
-    """Sums (N,) of the values of so many neighbours on either side."""
-    sums = np.cumsum(np.r_[0.0, np.pad(values, width)])
-    return np.asarray(sums[2 * width + 1 :] - sums[: len(values)] - values)

@@ -17,19 +17,19 @@ ROOT = SOURCE.parent
 # long functions, which have goals of 30,000, 400 and 10. Goals still ahead: 19,000 lines of code,
 # 450 functions in 50 files entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
-    "lines": 29_560,
-    "lines of code": 19_200,
+    "lines": 29_510,
+    "lines of code": 19_080,
     "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
     "rooms": 30,
     "floors": 17,
     "arrows between rooms": 186,
-    "functions entered by calibrate": 548,
-    "files entered by calibrate": 62,
+    "functions entered by calibrate": 552,
+    "files entered by calibrate": 60,
     "lines of reproduction": 6_960,
-    "lines of tests": 19_280,
-    "words of documentation": 35_000,
+    "lines of tests": 19_165,
+    "words of documentation": 34_850,
 }
 
 _LONG_FILE, _LONG_FUNCTION = 500, 50
