@@ -285,7 +285,7 @@ def _floor(result: Result) -> Iterator[_Found]:
 
 
 _OF_RECORDINGS = {
-    "differ": "record a third time: then the one that is off shows",
+    "differ": "record once more: then the one that is off shows",
     "moved": "calibrate from the recordings since then alone",
     "one off": "find out what was different in that recording; it is left out",
     "scatter": "look for what changes from recording to recording; the standard deviations contain "
@@ -348,8 +348,8 @@ RULES = (
     Rule(
         "recordings_differ",
         _NEVER,
-        "of several recordings two differ and there is no third, or the mount has moved between "
-        "them",
+        "of several recordings two differ and there is no third, all differ, or the mount has "
+        "moved between them",
         partial(_recordings, ("differ", "moved")),
     ),
     Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),

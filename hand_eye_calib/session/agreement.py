@@ -34,7 +34,7 @@ _UNKNOWN, _UNKNOWN_VARIANCE = 0.3, 1e4
 _ROUNDS = 2
 # Probability of a false alarm.
 _LEVEL = 0.01
-# Factors of the usual scatter.
+# Factors of the usual scatter; with more, results are of no one mount.
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
 
@@ -42,7 +42,7 @@ _FACTORS = np.geomspace(1 / 16, 16, 9)
 _SAID = {
     "single": "One recording: nothing to compare with",
     "agree": "{all} agree within their standard deviations",
-    "differ": "{both} differ; a third recording shows which is off",
+    "differ": "{both} differ; one more recording shows which is off",
     "scatter": "{all} scatter {excess} times as much as those of one rig do; none stands out",
     "one off": "{first} differs from the others: {moves}",
     "moved": "The mount has moved before {first}: {moves}",
@@ -252,7 +252,7 @@ def _explanation(
         is_one = best < len(number)
         kind = "one off" if is_one else "moved"
         apart = number == best if is_one else number >= best - len(number) + 2
-    elif kind == "differ":
+    elif kind == "differ" and all_chi2 < _FACTORS[-1] ** 2 * all_dof:
         kind = "scatter"
     return kind, apart, float(all_chi2), int(all_dof), p_value
 

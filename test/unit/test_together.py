@@ -173,6 +173,7 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
     scattered = [one for one in found if one.kind == "scatter"]
     assert len(scattered) >= 19
     assert all(1.5 < one.excess < 2.5 for one in scattered)
+    assert agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"  # of no one mount
 
 
 def test_a_single_result_and_one_that_knows_nothing():
