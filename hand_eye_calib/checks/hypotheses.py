@@ -331,11 +331,11 @@ def _or_axes(
     if "inverse_orientation" not in dict(chosen.hypothesis.mistakes):
         return chosen, []
     unexplained = chosen.fit.unexplained
-    rivals = _below(max(EXPLAINED, _ABOUT_EQUAL * unexplained), _axes(), streams, lag_s)
+    rivals = _below(_ABOUT_EQUAL * unexplained, _axes(), streams, lag_s)
     if not rivals:
         return chosen, []
     best = min(rivals, key=lambda each: each.complexity)
-    if _ABOUT_EQUAL * best.fit.unexplained < unexplained:
+    if _ABOUT_EQUAL**0.5 * min(each.fit.unexplained for each in rivals) < unexplained:
         return _fitted(best.hypothesis, streams, lag_s), []
     detail, (_, stream) = best.hypothesis.detail, best.hypothesis.mistakes[0]
     return chosen, [finding("ambiguous", stream, detail=detail)]

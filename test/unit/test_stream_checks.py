@@ -51,7 +51,7 @@ def test_no_false_alarm(seed, wander):
 
 
 @pytest.mark.parametrize("wander", [wandering_poses, planar_poses])
-def test_no_rival_is_fitted_to_noisy_streams_that_agree(wander, monkeypatch):
+def test_no_rival_is_taken_for_noisy_streams_that_agree(wander, monkeypatch):
     fits = []
 
     def counted(*arguments, **options):
@@ -60,7 +60,8 @@ def test_no_rival_is_fitted_to_noisy_streams_that_agree(wander, monkeypatch):
 
     monkeypatch.setattr(hypotheses, "fit_similarity", counted)
     assert grave(check_streams(*drive(1, noise=0.02, wander=wander))) == []
-    assert [EXPLAINED < fit.unexplained < hypotheses.HOLDS for fit in fits] == [True]
+    assert EXPLAINED < fits[0].unexplained < hypotheses.HOLDS
+    assert len(fits) > 1
 
 
 @pytest.mark.parametrize("centred", ["parent", "child"])
