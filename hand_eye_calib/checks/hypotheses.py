@@ -211,6 +211,7 @@ _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child
 _PLAIN = _ALL_WAYS[0]
 
 
+_INVERSE = [Hypothesis(child=("inverse",)), Hypothesis(parent=("inverse",))]
 # Those that invert both streams besides fit as well, over longer paths.
 _USUAL = [
     *(each for each in _ALL_WAYS[1:] if ("inverse", "both") not in each.mistakes),
@@ -253,7 +254,9 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         except NotEnoughDataError as error:
             too_few = error
             continue
-        chosen = _or_rival(plain, _USUAL, streams, lag_s, _NOISY if thorough else HOLDS)
+        # Streams that nearly agree may still be of an arm, one with inverse poses.
+        rivals = _INVERSE if plain.holds else _USUAL
+        chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
         if chosen is plain and not plain.holds:
             # A body that rotates about one of its sensors: that one's translations are noise.
             in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
