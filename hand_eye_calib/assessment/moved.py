@@ -295,10 +295,10 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
         splits = np.arange(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
         before = [np.cumsum(each, axis=0)[splits - 1] for each in (H_of, S_of)]
         sides = before, [H_of.sum(axis=0) - before[0], S_of.sum(axis=0) - before[1]]
-        answers = np.stack([(_inverse(one) @ two[..., None])[..., 0] for one, two in sides], axis=1)
+        answers = np.stack([se3.times(_inverse(one), two) for one, two in sides], axis=1)
         is_after = (np.arange(len(edges)) >= splits[:, None]).astype(int)
         own = answers[np.arange(len(splits))[:, None], is_after]
-        rests = S_of - (H_of @ own[..., None])[..., 0]
+        rests = S_of - se3.times(H_of, own)
         # Mean of S' H^-1 S of scores about two answers, per degree of freedom.
         seen = np.trace(H_of, axis1=1, axis2=2) > 0
         squared = squared_shift(H_of[seen], rests[:, seen], 1e-6).sum(axis=1)
@@ -380,7 +380,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     joint = max(misfit, 1.0) * (before.covariance + after.covariance)[known, :6, :6]
     steps = (after.step - before.step)[known, :6]
     H = np.linalg.inv(joint)
-    S = (H @ steps[:, :, None])[:, :, 0]
+    S = se3.times(H, steps)
     ratios = log_ratio(H, S)
     found = _probability(ratios)
     if found < _LEAST_PROBABILITY:
@@ -390,7 +390,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     spread = found * squared / 4.0
     beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
-    if _probability(log_ratio(beside, (beside @ steps[:, :, None])[:, :, 0])) < 0.5:
+    if _probability(log_ratio(beside, se3.times(beside, steps))) < 0.5:
         return PossibleShift(spread, ())
     best = int(np.argmax(ratios))
     share, xi = int(cuts[known][best]) / len(products), shifts[best]

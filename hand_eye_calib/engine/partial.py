@@ -112,7 +112,7 @@ def _steps(
     excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
     along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
     return Residuals(
-        translation=(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ along[:, :, None])[:, :, 0],
+        translation=se3.times(np.swapaxes(poses[:-1, :3, :3], 1, 2), along),
         rotation=np.zeros((len(steps), 3)),
         weights=(~(solution.jumps | solution.spikes[1:])).astype(float),
         start_ns=stamps_ns[:-1],

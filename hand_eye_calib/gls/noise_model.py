@@ -184,7 +184,7 @@ class NoiseModel:
         for process in self.slow:
             if process.kind != "scale":
                 directions = _directions(process, streams, to_child)
-                error += (directions @ states[:, start : start + 3, None])[:, :, 0]
+                error += se3.times(directions, states[:, start : start + 3])
             start += 1 if process.kind == "scale" else 3
         return error
 

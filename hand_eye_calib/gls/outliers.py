@@ -165,7 +165,7 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     poses in inverse proportion to their weights.
     """
     states = posterior.states_after(posterior.normal.step)[:, :WHITE]
-    pulled = (posterior.white @ states[:, :, None])[:, :, 0]
+    pulled = se3.times(posterior.white, states)
     squares = (states * pulled).sum(axis=1)
     weights, free = posterior.space.weights, posterior.space.weights == 0.0
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)

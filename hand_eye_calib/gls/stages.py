@@ -75,7 +75,7 @@ class Problem:
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
     # The fit whose posterior of all poses was asked for last, and that posterior. It is large.
-    _last: list[tuple[dict[str, object], Posterior]] = field(default_factory=list)
+    _last: list[tuple[Fit, Posterior]] = field(default_factory=list)
 
     def known(self, fit: Fit) -> FloatArray:
         """Products (p + 1, p + 1) that what is known of the parameters beforehand adds."""
@@ -105,13 +105,9 @@ class Problem:
 
     def posterior(self, fit: Fit) -> Posterior:
         """Of all poses."""
-        # It does not depend on what the fit says of the stages to come.
-        of_fit = {**vars(fit), "has_heavy_tails": None}
-        if not self._last or any(
-            value is not of_fit[name] for name, value in self._last[0][0].items()
-        ):
+        if not self._last or self._last[0][0] is not fit:
             self._last.clear()
-            self._last.append((of_fit, Posterior(self.space(fit), fit.levels)))
+            self._last.append((fit, Posterior(self.space(fit), fit.levels)))
         return self._last[0][1]
 
     def is_noisy(self, fit: Fit) -> bool:

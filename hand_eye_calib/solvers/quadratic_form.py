@@ -173,7 +173,7 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
         gradient = np.where(better[:, None], trial_gradient, gradient)
         value = np.where(better, trial_value, value)
     vectors = np.append(rotation.reshape(-1, 9), np.ones((len(rotation), 1)), axis=1)
-    translation = -(to_translation @ vectors[:, :, None])[:, :, 0]
+    translation = -se3.times(to_translation, vectors)
     Ts = se3.from_rotation_translation(rotation, translation)
     return Ts, value + constant, converged
 
@@ -239,7 +239,7 @@ def _derivatives(
     """
     S, linear = reduced[:, :9, :9], reduced[:, :9, 9]
     flat = rotation.reshape(-1, 9)
-    S_flat = (S @ flat[:, :, None])[:, :, 0]
+    S_flat = se3.times(S, flat)
     value = ((S_flat + 2 * linear) * flat).sum(axis=1)
     product = np.swapaxes(rotation, 1, 2) @ (S_flat + linear).reshape(-1, 3, 3)
     gradient = 2 * se3.vee(product)

@@ -260,7 +260,7 @@ def _linearise(
     jacobian = np.concatenate([by_X, -se3.adjoint(se3.inverse(predicted))], axis=2)
     if in_world:
         moved = se3.adjoint(stops.Ts_world_child)
-        errors, jacobian = (moved @ errors[..., None])[..., 0], moved @ jacobian
+        errors, jacobian = se3.times(moved, errors), moved @ jacobian
     return errors, jacobian
 
 
