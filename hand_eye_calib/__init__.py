@@ -21,7 +21,7 @@ _HOMES = {
     "Reason": "results.verdict",
     "Residuals": "results.records",
     "RigCalibration": "rig.calibrate",
-    "SolveStatus": "results.status",
+    "SolveStatus": "results.records",
     "Trajectory": "geometry.trajectory",
     "Verdict": "results.verdict",
     "calibrate": "engine.offline",
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from hand_eye_calib.report.figures import plot as plot
     from hand_eye_calib.results.calibration import Calibration as Calibration
     from hand_eye_calib.results.records import Residuals as Residuals
-    from hand_eye_calib.results.status import SolveStatus as SolveStatus
+    from hand_eye_calib.results.records import SolveStatus as SolveStatus
     from hand_eye_calib.results.verdict import Reason as Reason
     from hand_eye_calib.results.verdict import Verdict as Verdict
     from hand_eye_calib.rig.calibrate import RigCalibration as RigCalibration

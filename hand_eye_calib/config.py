@@ -7,10 +7,9 @@ the documentation are made from these dataclasses or tested against them.
 import math
 from collections.abc import Collection
 from dataclasses import InitVar, dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.methods import BACKENDS, METHODS
 from hand_eye_calib.option import OptionSet, option
 from hand_eye_calib.text import (
     AXIS_UNITS,
@@ -36,6 +35,37 @@ POSE_TYPES = (
     *(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform")),
     *("sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped"),
 )
+
+BACKENDS = ("fast", "ipopt")
+
+
+class MethodRecord(NamedTuple):
+    """What other code has to know about a method: it solves the motion pairs of a reference alone,
+    or (False) uses the pose stream as a whole; outliers are left out, so that a few jumps of a
+    stream hardly change the answer; and the values of the option ``backend`` that it takes.
+    """
+
+    uses_reference: bool = True
+    rejects_outliers: bool = False
+    backends: tuple[str, ...] = BACKENDS[:1]
+
+
+METHODS = {
+    "auto": MethodRecord(uses_reference=False, rejects_outliers=True),
+    "dnlo": MethodRecord(rejects_outliers=True, backends=BACKENDS),
+    "dnl": MethodRecord(backends=BACKENDS),
+    **dict.fromkeys(("park", "taylor", "zhuang", "ali"), MethodRecord()),
+    "adaptive": MethodRecord(uses_reference=False, rejects_outliers=True),
+}
+
+
+def require_backend(method: str, backend: str) -> None:
+    """Check that a method has a backend; otherwise a ConfigError names those that have."""
+    if backend not in METHODS[method].backends:
+        able = [name for name, record in METHODS.items() if backend in record.backends]
+        raise ConfigError(
+            f"method {method} has no {backend} backend; only {' and '.join(able)} have"
+        )
 
 
 def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:

@@ -78,15 +78,6 @@ def with_sigma(value: float | None, sigma: float | None, least_decimals: int = 2
     return f"{fixed(value, decimals)} +/- {fixed(sigma, decimals)}"
 
 
-def printed_angle(degrees: float | None, sigma: float | None) -> str:
-    """An angle and its standard deviation; near gimbal lock roll and yaw are known and have none of
-    their own.
-    """
-    return (
-        fixed(degrees, 2) if degrees is not None and sigma is None else with_sigma(degrees, sigma)
-    )
-
-
 def fixed(value: float, decimals: int = 4) -> str:
     """A number with so many decimals, and no minus before a zero."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}"

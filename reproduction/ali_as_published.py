@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers.dnl import residual_rows
-from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.solvers.all_pairs import Solution, residual_rows
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _MAX_ITERATIONS = 300

@@ -18,7 +18,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.trajectory_files.reading import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.solvers import park
+from hand_eye_calib.solvers import all_pairs
 from reproduction.metrics import Errors
 
 METHODS = ("ali", "dnl", "dnlo", "park", "taylor", "zhuang")
@@ -261,7 +261,7 @@ def _match_runs(
         published = np.array([row.T_parent_child for row in results["park", "B1"]])
         ours = np.array(
             [
-                park.solve(motion_pairs(parent.poses, child.poses, "B1")).T_parent_child
+                all_pairs.solve_park(motion_pairs(parent.poses, child.poses, "B1")).T_parent_child
                 for _, parent, child, _ in runs
             ]
         )

@@ -13,7 +13,7 @@ import pandas as pd
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import dnl, dnlo
+from hand_eye_calib.solvers import all_pairs, dnlo
 from hand_eye_calib.solvers.registry import Method
 from reproduction import ali_as_published
 from reproduction.metrics import Errors, errors
@@ -120,7 +120,7 @@ def _objective(method: str, pairs: MotionPairs, T_parent_child: FloatArray) -> f
     """Cost of an answer by the formula of dnl and dnlo; None for the other methods."""
     if method not in ("dnl", "dnlo"):
         return None
-    costs = dnl.pair_costs(pairs, T_parent_child)
+    costs = all_pairs.pair_costs(pairs, T_parent_child)
     if method == "dnl":
         return float(costs.sum())
     options = CalibratorConfig()

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hand_eye_calib.assessment.excitation import Excitation
-from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.assessment.excitation import Excitation, LeverArms
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import (
     Calibration,

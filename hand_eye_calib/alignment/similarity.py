@@ -25,7 +25,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
-from hand_eye_calib.solvers import dnl, quadratic_form
+from hand_eye_calib.solvers import all_pairs, quadratic_form
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
 # Starts: so many random subsets of each of these sizes, of so many pairs; and how many starts are
@@ -253,7 +253,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
     matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
     guesses = list(zip(forms, se3.nearest_rotation(matrices), strict=True))
-    guesses += [(forms[0], rotation) for rotation in dnl.start_rotations(ranked)]
+    guesses += [(forms[0], rotation) for rotation in all_pairs.start_rotations(ranked)]
     candidates = [_with_translation(form, rotation) for form, rotation in guesses]
     coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.

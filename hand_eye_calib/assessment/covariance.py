@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.assessment.lever_arm import (
+from hand_eye_calib.assessment.excitation import (
     HIDDEN_SHARE,
     MIN_SHARE,
     ROUNDING_ANGLE,
@@ -29,8 +29,8 @@ from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
 from hand_eye_calib.gls.normal import NormalEquations, answers_without
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
-from hand_eye_calib.results.status import AXES, ROTATIONS, DofObservability, DofVerdict
-from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.results.records import AXES, ROTATIONS, DofObservability, DofVerdict
+from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.stats import CHI2
 
 # (B, K) mask of the pairs to leave out to the answers (B, 4, 4) without them.
@@ -184,7 +184,7 @@ def noise_driven(
     rotation_variance : callable
         Variance (rad^2) per axis of the rotation noise over so many increments.
     least_share : float
-        See :meth:`~hand_eye_calib.assessment.lever_arm.LeverArms.hidden_directions`.
+        See :meth:`~hand_eye_calib.assessment.excitation.LeverArms.hidden_directions`.
     """
     longest = max(len(Ts_pw_p) // _BLOCKS, 1)
     rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])

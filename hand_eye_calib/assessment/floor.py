@@ -13,7 +13,7 @@ sees, which is far where a vehicle is fast: on roads, centres are 6 to 14 cm off
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.lever_arm import weighted_products
+from hand_eye_calib.assessment.excitation import weighted_products
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.stats import median

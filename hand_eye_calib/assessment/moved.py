@@ -34,7 +34,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.stats import (
     CHI2,
     LARGEST_OF_SIX,

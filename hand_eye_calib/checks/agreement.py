@@ -15,7 +15,7 @@ from hand_eye_calib.checks.response import Fitted, Regression, delays, response
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between, pairs_over
-from hand_eye_calib.solvers.park import align_rotation_vectors
+from hand_eye_calib.solvers.all_pairs import align_rotation_vectors
 from hand_eye_calib.stats import median, quantile
 from hand_eye_calib.text import angle, length, listing
 

@@ -25,7 +25,7 @@ from hand_eye_calib.alignment.time_offset import (
     refine_time_offset,
 )
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.assessment.excitation import LeverArms
 from hand_eye_calib.checks.agreement import (
     Known,
     check_agreement,

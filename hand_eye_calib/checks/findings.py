@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.methods import METHODS
+from hand_eye_calib.config import METHODS, CalibratorConfig
 from hand_eye_calib.results.records import Finding, Severity, gravest_first
 
 __all__ = ["Finding", "Severity", "answered", "finding", "graded", "gravest_first"]

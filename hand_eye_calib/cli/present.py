@@ -19,8 +19,8 @@ from hand_eye_calib.cli.console import (
 )
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
-from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
+from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import listing
 
@@ -105,18 +105,17 @@ def as_lines(
     installed; with details also quaternions, and how it was solved.
     """
     parent, child = calibration.parent_frame, calibration.child_frame
-    document = calibration.to_dict()
-    lines = [*verdict_lines(calibration)]
+    transforms, lines = transforms_of(calibration), [*verdict_lines(calibration)]
     for source, target, name in (
         (child, parent, "T_parent_child"),
         (parent, child, "T_child_parent"),
         (calibration.child_world_frame, calibration.parent_world_frame, "T_world_world"),
         (child, calibration.base_frame, "T_base_child"),
     ):
-        if document.get(name):
+        if name in transforms:
             reach = () if name == "T_world_world" else calibration.out_of_reach
             lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
-            lines += transform_lines(document[name], reach, with_details)
+            lines += transform_lines(transforms[name], reach, with_details)
     lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
     if command := calibration.static_transform_command():
         by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
@@ -198,6 +197,7 @@ def transform_lines(
     for metres, degrees in zip(*columns, strict=True):
         yield f"  {metres:<30}  {degrees}".rstrip()
     if with_quaternion:
-        named = zip("xyzw", transform["quat_xyzw"] or (), strict=False)
-        quaternion = " ".join(f"{name} {value:.6f}" for name, value in named)
-        yield f"  quaternion {quaternion or 'unknown'}"
+        quat, words = transform["quat_xyzw"], ["unknown"]
+        if quat is not None:
+            words = [f"{name} {value:.6f}" for name, value in zip("xyzw", quat, strict=True)]
+        yield f"  quaternion {' '.join(words)}"

@@ -9,6 +9,7 @@ from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.results.document import transforms_of
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
@@ -71,7 +72,7 @@ def as_lines(rig: "RigCalibration") -> list[str]:
     for each in rig.calibrations:
         first, *others = verdict_lines(each)
         lines += [f"{each.child_frame} in {each.parent_frame}: {first}", *others]
-        lines += [*transform_lines(each.to_dict()["T_parent_child"]), ""]
+        lines += [*transform_lines(transforms_of(each)["T_parent_child"]), ""]
     lines += ["Results for two sensors at a time"]
     for one in rig.closures:
         lines += wrapped(one.sentence, "  ", "    ")

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.config import METHODS, CalibratorConfig
 from hand_eye_calib.engine.estimation import Solved, solve_poses
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry.extrinsic import deviation
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.records import AxisScatter, CrossCheck
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES, AxisScatter, CrossCheck
 from hand_eye_calib.stats import MEDIAN_NORMAL, median
 
 # A result is compared with the method that takes least time, at these baselines, from at most and

@@ -16,18 +16,17 @@ from hand_eye_calib.assessment.covariance import Assessment, assess, assess_adap
 from hand_eye_calib.assessment.floor import common_mode_floor, floor_of_pairs, usual_speed
 from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.config import CalibratorConfig, require_backend
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC
-from hand_eye_calib.methods import require_backend
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import Residuals
+from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.solvers.registry import Method
-from hand_eye_calib.solvers.solution import Solution
 from hand_eye_calib.text import parse_targets
 
 # Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both

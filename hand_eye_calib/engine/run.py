@@ -19,13 +19,12 @@ from hand_eye_calib.checks.check import (
     unseen,
 )
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.config import METHODS, CalibratorConfig
 from hand_eye_calib.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 
 #: Called with the share that is done, 0 to 1, and the step that begins.
 Progress: TypeAlias = Callable[[float, str], None]

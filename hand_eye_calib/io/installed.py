@@ -22,7 +22,7 @@ from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.yaml_files import read_yaml
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.exports import arranged, formats
-from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.text import parse_pose
 
 # Results say what they are.

@@ -17,7 +17,7 @@ from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import transform_arguments, usable_angles, usable_numbers
-from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.version import package_version
 
 FILE_NAME = "extrinsic.yaml"

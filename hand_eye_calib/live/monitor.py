@@ -38,7 +38,7 @@ from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.session.together import SEEN_TARGETS
 from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
 from hand_eye_calib.text import axes_in_words

@@ -12,7 +12,7 @@ from enum import Enum, IntEnum
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.context import Comparison, Progress
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 
 # The node says how it is so often (s). A disk, a solve under way and who listens may each hold up
 # its end for so long (s).

@@ -22,8 +22,8 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.report.figures import LOOK, figure_of_views, figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import printed_numbers, summary, usable_numbers
-from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
+from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.rig.calibrate import RigCalibration
 from hand_eye_calib.text import (
@@ -149,7 +149,8 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
         rig=rig,
         inputs=inputs,
         poses=[
-            printed_numbers(each.to_dict()["T_parent_child"], (), "±") for each in rig.calibrations
+            printed_numbers(transforms_of(each)["T_parent_child"], (), "±")
+            for each in rig.calibrations
         ],
         figures=[figure_of_views(rig.calibrations)],
     )

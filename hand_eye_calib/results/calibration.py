@@ -13,8 +13,8 @@ from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, transform_arguments, values_of
+from hand_eye_calib.results.records import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
 from hand_eye_calib.text import AXIS_UNITS
 from hand_eye_calib.upstairs import upstairs

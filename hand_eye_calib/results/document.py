@@ -9,16 +9,16 @@ from typing import Any, cast, get_type_hints
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.config import METHODS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_rpy, sigmas_translation
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
-from hand_eye_calib.methods import METHODS
 from hand_eye_calib.plain import from_plain, plain
+from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
-from hand_eye_calib.text import fixed, given_or_estimated, listing, printed_angle, with_sigma
+from hand_eye_calib.text import fixed, given_or_estimated, listing, with_sigma
 
 # Format and version of a document. A change that an older reader cannot understand raises the
 # version.
@@ -38,12 +38,7 @@ _SHARED = 0.02
 
 def document_of(result: Result) -> dict[str, Any]:
     """The document of a result; see ``Calibration.to_dict``."""
-    T, parent, child = result.T_parent_child, result.parent_frame, result.child_frame
-    own, found = (result.covariance, result.floor), reasons(result)
-    exchanged = tuple(inverse_covariance(T, each) for each in own)
-    # Where the rotation is out of reach, the axes of both sensors are the same by convention.
-    has_same_axes = {*ROTATIONS} <= {*result.out_of_reach}
-    of_inverse = result.sigmas[:3] if has_same_axes else None
+    parent, child, found = result.parent_frame, result.child_frame, reasons(result)
     document: dict[str, Any] = {
         "verdict": verdict_of(found),
         "headline": headline(result, found),
@@ -51,10 +46,7 @@ def document_of(result: Result) -> dict[str, Any]:
         **_FORMAT,
         "parent_frame": parent,
         "child_frame": child,
-        "T_parent_child": _printed(result, T, (parent, child), own, result.sigmas[:3]),
-        "T_child_parent": _printed(
-            result, result.T_child_parent, (child, parent), exchanged, of_inverse
-        ),
+        **transforms_of(result),
         "status": result.status,
         "covariance": _matrix_of("error xi in T_parent_child @ exp(xi)", child, result.covariance)
         | {"order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]},
@@ -63,17 +55,12 @@ def document_of(result: Result) -> dict[str, Any]:
             for dof, total in zip(result.observability, result.sigmas_with_floor, strict=True)
         ],
     }
-    if result.T_base_child is not None:
-        frames = result.base_frame, child
-        document["T_base_child"] = _printed(result, result.T_base_child, frames, own)
     if result.T_method is not None:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
         document["T_method"] = {"of": of, "matrix": result.T_method}
-    if (Z := result.T_world_world) is not None and (cov := result.cov_world_world) is not None:
-        worlds = result.parent_world_frame, result.child_world_frame
-        document["T_world_world"] = _printed(result, Z, worlds, (cov, np.zeros((6, 6))))
-        of = "error xi in T_world_world @ exp(xi)"
-        document["cov_world_world"] = _matrix_of(of, worlds[1], cov)
+    if result.cov_world_world is not None:
+        of, world = "error xi in T_world_world @ exp(xi)", result.child_world_frame
+        document["cov_world_world"] = _matrix_of(of, world, result.cov_world_world)
     of = "errors of a whole recording, the same in every part; not in the covariance"
     document["floor"] = _matrix_of(of, child, result.floor)
     document["sigma_total"] = dict(zip(AXES, result.sigmas_with_floor, strict=True))
@@ -83,37 +70,49 @@ def document_of(result: Result) -> dict[str, Any]:
     return cast(dict[str, Any], plain(document))
 
 
-def _printed(
-    result: Result,
-    T_target_source: FloatArray,
-    frames: tuple[str, str],
-    covariances: tuple[FloatArray, ...],
-    sigmas_m: FloatArray | None = None,
-) -> dict[str, Any]:
-    """A transform between frames (target, source) in the notations people and programs use, with
-    the standard deviation of each number that is printed, without and with the common-mode
-    uncertainty, from both covariances; infinite, and no number, for what is unknown.
+def transforms_of(result: Result) -> dict[str, dict[str, Any]]:
+    """The transforms of a result by their names, each with source and target frame, in the
+    notations that people and programs use, and with the standard deviation of each number that is
+    printed, without and with the common-mode uncertainty; infinite, and no number, for what is
+    unknown.
     """
-    sigmas, of_floor = (sigmas_rpy(T_target_source, each) for each in covariances)
-    along, floor_m = (sigmas_translation(T_target_source, each) for each in covariances)
-    if sigmas_m is None:
-        is_unsure = bool(result.unobservable()) or covariances[0] is result.cov_world_world
-        sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
-    is_turn_known = not {*ROTATIONS} & {*result.unobservable()}
-    # Near gimbal lock roll and yaw have no standard deviation and are known.
-    known = np.isfinite(sigmas) | is_turn_known
-    rpy = se3.rotation_to_rpy(T_target_source[:3, :3])
-    return {
-        "maps": f"coordinates of {frames[1]} into {frames[0]}",
-        "translation": np.where(np.isfinite(sigmas_m), T_target_source[:3, 3], np.nan),
-        "sigma_translation": sigmas_m,
-        "sigma_total_translation": np.hypot(sigmas_m, floor_m),
-        "quat_xyzw": se3.to_quat_xyzw(T_target_source) if is_turn_known else None,
-        "rpy_deg": np.degrees(np.where(known, rpy, np.nan)),
-        "sigma_rpy_deg": np.degrees(sigmas),
-        "sigma_total_rpy_deg": np.degrees(np.hypot(sigmas, of_floor)),
-        "matrix": T_target_source,
+    T, parent, child = result.T_parent_child, result.parent_frame, result.child_frame
+    own = result.covariance, result.floor
+    exchanged = [inverse_covariance(T, each) for each in own]
+    known_m, hidden = result.sigmas[:3], {*result.unobservable()}
+    # Where the rotation is out of reach, the axes of both sensors are the same by convention.
+    of_inverse_m = known_m if {*ROTATIONS} <= {*result.out_of_reach} else None
+    found: dict[str, Any] = {
+        "T_parent_child": (T, child, parent, own, known_m),
+        "T_child_parent": (result.T_child_parent, parent, child, exchanged, of_inverse_m),
     }
+    if result.T_base_child is not None:
+        found["T_base_child"] = (result.T_base_child, child, result.base_frame, own, None)
+    if result.T_world_world is not None and result.cov_world_world is not None:
+        worlds = result.child_world_frame, result.parent_world_frame
+        of_worlds = result.cov_world_world, np.zeros((6, 6))
+        found["T_world_world"] = (result.T_world_world, *worlds, of_worlds, None)
+    for name, (T, source, target, covariances, sigmas_m) in found.items():
+        sigmas, of_floor = (sigmas_rpy(T, each) for each in covariances)
+        along, floor_m = (sigmas_translation(T, each) for each in covariances)
+        if sigmas_m is None:
+            is_unsure = bool(hidden) or name == "T_world_world"
+            sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
+        is_turn_known = not {*ROTATIONS} & hidden
+        # Near gimbal lock roll and yaw have no standard deviation and are known.
+        known = np.isfinite(sigmas) | is_turn_known
+        found[name] = {
+            "maps": f"coordinates of {source} into {target}",
+            "translation": np.where(np.isfinite(sigmas_m), T[:3, 3], np.nan),
+            "sigma_translation": sigmas_m,
+            "sigma_total_translation": np.hypot(sigmas_m, floor_m),
+            "quat_xyzw": se3.to_quat_xyzw(T) if is_turn_known else None,
+            "rpy_deg": np.degrees(np.where(known, se3.rotation_to_rpy(T[:3, :3]), np.nan)),
+            "sigma_rpy_deg": np.degrees(sigmas),
+            "sigma_total_rpy_deg": np.degrees(np.hypot(sigmas, of_floor)),
+            "matrix": T,
+        }
+    return found
 
 
 def _matrix_of(of: str, frame: str, matrix: FloatArray) -> dict[str, Any]:
@@ -160,8 +159,14 @@ def printed_numbers(
             found[listing(axes)] = "not estimated"
             continue
         for axis, value, sigma in zip(axes, transform[values], transform[sigmas], strict=True):
-            text = with_sigma(value, sigma, 3) if unit == "m" else printed_angle(value, sigma)
-            found[axis] = text if text == "unknown" else f"{text.replace('+/-', sign)} {unit}"
+            known = [each for each in (value, sigma) if each is not None and np.isfinite(each)]
+            if not known:
+                found[axis] = "unknown"
+            elif len(known) < 2:  # near gimbal lock
+                found[axis] = f"{fixed(value, 2)} {unit}"
+            else:
+                text = with_sigma(value, sigma, 3 if unit == "m" else 2).replace("+/-", sign)
+                found[axis] = f"{text} {unit}"
     return found
 
 

@@ -18,8 +18,8 @@ import yaml
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import AXES
 from hand_eye_calib.text import axes_in_words
 from hand_eye_calib.version import package_version
 

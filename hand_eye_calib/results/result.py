@@ -12,14 +12,17 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.results.records import (
+    AXES,
     ClockRate,
     CrossCheck,
+    DofObservability,
+    DofVerdict,
     Finding,
     Noise,
     RateBias,
     Residuals,
+    SolveStatus,
 )
-from hand_eye_calib.results.status import AXES, DofObservability, DofVerdict, SolveStatus
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

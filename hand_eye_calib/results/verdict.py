@@ -11,10 +11,15 @@ from enum import Enum
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
-from hand_eye_calib.methods import METHODS
-from hand_eye_calib.results.records import Severity
+from hand_eye_calib.config import METHODS
+from hand_eye_calib.results.records import (
+    ROTATIONS,
+    TRANSLATIONS,
+    DofVerdict,
+    Severity,
+    SolveStatus,
+)
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.status import ROTATIONS, TRANSLATIONS, DofVerdict, SolveStatus
 from hand_eye_calib.text import amount, axes_in_words, listing
 
 

@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from hand_eye_calib.live.state import GRACE_S, NodeState
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.status import AXES, ROTATIONS
+from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.ros.conversions import LATCHED, to_pose_with_covariance, to_time, to_transform
 from hand_eye_calib.text import in_words
 

@@ -22,7 +22,7 @@ from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.status import AXES, ROTATIONS
+from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.ros.conversions import LATCHED, LISTENING, from_transform, quick, to_transform
 from hand_eye_calib.session.together import with_comparison
 from hand_eye_calib.text import axes_in_words

@@ -26,7 +26,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import deviation
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.text import amount, axes_in_words, listing
 
 # A direction with a larger standard deviation (m, rad) is unknown; its variance then.

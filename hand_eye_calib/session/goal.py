@@ -14,7 +14,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.context import AxisProgress, Progress
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.results.verdict import what_is_known
 from hand_eye_calib.text import axes_in_words, duration
 

@@ -26,7 +26,7 @@ from hand_eye_calib.results.context import (
     Recorded,
     Together,
 )
-from hand_eye_calib.results.status import AXES, DofVerdict, SolveStatus
+from hand_eye_calib.results.records import AXES, DofVerdict, SolveStatus
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions
 from hand_eye_calib.text import listing

@@ -27,8 +27,8 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import dnl, quadratic_form
-from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.solvers import all_pairs, quadratic_form
+from hand_eye_calib.solvers.all_pairs import Solution
 
 # Largest number of pairs that is searched.
 _MAX_SEARCHED = 512
@@ -190,7 +190,7 @@ class _Search:
     def best(self, pairs: MotionPairs) -> FloatArray:
         """The annealed answer (4, 4), or a better rival."""
         total = self.condensed.sum(axis=0)
-        Ts = se3.from_rotation_translation(dnl.start_rotations(pairs), np.zeros(3))
+        Ts = se3.from_rotation_translation(all_pairs.start_rotations(pairs), np.zeros(3))
         for _ in range(_STEPS_OVER_ALL):
             Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
         near_all = Ts[[int(np.argmin(quadratic_form.monomials(Ts) @ total))]]

@@ -13,8 +13,8 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import MissingDependencyError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import dnl, dnlo
-from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.solvers import dnlo
+from hand_eye_calib.solvers.all_pairs import Solution, pair_costs
 
 try:
     import casadi
@@ -30,11 +30,11 @@ _IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
-    """Minimise eq. (4) from the identity; see :func:`hand_eye_calib.solvers.dnl.solve`."""
+    """Minimise eq. (4) from the identity; see :mod:`hand_eye_calib.solvers.all_pairs`."""
     pose = casadi.MX.sym("pose", 6)
     problem = {"x": pose, "f": casadi.sum2(_cost_expressions(pairs, pose))}
     T_parent_child, settled = _minimum(problem, 0)
-    objective = float(dnl.pair_costs(pairs, T_parent_child).sum())
+    objective = float(pair_costs(pairs, T_parent_child).sum())
     return Solution(T_parent_child, objective, settled, np.ones(len(pairs)))
 
 
@@ -59,7 +59,7 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
         lbg=floor,
         ubg=np.inf,
     )
-    weights, objective = dnlo.truncate(dnl.pair_costs(pairs, T_parent_child), threshold, floor)
+    weights, objective = dnlo.truncate(pair_costs(pairs, T_parent_child), threshold, floor)
     return Solution(T_parent_child, float(objective), settled, weights)
 
 

@@ -6,21 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.config import METHODS, CalibratorConfig, require_backend
 from hand_eye_calib.errors import ConfigError, NotEnoughDataError
-from hand_eye_calib.methods import METHODS, require_backend
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import certificate, dnl, dnlo, park, quadratic_form, zhuang
-from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.solvers import all_pairs, certificate, dnlo, quadratic_form, zhuang
+from hand_eye_calib.solvers.all_pairs import Solution
 
 # Of pairs, and of a threshold and the least share of inliers if they reject outliers.
 _SOLVERS: dict[str, Callable[..., Solution]] = {
     "dnlo": dnlo.solve,
-    "dnl": dnl.solve,
-    "park": park.solve,
-    "taylor": park.solve,
+    "dnl": all_pairs.solve_dnl,
+    "park": all_pairs.solve_park,
+    "taylor": all_pairs.solve_park,
     "zhuang": zhuang.solve,
-    "ali": dnl.solve_ali,
+    "ali": all_pairs.solve_ali,
 }
 
 
@@ -31,7 +30,7 @@ class Method:
     Parameters
     ----------
     name : str
-        Name of a method in :data:`hand_eye_calib.methods.METHODS` that uses a reference.
+        Name of a method in :data:`hand_eye_calib.config.METHODS` that uses a reference.
     threshold : float
         c of eq. (5), in m^2. Only dnlo uses it.
     min_inlier_fraction : float

@@ -25,8 +25,8 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import park
-from hand_eye_calib.solvers.solution import Solution
+from hand_eye_calib.solvers import all_pairs
+from hand_eye_calib.solvers.all_pairs import Solution
 
 _MAX_ITERATIONS, _STEP_TOLERANCE = 500, 1e-8
 
@@ -42,7 +42,7 @@ def solve(pairs: MotionPairs) -> Solution:
     """
     residual_of_products = _condense(pairs)
     parameters, objective, settled = _gauss_newton(residual_of_products, np.zeros(6))
-    near_park = _parameters(park.solve(pairs).T_parent_child)
+    near_park = _parameters(all_pairs.solve_park(pairs).T_parent_child)
     _, elsewhere, _ = _gauss_newton(residual_of_products, near_park)
     rounding = _ROUNDING**2 * float((residual_of_products**2).sum())
     lowest = objective <= elsewhere / (1 - _LOWER) + rounding
@@ -59,7 +59,7 @@ def _gauss_newton(
     for _ in range(_MAX_ITERATIONS):
         products, derivative = _products(parameters)
         rows, values = residual_of_products @ derivative, -residual_of_products @ products
-        step = np.linalg.lstsq(rows, values, rcond=park.RANK_TOLERANCE)[0]
+        step = np.linalg.lstsq(rows, values, rcond=all_pairs.RANK_TOLERANCE)[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
         if settled:

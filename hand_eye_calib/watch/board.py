@@ -20,7 +20,7 @@ from hand_eye_calib.live.state import (
     SavedState,
 )
 from hand_eye_calib.results.context import Comparison
-from hand_eye_calib.results.status import AXES, ROTATIONS
+from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.stats import LARGEST_OF_SIX
 from hand_eye_calib.text import amount, capital, change, duration, fixed, two_digits
 

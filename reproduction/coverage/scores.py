@@ -14,7 +14,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import absolute_errors, deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from reproduction.coverage import classes
 from reproduction.coverage.measures import COVERAGE, Row
 from reproduction.published import load_simulated, path_to

@@ -5,8 +5,7 @@ import dataclasses
 import pytest
 from ros_harness import RELIABLE_INPUTS, drive
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.methods import METHODS
+from hand_eye_calib.config import METHODS, CalibratorConfig, NodeConfig
 from hand_eye_calib.option import option_name
 
 FIELDS = {

@@ -13,8 +13,7 @@ from hand_eye_calib.simulation.options import NoiseConfig
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
-GROUND = {"errors", "text", "config", "methods", "arrays", "stats", "plain", "version"}
-GROUND |= {"upstairs", "option"}
+GROUND = {"errors", "text", "config", "arrays", "stats", "plain", "version", "upstairs", "option"}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
@@ -23,9 +22,8 @@ ENGINE = {
     "version": set(),
     "upstairs": set(),
     "text": {"errors"},
-    "methods": {"errors"},
     "option": {"errors", "text"},
-    "config": {"errors", "methods", "text", "option"},
+    "config": {"errors", "text", "option"},
     "geometry": GROUND,
     "results": GROUND | {"geometry"},
     "pairing": GROUND | {"geometry"},
@@ -132,7 +130,7 @@ def test_no_files_import_each_other_in_a_circle():
     [
         (
             "geometry/se3.py",
-            "def late():\n    from ..solvers import dnl",
+            "def late():\n    from ..solvers import dnlo",
             "geometry must not import solvers",
         ),
         ("errors.py", "from hand_eye_calib import calibrate", "errors must not import root"),

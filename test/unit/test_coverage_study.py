@@ -9,7 +9,7 @@ from result_making import calibration
 
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from reproduction.coverage import __main__ as study
 from reproduction.coverage import classes, motions
 from reproduction.coverage.bound import ideal_estimate

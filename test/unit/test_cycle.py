@@ -23,7 +23,7 @@ from hand_eye_calib.live.solving import Answer
 from hand_eye_calib.live.state import Level, NodeState
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 

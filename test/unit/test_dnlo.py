@@ -3,7 +3,7 @@ import pytest
 from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers import dnl, dnlo
+from hand_eye_calib.solvers import all_pairs, dnlo
 from hand_eye_calib.solvers.registry import Method
 
 
@@ -41,11 +41,11 @@ def jumpy_pairs():
 def test_outliers_are_rejected_and_reported(jumpy_pairs):
     solution = dnlo.solve(jumpy_pairs, threshold=0.01, min_inlier_fraction=0.3)
     np.testing.assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=0.02)
-    costs = dnl.pair_costs(jumpy_pairs, solution.T_parent_child)
+    costs = all_pairs.pair_costs(jumpy_pairs, solution.T_parent_child)
     assert np.array_equal(solution.weights > 0.5, costs < 0.01)
     assert solution.converged
     # the same data without rejection is far off, so the test above is not idle
-    assert np.abs(dnl.solve(jumpy_pairs).T_parent_child - T_PARENT_CHILD).max() > 0.1
+    assert np.abs(all_pairs.solve_dnl(jumpy_pairs).T_parent_child - T_PARENT_CHILD).max() > 0.1
 
 
 def test_many_pairs_are_sampled_for_the_search_only():

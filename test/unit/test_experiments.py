@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.solvers import park
+from hand_eye_calib.solvers.all_pairs import solve_park
 from reproduction import comparison, metrics, results, runner
 from reproduction.__main__ import EXPERIMENTS, GROUPS, main
 from reproduction.published import REFERENCES
@@ -57,12 +57,12 @@ def test_rows_hold_the_errors_of_what_was_solved(rows):
     row = next(row for row in rows if row.items() >= wanted.items())
     case = SOURCE.cases("noise", 0.004)[1]
     pairs = case.pairs("B5")
-    expected = metrics.errors(pairs, park.solve(pairs).T_parent_child, case.T_parent_child)
+    expected = metrics.errors(pairs, solve_park(pairs).T_parent_child, case.T_parent_child)
     np.testing.assert_allclose(
         [row[metric] for metric in METRICS],
         np.array(expected) * [1, 180 / np.pi, 1, 180 / np.pi],
     )
-    np.testing.assert_array_equal(row["T_parent_child"], park.solve(pairs).T_parent_child.ravel())
+    np.testing.assert_array_equal(row["T_parent_child"], solve_park(pairs).T_parent_child.ravel())
     table = table_of([row])
     assert (table["case"][0], table["why"][0]) == ("noise/0.004/run_02", "")
     assert table["published_e_at"].isna().all()

@@ -15,8 +15,7 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.records import CorrelatedError, Noise
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES, CorrelatedError, Noise
 from hand_eye_calib.session.goal import Goal
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed
 
-from hand_eye_calib.assessment.excitation import excitation
-from hand_eye_calib.assessment.lever_arm import LeverArms
+from hand_eye_calib.assessment.excitation import LeverArms, excitation
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3

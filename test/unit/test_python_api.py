@@ -19,13 +19,12 @@ from motions import (
 )
 
 import hand_eye_calib as hec
-from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.config import BACKENDS, METHODS, CalibratorConfig
 from hand_eye_calib.engine.offline import prior_fields
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.methods import BACKENDS, METHODS
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers.dnl import pair_costs
+from hand_eye_calib.solvers.all_pairs import pair_costs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.text import AXIS_UNITS
 

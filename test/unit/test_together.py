@@ -17,7 +17,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.extrinsic import Extrinsic, deviation
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.results.status import AXES
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.session.agreement import agreement_of
 from hand_eye_calib.session.together import compare, together, with_comparison
 
