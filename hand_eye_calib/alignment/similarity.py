@@ -361,10 +361,7 @@ class _Problem:
                 moments += flat.T @ flat
             step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
-            rotation = T[:3, :3]
-            T = se3.from_rotation_translation(
-                rotation @ se3.rotation_exp(step[3:6]), T[:3, 3] + rotation @ step[:3]
-            )
+            T = se3.retracted(T, step[:6])
             scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
             if np.abs(np.r_[step[:3] / max(self.rms_a, 1e-9), step[3:]]).max() < _STEP_TOLERANCE:
                 break

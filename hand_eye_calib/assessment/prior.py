@@ -112,7 +112,7 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         apart = back @ (T[:3, 3] - T_parent_child[:3, 3]), se3.rotation_log(back @ T[:3, :3])
         deviations = inverse_root @ np.concatenate(apart) - targets
         step = -root @ np.linalg.solve(normal, deviations + jacobian.T @ residuals)
-        T = _moved(T, step)
+        T = se3.retracted(T, step)
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     if not prior:
@@ -166,20 +166,12 @@ def _whitened(
     return directions * sigmas, (directions / sigmas).T, targets
 
 
-def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
-    """A transform with a small deviation (rho, phi)."""
-    rotation = T[:3, :3]
-    return se3.from_rotation_translation(
-        rotation @ se3.rotation_exp(step[3:]), T[:3, 3] + rotation @ step[:3]
-    )
-
-
 def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """Weighted residuals (P,) of the prior and their derivatives (P, 6) by (rho, phi)."""
     residuals, jacobian = _weighted(T, prior), np.zeros((len(prior), 6))
     for column, step in enumerate(_SMALL * np.eye(6)):
         for sign in (-1, 1):
-            weighted = _weighted(_moved(T, sign * step), prior)
+            weighted = _weighted(se3.retracted(T, sign * step), prior)
             jacobian[:, column] += sign * weighted / (2 * _SMALL)
     return residuals, jacobian
 

@@ -9,7 +9,7 @@ wrong with them.
 4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -112,7 +112,8 @@ def check_streams(
     known : ((4, 4) array, (6,) array), optional
         An extrinsic of these streams, and its standard deviations.
     """
-    findings = _check_each(parent, child, max_gap_s, check_stream)
+    findings = check_stream(parent, "parent", max_gap_s)
+    findings += check_stream(child, "child", max_gap_s)
     if any(each.makes_unusable for each in findings):
         return CheckResult(gravest_first(findings))
     correlation = correlation or correlate_rates(parent, child, max_gap_s)
@@ -233,24 +234,12 @@ def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list
     """
     if not (parent.has_positions and child.has_positions):
         parent, child = parent.scaled(0.0), child.scaled(0.0)
-    findings = _check_each(parent, child, max_gap_s, check_positions)
+    findings = check_positions(parent, "parent", max_gap_s)
+    findings += check_positions(child, "child", max_gap_s)
     # Rounded positions stay the same while the sensor moves.
     if any(each.makes_unusable or each.code == "coarse_positions" for each in findings):
         return findings
     return [*findings, *check_lengths(parent), *check_frozen(parent, child)]
-
-
-def _check_each(
-    parent: Trajectory,
-    child: Trajectory,
-    max_gap_s: float,
-    check: Callable[[Trajectory, str, float], list[Finding]],
-) -> list[Finding]:
-    """Findings about two streams by a check of each alone."""
-    findings = []
-    for stream, trajectory in (("parent", parent), ("child", child)):
-        findings += check(trajectory, stream, max_gap_s)
-    return findings
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
@@ -266,18 +255,22 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
 
 def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     """A finding if the clocks differ by more than ``known_s``, which the child's stamps have."""
-    total_s = round(known_s + found.seconds, 4)
-    values: dict[str, Any] = {
-        "options": {"time_offset": total_s},
-        "total_s": total_s,
-        "offset_s": found.seconds,
-        "size_s": abs(found.seconds),
-        "sigma_s": found.sigma_s,
-        "direction": "behind" if found.seconds > 0 else "ahead of",
-        "beyond": f" beyond the {known_s:.4f} s that were added" if known_s else "",
-    }
+    values = offset_values(found.seconds, known_s) | {"sigma_s": found.sigma_s}
+    values["beyond"] = f" beyond the {known_s:.4f} s that were added" if known_s else ""
+    values["options"] = {"time_offset": values["total_s"]}
     offset = graded("time_offset", "child", found.seconds, found.sigma_s, **values)
     return [offset] if offset else []
+
+
+def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
+    """What findings say of the child's clock, which is off by this beside what is known."""
+    direction, total_s = "behind" if offset_s > 0 else "ahead of", round(known_s + offset_s, 4)
+    return {
+        "offset_s": offset_s,
+        "size_s": abs(offset_s),
+        "total_s": total_s,
+        "direction": direction,
+    }
 
 
 def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:

@@ -52,10 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         frames = results[0].parent_frame, results[0].child_frame
         with waiting_for(f"reading {arguments.installed}"):
             installed = open_installed(arguments.installed)(*frames)
-    names = told_apart(arguments.results)
-    if len({*names}) < len(names):
-        raise InputError(f"expected different results; got {', '.join(names)}")
-    found = compare(results, installed, names)
+    found = compare(results, installed, told_apart(arguments.results))
     print_result(_lines(found, results[0]), found if arguments.json else None)
     return {"same": 0, "moved": 4}.get(found.verdict, 3)
 

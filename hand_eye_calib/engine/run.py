@@ -16,6 +16,7 @@ from hand_eye_calib.checks.check import (
     check_offset,
     check_parts,
     check_streams,
+    offset_values,
     unseen,
 )
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
@@ -186,16 +187,10 @@ def _doubting(found: Run, doubts: Collection[Finding]) -> Run:
     """With findings about options that were set; a large offset that nobody gave is one."""
     offset_s = found.calibration.time_offset_s
     if "time_offset" in found.options and abs(offset_s) > UNASKED_S:
-        sizes: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
-        sizes |= {"total_s": round(offset_s, 4), "direction": _direction(offset_s)}
-        large = finding("large_time_offset", "child", **sizes)
+        large = finding("large_time_offset", "child", **offset_values(offset_s))
         doubts = [*doubts, *([] if large in found.calibration.findings else [large])]
     findings = gravest_first((*found.calibration.findings, *doubts))
     return replace(found, calibration=replace(found.calibration, findings=findings))
-
-
-def _direction(offset_s: float) -> str:
-    return "behind" if offset_s > 0 else "ahead of"
 
 
 def _saying(found: Run, options: Options, told: tuple[str, ...]) -> Run:
@@ -250,7 +245,7 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     offset_s = found.calibration.time_offset_s
     what["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {found.calibration.time_offset_sigma_s:.4f} "
-        f"s {_direction(offset_s)} the parent's"
+        f"s {offset_values(offset_s)['direction']} the parent's"
     )
     if (rate := found.calibration.clock_rate) and rate.is_used:
         what["time_offset"] += f" and {rate}"

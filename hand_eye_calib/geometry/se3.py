@@ -195,6 +195,16 @@ def inverse(transforms: ArrayLike) -> FloatArray:
     )
 
 
+def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
+    """A transform (4, 4) after a small step (rho, phi) in its own axes, each part by itself: to
+    first order it is ``transform @ exp(step)``.
+    """
+    rotation = transform[:3, :3]
+    return from_rotation_translation(
+        rotation @ rotation_exp(step[3:]), transform[:3, 3] + rotation @ step[:3]
+    )
+
+
 def exp(xi: ArrayLike) -> FloatArray:
     """Exponential map of SE(3).
 

@@ -368,7 +368,7 @@ def test_json_has_it_all(saved, run):
     ("words", "code", "text"),
     [
         (["first"], 1, "two results or more"),
-        (["first", "first"], 1, "expected different results"),
+        (["first", "first"], 1, "2 different names"),
         (["first", "--with", "absent.urdf"], 2, "file that exists"),
         (["absent", "first"], 1, "cannot read absent"),
         (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),

@@ -80,16 +80,10 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
     )
 
 
-def test_type_checkers_see_the_names_that_exist():
-    tree = ast.parse((ROOT / "hand_eye_calib" / "__init__.py").read_text(encoding="utf-8"))
-    conditions = [node for node in tree.body if isinstance(node, ast.If)]
-    (block,) = (node for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING")
-    seen = {
-        alias.asname or alias.name: (node.module, alias.name)
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
+def test_the_stub_names_what_exists():
+    tree = ast.parse((ROOT / "hand_eye_calib" / "__init__.pyi").read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    seen = {alias.asname: (node.module, alias.name) for node in imports for alias in node.names}
     assert sorted(seen) == sorted(hec.__all__)
     for name, (module, original) in seen.items():
         assert getattr(importlib.import_module(module), original) is getattr(hec, name)
