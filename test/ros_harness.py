@@ -316,7 +316,16 @@ class Peer:
         return next(future.result() for _, future in asked if future.done())
 
     def trigger(self, name):
-        return self.call(Trigger, name)
+        """Answer of a service, asked again while a solve goes on."""
+        answers = [self.call(Trigger, name)]
+
+        def is_final():
+            if answers[-1].message.startswith("still solving"):
+                answers.append(self.call(Trigger, name))
+            return not answers[-1].message.startswith("still solving")
+
+        self.spin_until(is_final, f"the end of {name}")
+        return answers[-1]
 
     def solve(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, **options):
         """Feed, then have the node solve with everything; answer of the last ~/solve.

@@ -19,6 +19,7 @@ from hand_eye_calib.live.log import GOES_ON_S, ONCE_S, NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
 from hand_eye_calib.live.state import (
+    ANSWER_WITHIN_S,
     Broadcast,
     ChecksState,
     ExtrinsicState,
@@ -141,8 +142,9 @@ class SolveCycle:
         self._session, self._log = session, log
         self._complete, self._publish = complete, publish
         self._rest_until_s = 0.0
-        self._asked: list[OnSolved] = []
-        self._asked_in_flight: list[OnSolved] = []
+        # Who waits, since when; in flight are those that the next answer is for.
+        self._asked: dict[OnSolved, float] = {}
+        self._in_flight: tuple[OnSolved, ...] = ()
         self._process = SolvingProcess(wake)
         self.restart()
 
@@ -177,9 +179,17 @@ class SolveCycle:
 
     def ask(self, on_solved: OnSolved) -> None:
         """Solve as soon as possible."""
-        self._asked.append(on_solved)
+        self._asked[on_solved] = time.monotonic()
         if not self.is_solving:
             self._start()
+
+    def tell_who_waits(self) -> None:
+        """Tell those who have waited for long that the solve goes on; to be called often."""
+        long_ago_s = time.monotonic() - ANSWER_WITHIN_S
+        for on_solved in [each for each, since_s in self._asked.items() if since_s < long_ago_s]:
+            del self._asked[on_solved]
+            text = f"still solving after {ANSWER_WITHIN_S:g} s: do other programs use the processor?"
+            on_solved(False, f"{text} The result will be in the log and on the topics")
 
     def start_if_due(self) -> None:
         """Solve if there is something new and the last solve has left the processor a rest."""
@@ -194,9 +204,10 @@ class SolveCycle:
             good, text = self.conclude(answer)
             self.is_solving = False
             self._publish()
-            asked, self._asked_in_flight = self._asked_in_flight, []
-            for on_solved in asked:
-                on_solved(good, text)
+            for on_solved in self._in_flight:
+                if self._asked.pop(on_solved, None) is not None:
+                    on_solved(good, text)
+            self._in_flight = ()
             if self._asked:
                 self._start()
 
@@ -213,9 +224,9 @@ class SolveCycle:
         self.is_solving, now_s = True, time.monotonic()
         self._is_unchecked |= self._session.has_new_poses
         self._session.has_new_poses = False
-        self._asked_in_flight, self._asked = self._asked, []
+        self._in_flight = tuple(self._asked)
         # What somebody asks for is told together with what speaks against it.
-        if check := self._must_check(now_s) or (self._is_unchecked and bool(self._asked_in_flight)):
+        if check := self._must_check(now_s) or (self._is_unchecked and bool(self._in_flight)):
             self._is_unchecked, self._check_due_s = False, now_s + _CHECK_PERIOD_S
         self._submitted = deepcopy(self._session.calibrator)
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))

@@ -18,6 +18,9 @@ from hand_eye_calib.results.records import AXES
 # its end for so long (s).
 REPORT_PERIOD_S, GRACE_S = 1.0, 0.4
 
+# Who asks for a solve has an answer within so long (s), also where others use the processor.
+ANSWER_WITHIN_S = 20.0
+
 AxisValues = Mapping[str, float | None]
 
 

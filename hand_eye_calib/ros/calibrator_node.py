@@ -185,6 +185,7 @@ class CalibratorNode(Node):
             self._mount.look()
         clock_ns = self.get_clock().now().nanoseconds
         self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
+        self._cycle.tell_who_waits()
 
     def _why_not_broadcast(self) -> str:
         result, progress = self._cycle.result, self._cycle.goal.progress

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from hand_eye_calib.config import POSE_TYPES
 from hand_eye_calib.errors import printable
-from hand_eye_calib.live.state import REPORT_PERIOD_S, NodeState
+from hand_eye_calib.live.state import ANSWER_WITHIN_S, REPORT_PERIOD_S, NodeState
 from hand_eye_calib.plain import from_plain
 from hand_eye_calib.ros.conversions import LATCHED
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
@@ -28,8 +28,8 @@ from hand_eye_calib.watch.board import Board
 # So many nodes are listened to, and so many topics with poses are told of, at most.
 _MOST = 20
 
-# A service that has not answered for so long will not (s): a solve takes seconds.
-_PATIENCE_S = 60.0
+# A service that has not answered for so long will not (s).
+_PATIENCE_S = 3.0 * ANSWER_WITHIN_S
 
 
 class Watcher:

@@ -92,9 +92,23 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle):
 
 def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minute(cycle):
     for is_asked in (False, False, True):
-        cycle._session.has_new_poses, cycle.is_solving = True, False
+        cycle._session.has_new_poses, cycle.is_solving, cycle._asked = True, False, {}
         cycle.ask(lambda good, text: None) if is_asked else cycle.start_if_due()
     assert [job.check for job in cycle.jobs] == [False, True, False, True]
+
+
+def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypatch):
+    told, start_s = [], module.time.monotonic()
+    cycle.ask(lambda *answer: told.append(answer))
+    cycle.tell_who_waits()
+    assert not told
+    monkeypatch.setattr(module.time, "monotonic", lambda: start_s + 30.0)
+    cycle.tell_who_waits()
+    assert told == [(False, told[0][1])]
+    assert told[0][1].startswith("still solving after 20 s")
+    cycle._process.answers = lambda: [Answer(0, 0.1, seen(40.0), result())]
+    cycle.take_answers()
+    assert len(told) == 1
 
 
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
