@@ -188,8 +188,8 @@ class SolveCycle:
         long_ago_s = time.monotonic() - ANSWER_WITHIN_S
         for on_solved in [each for each, since_s in self._asked.items() if since_s < long_ago_s]:
             del self._asked[on_solved]
-            text = f"still solving after {ANSWER_WITHIN_S:g} s: do other programs use the processor?"
-            on_solved(False, f"{text} The result will be in the log and on the topics")
+            text = f"still solving after {ANSWER_WITHIN_S:g} s (do others use the processor?)"
+            on_solved(False, f"{text}: the result will be in the log and on the topics")
 
     def start_if_due(self) -> None:
         """Solve if there is something new and the last solve has left the processor a rest."""
