@@ -8,8 +8,10 @@ the key that is part of the address: a page of somebody else in the same browser
 import contextlib
 import hmac
 import os
+import re
 import secrets
 import socket
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -54,8 +56,30 @@ _POLICY = (
 _POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
 
+def _kept_key() -> str:
+    """The user's key, the same at every start, so that a page that was left open comes back; one
+    for this time if no file that is only this user's can keep it.
+    """
+    made = secrets.token_urlsafe(6)
+    with contextlib.suppress(OSError, RuntimeError):
+        state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        file = Path(state, "hand_eye_calib", "watch_key")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError), open(file, "x", opener=_for_user) as new:
+            new.write(made)
+        with open(file, opener=_for_user) as kept:
+            about, text = os.fstat(kept.fileno()), kept.read(len(made) + 1)
+        is_own = about.st_uid == os.getuid() and not stat.S_IMODE(about.st_mode) & 0o077
+        made = text if is_own and re.fullmatch(rf"[\w-]{{{len(made)}}}", text, re.ASCII) else made
+    return made
+
+
+def _for_user(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o600)
+
+
 class WebServer(ThreadingHTTPServer):
-    """Serves the view until :meth:`stop`, in threads of its own.
+    """Serves the view until :meth:`stop`, in threads of its own, under the key of this user.
 
     Parameters
     ----------
@@ -82,7 +106,7 @@ class WebServer(ThreadingHTTPServer):
         ask: Callable[[str], None],
         address: tuple[str, int],
     ) -> None:
-        self.key = secrets.token_urlsafe(6)
+        self.key = _kept_key()
         self.board, self.ask = board, ask
         self.stopping = threading.Event()
         self._host, port = address

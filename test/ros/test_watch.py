@@ -51,7 +51,7 @@ class Watch:
                 [sys.executable, "-m", "hand_eye_calib", "watch", *arguments],
                 stdout=seen,
                 stderr=notes,
-                env=os.environ | {"ROS_DOMAIN_ID": str(domain)},
+                env=os.environ | {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(directory)},
             )
 
     def wait_for(self, pattern, file=None):

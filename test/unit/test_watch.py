@@ -4,6 +4,7 @@ import http.client
 import io
 import queue
 import re
+import stat
 import sys
 import time
 from dataclasses import replace
@@ -391,11 +392,12 @@ def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
 
 
 @pytest.fixture
-def server():
+def server(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     board, requests = Board(), queue.SimpleQueue()
     board.take(state(), time.monotonic())
     made = WebServer(board, requests.put, ("127.0.0.1", 0))
-    made.key = "word"
+    made.kept, made.key = made.key, "word"
     made.requests = requests
     yield made
     made.stop()
@@ -418,6 +420,26 @@ def test_the_page_needs_nothing_from_elsewhere(server):
         assert answer.status == 200
         text = answer.read().decode().replace("// ", "").replace("http://www.w3.org/2000/svg", "")
         assert "//" not in text
+
+
+def test_a_server_that_is_started_again_has_its_key_again_unless_others_can_read_it(
+    server, tmp_path
+):
+    def started():
+        server.stop()
+        server.__init__(Board(), print, ("127.0.0.1", server.server_port))
+        return server.key
+
+    file = tmp_path / "hand_eye_calib" / "watch_key"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert started() == server.kept == file.read_text()
+    file.chmod(0o644)
+    assert started() not in (server.kept, "")
+    file.rename(file.with_name("elsewhere")).chmod(0o600)
+    file.symlink_to("elsewhere")
+    assert started() not in (server.kept, "")
+    file.unlink()
+    assert started() == started()
 
 
 def test_events_bring_the_view_at_once_and_again_when_it_changes(server):

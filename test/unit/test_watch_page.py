@@ -17,7 +17,7 @@ PAGE = (FOLDER / "page.html").read_text(encoding="utf-8")
 
 # A browser as far as the script needs one: it stands still until it is told what happens.
 BROWSER = """
-let now = 0, tick = null; const log = {posts: [], opened: [], shaken: 0};
+let now = 0, tick = null; const log = {posts: [], opened: [], shaken: 0, locks: []};
 Date.now = () => now;
 const element = (more) => withClasses({
   dataset: {}, hidden: false, disabled: false, textContent: "", heard: {}, classes: new Set(),
@@ -39,14 +39,16 @@ nodes.state = {className: "busy", dataset: shown};
 const keys = ["solve", "save", "reset"].map((request) => element(
   {dataset: request === "reset" ? {request, sure: "Forget all poses?"} : {request}}));
 globalThis.document = {title: "", getElementById: (id) => nodes[id], visibilityState: "visible",
-  addEventListener() {}, querySelector: () => nodes.footer,
+  addEventListener(name, run) { seen = run; }, querySelector: () => nodes.footer,
   querySelectorAll: (what) => what.startsWith("a") ? anchors : keys};
 globalThis.FormData = class {
   *[Symbol.iterator]() { yield ["value", "1.85"]; yield ["sigma", "0.02"]; }
 };
 globalThis.location = {search: "?key=word"};
-Object.defineProperty(globalThis, "navigator", {value: {vibrate() { log.shaken += 1; }}});
-let sure = false, answer = {ok: true, text: async () => ""};
+Object.defineProperty(globalThis, "navigator", {value: {
+  vibrate() { log.shaken += 1; },
+  wakeLock: {request(kind) { log.locks.push(kind); return Promise.resolve(); }}}});
+let seen = null, sure = false, answer = {ok: true, text: async () => ""};
 globalThis.confirm = () => sure;
 globalThis.fetch = (address, {method}) => {
   log.posts.push(`${method} ${address}`); return Promise.resolve(answer); };
@@ -57,7 +59,7 @@ globalThis.EventSource = class {
   close() { this.readyState = 2; }
 };
 let events = null;
-const state = () => ({...log, posts: [...log.posts],
+const state = () => ({...log, posts: [...log.posts], locks: log.locks.length,
   opened: log.opened.length, last: log.opened.at(-1),
   title: document.title, said: nodes.connection.textContent,
   lost: nodes.connection.classes.has("lost"), footer: nodes.footer.hidden,
@@ -120,21 +122,32 @@ def test_the_page_shows_what_comes_and_says_when_nothing_comes():
             f"now = 9800; events.onmessage({{data: {go_on}}});",
             "events.onerror(); now = 10800; tick();",
             "answer = {status: 403}; events.onerror(); await null; now = 11800; tick();",
+            "document.visibilityState = 'hidden'; seen(); document.visibilityState = 'visible';",
+            "seen();",
         ]
     )
     opened, title, said = ([each[key] for each in states] for key in ("opened", "title", "said"))
-    assert opened == [1, 1, 1, 1, 2, 2, 2, 3, 4]
+    assert opened == [1, 1, 1, 1, 2, 2, 2, 3, 4, 4, 4]
     assert states[0]["last"] == "events?key=word"
     assert title[1:4] == ["▶ GO ON", "MOUNT MOVED", "MOUNT MOVED"]
-    assert [each["shaken"] for each in states] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
+    assert [each["shaken"] for each in states][:9] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
     assert [each["footer"] for each in states][1:3] == [False, True]
-    assert [each["disabled"] for each in states] == [False] * 4 + [True, True, False, True, True]
-    assert said[3:6] == [
-        "✓ connected",
-        "✗ NO CONNECTION for 0 s, trying again ...",
-        "✗ NO CONNECTION for 0 s, trying again ...",
+    assert [each["locks"] for each in states][8:] == [
+        1,
+        1,
+        2,
+    ]  # while it is seen, the screen stays on
+    assert [each["disabled"] for each in states][:9] == [False] * 4 + [
+        True,
+        True,
+        False,
+        True,
+        True,
     ]
-    assert said[8].startswith("✗ OLD ADDRESS: watch was started again")
+    assert said[3] == said[6] == "✓ connected"
+    assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d( [AP]M)?, trying again ...", said[4])
+    assert said[5] == said[4]
+    assert said[8] == "✗ OLD ADDRESS: open the address that watch shows now"
     assert [each["lost"] for each in states][3:7] == [False, True, True, False]
 
 

@@ -18,11 +18,11 @@ const ICONS = {good: "#11703a", busy: "#0b5cad", act: "#c77700", bad: "#b3211c",
 function show(isLive) {
   if (!isLive && lostAt === null) lostAt = Date.now();
   if (isLive) lostAt = null;
-  const seconds = lostAt === null ? 0 : Math.round((Date.now() - lostAt) / 1000);
+  const at = new Date(lostAt).toLocaleTimeString([], {hour: "2-digit", minute: "2-digit"});
   connection.classList.toggle("lost", !isLive);
   connection.textContent = isLive ? "✓ connected"
-    : isOld ? "✗ OLD ADDRESS: watch was started again, open the address that it shows now"
-    : `✗ NO CONNECTION for ${seconds} s, trying again ...`;
+    : isOld ? "✗ OLD ADDRESS: open the address that watch shows now"
+    : `✗ CONNECTION LOST at ${at}, trying again ...`;
   for (const button of buttons) button.disabled = !isLive;
 }
 
@@ -80,7 +80,7 @@ function connect() {
   source.onerror = () => { source.close(); show(false); look(); };
 }
 
-// A server that was started again has another key, which no reconnecting finds.
+// Another user's server, or one that could not keep its key: no reconnecting finds it.
 async function look() {
   try {
     isOld = (await fetch("page.html?" + address, {method: "GET"})).status === 403;
