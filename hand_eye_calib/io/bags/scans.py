@@ -2,12 +2,11 @@
 small_gicp.
 
 Each scan is registered against a map of the scans before it, by their local planes (generalised
-ICP). Registration of points to points, as of KISS-ICP, drags along the rings of a lidar that has 16
-of them: they look the same on flat ground whatever the pitch, and pitch and roll are not followed.
+ICP), whose voxels hold the mean plane of their points. Registration of points to points, as of
+KISS-ICP, drags along the rings of a lidar that has 16 of them: they look the same on flat ground
+whatever the pitch, and pitch and roll are not followed.
 """
 
-import os
-from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -41,14 +40,15 @@ class Tuning:
     voxel_share: float = 0.03
     least_voxel_m: float = 0.1
     most_voxel_m: float = 0.4
-    # Over so many voxels points are matched, in two registrations: the first corrects distortion.
+    # Of two registrations, of which the first corrects distortion: voxels that a scan is thinned
+    # to, and over how many points are matched.
+    thinned_voxels: tuple[float, ...] = (2.0, 1.0)
     match_voxels: tuple[float, ...] = (6.0, 2.0)
     # Points that a local plane is fitted to.
     n_neighbours: int = 12
-    # A scan becomes part of the map, of so many scans, after so much motion (m, rad).
-    key_m: float = 0.7
-    key_rad: float = 0.06
-    n_keys: int = 30
+    # Size of a voxel of the map, in those of scans, and for how many scans it is kept unseen.
+    map_voxels: float = 2.0
+    n_unseen: int = 100
     # Parts of a scan whose points have the same correction for motion.
     n_parts: int = 40
     # A registration with a smaller share of matched points counts as failed.
@@ -128,10 +128,9 @@ class ScanOdometry:
         self._gicp = required(
             "small_gicp", "odometry from the points of a lidar", "hand_eye_calib[lidar]"
         )
-        self._n_threads = os.cpu_count() or 1  # what is found does not depend on it
         self._pose, self._step, self._frame = np.eye(4), np.eye(4), ""
         self._voxel_m, self._n_failed = 0.0, 0
-        self._keys = deque[tuple[FloatArray, FloatArray]](maxlen=_TUNING.n_keys)
+        self._map: Any = None
         self._found: list[tuple[FloatArray, int, int]] = []
 
     def add(self, scan: Scan, bag_ns: int) -> None:
@@ -158,43 +157,44 @@ class ScanOdometry:
         return self.kept
 
     def _register(self, scan: Scan) -> None:
-        if not self._keys:
+        if self._map is None:
             share = _TUNING.voxel_share * float(np.median(np.linalg.norm(scan.points, axis=1)))
             self._voxel_m = min(max(share, _TUNING.least_voxel_m), _TUNING.most_voxel_m)
-            self._add_to_map(scan.points)
+            self._first = scan
+            self._start(np.eye(4))
             return
-        before, step, pose = self._pose, self._step, self._pose
-        for n_voxels in _TUNING.match_voxels:
-            points = self._gicp.voxelgrid_sampling(_without_motion(scan, step), self._voxel_m)
-            self._gicp.estimate_covariances(points, None, _TUNING.n_neighbours, self._n_threads)
+        pose, step = self._pose, self._step
+        for thinned, matched in zip(_TUNING.thinned_voxels, _TUNING.match_voxels, strict=True):
+            if len(self._found) == 1:
+                self._start(step)
+            points = self._thinned(_without_motion(scan, step), thinned)
             found = self._gicp.align(
-                *(self._map[0], points, self._map[1]),
-                init_T_target_source=before @ step,
-                registration_type="GICP",
-                max_correspondence_distance=n_voxels * self._voxel_m,
+                *(self._map, points, self._pose @ step),
+                max_correspondence_distance=matched * self._voxel_m,
                 max_iterations=30,
             )
             if found.num_inliers < _TUNING.least_matched * points.size():
-                pose, step = before, np.eye(4)  # rather than on and away from the map
+                self._step = np.eye(4)  # rather than on and away from the map
                 self._n_failed += 1
-                break
+                return
             pose = np.array(found.T_target_source)
             # Rounding must not grow from scan to scan.
             pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
-            step = se3.inverse(before) @ pose
+            step = se3.inverse(self._pose) @ pose
         self._pose, self._step = pose, step
-        moved = se3.inverse(self._keys[-1][0]) @ pose
-        is_new = len(self._keys) < 5 or np.linalg.norm(moved[:3, 3]) > _TUNING.key_m
-        if is_new or se3.rotation_angle(moved[:3, :3]) > _TUNING.key_rad:
-            self._add_to_map(_without_motion(scan, step))
+        self._map.insert(points, pose)
 
-    def _add_to_map(self, points: FloatArray) -> None:
-        placed = points @ self._pose[:3, :3].T + self._pose[:3, 3]
-        sampled = self._gicp.voxelgrid_sampling(placed, self._voxel_m / 2.0)
-        self._keys.append((self._pose, np.array(sampled.points()[:, :3])))
-        whole = np.concatenate([each for _, each in self._keys])
-        about = self._voxel_m, _TUNING.n_neighbours, self._n_threads
-        self._map = self._gicp.preprocess_points(whole, *about)
+    def _start(self, step: FloatArray) -> None:
+        """Begin the map with the first scan, in which the lidar may have moved already."""
+        self._map = self._gicp.GaussianVoxelMap(_TUNING.map_voxels * self._voxel_m)
+        self._map.set_lru(_TUNING.n_unseen, _TUNING.n_unseen)
+        self._map.insert(self._thinned(_without_motion(self._first, step), 1.0))
+
+    def _thinned(self, points: FloatArray, n_voxels: float) -> Any:
+        """One of the points (N, 3) in so many voxels, with the planes about them."""
+        thinned = self._gicp.voxelgrid_sampling(points, n_voxels * self._voxel_m)
+        self._gicp.estimate_covariances(thinned, num_neighbors=_TUNING.n_neighbours)
+        return thinned
 
 
 def _without_motion(scan: Scan, step: FloatArray) -> FloatArray:
