@@ -219,19 +219,6 @@ def some_calibration(**changes):
     return dataclasses.replace(solved(), **changes)
 
 
-def test_static_transform_command_carries_the_extrinsic():
-    calibration = some_calibration(child_frame="left camera")
-    words = shlex.split(calibration.static_transform_command())
-    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
-    options = dict(zip(words[4::2], words[5::2], strict=True))
-    assert (options.pop("--frame-id"), options.pop("--child-frame-id")) == ("lidar", "left camera")
-    values = [float(options.pop(f"--{name}")) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    assert not options
-    np.testing.assert_allclose(
-        se3.from_quat_xyzw(values[:3], values[3:]), calibration.T_parent_child, atol=2e-9
-    )
-
-
 def test_a_solve_that_did_not_converge_fails(run, new_bag, monkeypatch):
     from hand_eye_calib.engine.snapshot import Snapshot
 
@@ -351,6 +338,10 @@ def parsed(options):
         (["info", "a", "b"], "unknown 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
+        (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
+        (["replay", "bag", "--batch", "fleet"], "--batch cannot be combined with PATH or --list"),
+        (["replay", "--batch", "none*"], "no bag matches none*"),
+        (["replay"], "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n"),
     ],
 )
 def test_wrong_usage(run, arguments, message):

@@ -123,21 +123,6 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
     np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
-        (["bag", "--batch", "fleet.yaml"], "--batch cannot be combined with PATH or --list"),
-        (["--batch", "none*"], "no bag matches none*"),
-        ([], "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n"),
-    ],
-)
-def test_wrong_usage(run, arguments, message):
-    code, out, err = run(*arguments)
-    assert (code, out) == (2, "")
-    assert message in err
-
-
 # ---- several bags
 
 

@@ -1,9 +1,17 @@
+"""DNLO, the quadratic form that it minimises, and the proof of a global minimum."""
+
 import numpy as np
+import published_data
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
 
+import hand_eye_calib as hec
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers import all_pairs, dnlo
+from hand_eye_calib.solvers import all_pairs, dnlo, quadratic_form
+from hand_eye_calib.solvers.certificate import is_global
 from hand_eye_calib.solvers.registry import Method
 
 
@@ -74,3 +82,117 @@ def test_ipopt_and_the_fast_backend_agree(method, jumpy_pairs):
     assert fast.objective <= ipopt.objective * (1 + 1e-9)
     if abs(fast.objective - ipopt.objective) < 1e-6 * ipopt.objective:
         np.testing.assert_allclose(fast.T_parent_child, ipopt.T_parent_child, atol=1e-5)
+
+
+# ---- the quadratic form
+
+
+@pytest.fixture
+def pairs():
+    return noisy_pairs(1)
+
+
+def test_condensed_costs_are_the_matrix_costs(pairs):
+    for T in (np.eye(4), T_PARENT_CHILD, se3.exp(np.array([30.0, -4.0, 2.0, 2.0, 1.0, -1.0]))):
+        condensed_costs = quadratic_form.condense(pairs) @ quadratic_form.monomials(T)
+        np.testing.assert_allclose(
+            condensed_costs, all_pairs.pair_costs(pairs, T), rtol=1e-12, atol=1e-12
+        )
+
+
+def test_the_minimum_is_where_no_small_step_goes_down(pairs):
+    Q = quadratic_form.expand(quadratic_form.condense(pairs).sum(axis=0))
+    Ts, values, converged = quadratic_form.minimise(Q, all_pairs.start_rotations(pairs))
+    T = Ts[np.argmin(values)]
+
+    def total(xi):
+        return all_pairs.pair_costs(pairs, T @ se3.exp(xi)).sum()
+
+    step = 1e-4
+    for direction in np.vstack([np.eye(6), -np.eye(6)]):
+        assert total(step * direction) > total(np.zeros(6))
+    assert converged.all()
+    np.testing.assert_allclose(values.min(), total(np.zeros(6)), rtol=1e-9)
+
+
+def test_gauss_newton_steps_reach_the_minimum(pairs):
+    Q = quadratic_form.expand(quadratic_form.condense(pairs).sum(axis=0))
+    T = quadratic_form.minimise(Q, all_pairs.start_rotations(pairs)[:1])[0]
+    stepped = T @ se3.exp(np.array([0.05, -0.02, 0.01, 0.05, 0.02, -0.03]))
+    for _ in range(12):
+        stepped = quadratic_form.gauss_newton_step(Q[None], stepped)
+    np.testing.assert_allclose(stepped, T, atol=1e-8)
+
+
+# ---- the proof
+
+
+HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
+
+
+def noisy_pairs(seed, sigma=0.02, poses=60):
+    rng = np.random.default_rng(seed)
+    T_parent_child = se3.exp(rng.normal(size=6))
+    Ts_pw_p = wandering_poses(poses, seed)
+    Ts_cw_c = child_of(Ts_pw_p, T_parent_child) @ se3.exp(sigma * rng.normal(size=(poses, 6)))
+    return motion_pairs(Ts_pw_p, Ts_cw_c, "B5")
+
+
+def form_of(pairs, solution):
+    return quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
+
+
+def false_minimum(Q, T_parent_child):
+    """The highest local minimum from rotations by pi beside the global one, and how much higher."""
+    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
+    T = Ts[np.argmax(values)]
+    return T, float(quadratic_form.decrease(Q, T, T_parent_child))
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000), sigma=st.sampled_from([0.0, 1e-3, 0.02, 0.2]))
+@pytest.mark.parametrize("method", ["dnl", "dnlo"])
+def test_the_minimum_is_proved_and_a_false_one_is_not(method, seed, sigma):
+    pairs = noisy_pairs(seed, sigma)
+    solution = Method(method).solve(pairs)
+    Q = form_of(pairs, solution)
+    assert is_global(Q, solution.T_parent_child)
+    T_false, above = false_minimum(Q, solution.T_parent_child)
+    if above > 1e-3 * np.trace(Q):
+        assert not is_global(Q, T_false)
+
+
+@pytest.mark.parametrize("name", sorted(published_data.FALSE_MINIMA_OF_DNL))
+def test_the_false_minima_of_the_published_results_are_caught(name):
+    case_name, reference = name
+    dataset, *level, run = case_name.split("/")
+    (case,) = [
+        case
+        for case in published_data.simulated([dataset], [float(level[0])] if level else None)
+        if case.run == run
+    ]
+    pairs = motion_pairs(case.parent.poses, case.child.poses, reference)
+    solution = Method("dnl").solve(pairs)
+    assert Method("dnl").proved_global(pairs, solution) == "yes"
+    T_false, above = false_minimum(form_of(pairs, solution), solution.T_parent_child)
+    assert above > 9 * solution.objective
+    assert not is_global(form_of(pairs, solution), T_false)
+
+
+def test_results_say_what_was_proved(tmp_path):
+    rng = np.random.default_rng(0)
+    Ts_pw_p = wandering_poses(60)
+    stamps_ns = np.arange(60) * 100_000_000
+    parent = hec.Trajectory(stamps_ns, Ts_pw_p)
+    child = hec.Trajectory(stamps_ns, child_of(Ts_pw_p, se3.exp(rng.normal(size=6))))
+    proved = {
+        method: hec.calibrate(parent, child, method=method, reference="B5")
+        for method in ("dnl", "dnlo", "park")
+    }
+    assert {method: result.proved_global for method, result in proved.items()} == {
+        "dnl": "yes",
+        "dnlo": "yes",
+        "park": "not tried",
+    }
+    hec.save(proved["dnl"], tmp_path)
+    assert hec.load(tmp_path / "extrinsic.yaml").proved_global == "yes"

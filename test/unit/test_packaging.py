@@ -1,6 +1,7 @@
-"""The package as colcon and pip install it, and what its manifests promise."""
+"""The package as colcon and pip install it, what its manifests promise, workflows and layouts."""
 
 import ast
+import json
 import os
 import re
 import runpy
@@ -11,9 +12,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
 from hand_eye_calib.cli.main import COMMANDS
+from hand_eye_calib.watch.board import AXES
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "hand_eye_calib"
@@ -236,3 +239,83 @@ def test_colcon_installed_commands_run(install_space):
     for command in COMMANDS:
         assert f"usage: hand_eye_calib {command}" in said
     assert MANIFEST.findtext("version") in said
+
+
+# ---- workflows of the forge
+
+
+WORKFLOWS = {
+    path.stem: yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"]
+    for path in (ROOT / ".github" / "workflows").glob("*.yml")
+}
+
+
+def lines(jobs):
+    """What the steps of jobs run, with the values of their matrices."""
+    steps = [step for job in jobs.values() for step in job["steps"]]
+    found = [line for step in steps for line in step.get("run", "").splitlines()]
+    matrices = [job.get("strategy", {}).get("matrix", {}) for job in jobs.values()]
+    return found + [line for matrix in matrices for line in matrix.get("command", [])]
+
+
+def test_commands_exist_jobs_end_and_leave_no_credentials():
+    assert WORKFLOWS.keys() >= {"ci", "nightly", "benchmark", "release"}
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = re.findall(r"^([a-z-]+)[a-z -]*:", makefile, re.MULTILINE)
+    for jobs in WORKFLOWS.values():
+        said = "\n".join(lines(jobs))
+        assert set(re.findall(r"\bmake ([a-z-]+)", said)) <= set(targets)
+        for script in re.findall(r"\S*\.ci/[a-z]+", said):
+            assert os.access(ROOT / script.removeprefix("src/hand_eye_calib/"), os.X_OK)
+        for job in jobs.values():
+            assert 5 <= job["timeout-minutes"] <= 120
+            for step in job["steps"]:
+                if step.get("uses", "").startswith("actions/checkout@"):
+                    assert step["with"]["persist-credentials"] is False
+
+
+def test_what_ci_runs_here_runs_there_and_on_every_declared_python():
+    """Each step of .ci/run is a job of the workflow."""
+    steps = re.findall(r"^step (make [a-z-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    assert len(steps) >= 4
+    assert set(steps) <= set(lines(WORKFLOWS["ci"]))
+    setup = (ROOT / "setup.py").read_text(encoding="utf-8")
+    declared = re.findall(r"Programming Language :: Python :: (3\.\d+)", setup)
+    assert WORKFLOWS["ci"]["test"]["strategy"]["matrix"]["python"] == declared
+    assert f'python_requires=">={declared[0]}"' in setup
+
+
+# ---- layouts for RViz and Foxglove
+
+
+CONFIG = ROOT / "config"
+NODE_PAGE = (ROOT / "docs" / "node.md").read_text(encoding="utf-8")
+
+
+def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
+    rviz = yaml.safe_load((CONFIG / "calibrator.rviz").read_text())["Visualization Manager"]
+    (extrinsic,) = (each for each in rviz["Displays"] if each["Name"] == "Extrinsic")
+    assert extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
+    assert extrinsic["Topic"]["Durability Policy"] == "Transient Local"
+    assert extrinsic["Covariance"]["Position"]["Value"] is True
+    assert "`~/extrinsic_with_covariance`" in NODE_PAGE
+
+
+def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
+    layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
+    panels = layout["configById"]
+    services = [each["serviceName"] for each in panels.values() if "serviceName" in each]
+    assert sorted(services) == [f"/calibrator/{name}" for name in ("reset", "save", "solve")]
+    for name in services:
+        assert f"`~/{name.rpartition('/')[2]}`" in NODE_PAGE
+    assert list(panels["3D!extrinsic"]["topics"]) == ["/calibrator/extrinsic_with_covariance"]
+    values = [path["value"] for each in panels.values() for path in each.get("paths", ())]
+    keys = set(re.findall(r'key=="([a-z.]+)"', " ".join(values)))
+    assert keys == {*(f"sigma.{axis}" for axis in AXES), "target.x", "target.roll"}
+
+    def placed(part):
+        if isinstance(part, str):
+            return [part]
+        return [*placed(part["first"]), *placed(part["second"])]
+
+    assert sorted(placed(layout["layout"])) == sorted(panels)

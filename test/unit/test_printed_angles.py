@@ -39,11 +39,20 @@ def spread_of_angles(angles, around):
     [LIDAR_CAMERA, se3.rotation_from_rpy([0.4, -0.9, 2.5]), se3.rotation_from_rpy([2.0, 0.9, 0.0])],
     ids=["lidar-camera", "oblique", "steep"],
 )
-def test_sigmas_are_the_spread_of_the_angles(rotation):
-    T, covariance = transform(rotation), covariance_about_parent(rotation, (0.57, 0.028, 0.2))
-    angles = se3.rotation_to_rpy(samples_of(T, covariance)[:, :3, :3])
-    spread = spread_of_angles(angles, se3.rotation_to_rpy(rotation))
-    np.testing.assert_allclose(sigmas_rpy(T, covariance), spread, rtol=0.03)
+def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
+    T = transform(rotation, (3.0, -2.0, 1.0))
+    covariance = covariance_about_parent(rotation, (0.57, 0.028, 0.2))
+    assert np.isfinite(sigmas_rpy(T, covariance)).all()
+    drawn = samples_of(T, covariance)
+    inverse = se3.inverse(T), se3.inverse(drawn), inverse_covariance(T, covariance)
+    for of, samples, stated in ((T, drawn, covariance), inverse):
+        along = samples[:, :3, 3].std(axis=0)
+        np.testing.assert_allclose(sigmas_translation(of, stated), along, rtol=0.03)
+        found = sigmas_rpy(of, stated)
+        if np.isfinite(found).all():  # the inverse of one is locked
+            angles = se3.rotation_to_rpy(samples[:, :3, :3])
+            spread = spread_of_angles(angles, se3.rotation_to_rpy(of[:3, :3]))
+            np.testing.assert_allclose(found, spread, rtol=0.03)
 
 
 def test_near_gimbal_lock_roll_and_yaw_are_printed_without_a_sigma():
@@ -62,22 +71,6 @@ def test_an_unknown_rotation_has_no_sigma():
     assert sigmas_rpy(np.eye(4), covariance).tolist() == pytest.approx([1e-3, 1e-3, np.inf])
     assert np.isinf(sigmas_rpy(np.eye(4), np.full((6, 6), np.inf))).all()
     assert np.isinf(sigmas_translation(np.eye(4), np.full((6, 6), np.inf))).all()
-
-
-def test_the_other_direction_has_its_own_sigmas():
-    T = transform(se3.rotation_from_rpy([0.4, -0.9, 2.5]), (3.0, -2.0, 1.0))
-    covariance = covariance_about_parent(T[:3, :3], (0.5, 0.1, 0.2))
-    inverse, its_covariance = se3.inverse(T), inverse_covariance(T, covariance)
-    drawn = se3.inverse(samples_of(T, covariance))
-    np.testing.assert_allclose(
-        sigmas_translation(inverse, its_covariance), drawn[:, :3, 3].std(axis=0), rtol=0.03
-    )
-    angles = se3.rotation_to_rpy(drawn[:, :3, :3])
-    np.testing.assert_allclose(
-        sigmas_rpy(inverse, its_covariance),
-        spread_of_angles(angles, se3.rotation_to_rpy(inverse[:3, :3])),
-        rtol=0.03,
-    )
 
 
 def calibration(rotation, sigmas_deg):

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import re
+import shlex
 import stat
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
-from result_making import NAMES, calibration, good_calibration
+from result_making import calibration, dofs, good_calibration
 
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.cli.main import main
@@ -23,8 +24,6 @@ from hand_eye_calib.io.yaml_files import yaml_text
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import (
     Calibration,
-    DofObservability,
-    DofVerdict,
     SolveStatus,
     Verdict,
 )
@@ -100,16 +99,10 @@ def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
 
 
 def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robot(tmp_path):
-    yaw = DofVerdict.UNOBSERVABLE
-    dofs = tuple(
-        DofObservability(name, yaw if name == "yaw" else DofVerdict.OBSERVED, sigma)
-        for name, sigma in zip(NAMES, [0.01] * 5 + [np.inf], strict=True)
-    )
-    covariance = np.diag([1e-4] * 5 + [1e4])
     written = calibration(
         T_parent_child=se3.exp(np.array([1.0, 2, 3, 0, 0, 0.3])),
-        covariance=covariance,
-        observability=dofs,
+        covariance=np.diag([1e-4] * 5 + [1e4]),
+        observability=dofs([0.01] * 5 + [np.inf], ["yaw"]),
     )
     transform = yaml.safe_load(save_result(written, tmp_path).read_text())["T_parent_child"]
     assert transform["quat_xyzw"] is None
@@ -205,6 +198,10 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     np.testing.assert_allclose(
         se3.from_quat_xyzw(values[:3], values[3:]), written.T_parent_child, atol=1e-11
     )
+    typed = shlex.split(written.static_transform_command())
+    assert typed[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    np.testing.assert_allclose(list(map(float, typed[5:18:2])), values, atol=1e-9)
+    assert (typed[4::2], typed[-1]) == (arguments[::2], written.child_frame)
 
 
 ROBOT_FILES = ("extrinsic.urdf.xacro", "static_transform.launch.py")

@@ -8,15 +8,17 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
+from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change, possible_shift
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
 from hand_eye_calib.checks.streams import check_stream
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.pairing.motion_pairs import synchronise
 from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
-from reproduction.fault_cases import FAULTS, LATER, SILENT
+from reproduction.fault_cases import FAULTS, LATER, SILENT, heading_drift
 
 # Not the strongest: seen by a solve or with no effect then, or named already if it is small.
 STRONGEST = {"S13": 1, "S10b": 2, "V1": 1, "U7": 0}
@@ -157,3 +159,84 @@ class TestOneStreamComputedFromTheOther:
         parent = as_trajectory(disturbed(poses, 1, noise, noise), rate_hz)
         child = as_trajectory(disturbed(child_of(poses), 2, noise, noise), rate_hz)
         assert "not_independent" not in [f.code for f in check_streams(parent, child).findings]
+
+
+# ---- a mount that moved within a recording
+
+
+SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]
+
+
+def recording(seed, shift_at=None):
+    """Pose pairs of a simulated drive whose mount is off by so much of SHIFT over its course (a
+    function of the share of the recording), and its truth.
+    """
+    drive = simulate_drive(seed, HILLY_DRIVE, NoiseConfig(gaussian=0.003))
+    child = drive.child
+    if shift_at is not None:
+        shares = shift_at(np.arange(len(child)) / len(child))
+        poses = child.poses @ se3.exp(shares[:, None] * SHIFT)
+        child = dataclasses.replace(child, poses=poses)
+    return synchronise(drive.parent, child, 0.5), drive.T_parent_child
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+def test_a_shift_is_found_with_its_time_and_size(share):
+    pose_pairs, truth = recording(1, lambda at: np.where(at < share, 0.0, 1.0))
+    change = find_change(pose_pairs, truth)
+    assert change.log_ratio > SIGNIFICANT
+    at_s = (change.at_ns - pose_pairs.stamps_ns[0]) * 1e-9
+    assert at_s == pytest.approx(120 * share, abs=2.0)
+    error = change.xi - SHIFT
+    assert error @ np.linalg.solve(change.covariance, error) < 25.0
+
+
+def test_a_world_that_drifts_is_no_mount_that_has_moved():
+    """Seen in a short recording, it looks like a shift as well."""
+    drive = simulate_drive(1, HILLY_DRIVE, NoiseConfig(gaussian=0.003))
+    child = heading_drift(drive.child, 20.0, None)[: len(drive.child) // 3]
+    codes = [found.code for found in check_streams(drive.parent, child).findings]
+    assert codes == ["world_drift"]
+
+
+def test_noise_and_a_wrong_extrinsic_are_no_shift_and_a_short_recording_tells_nothing():
+    for seed in range(4):
+        pose_pairs, truth = recording(seed)
+        assert find_change(pose_pairs, truth).log_ratio < SIGNIFICANT
+    assert find_change(pose_pairs, truth @ se3.exp(SHIFT)).log_ratio < SIGNIFICANT
+    assert find_change(pose_pairs[:200], truth) is None
+
+
+def products_of(steps, sigma=0.01):
+    """Products of parts that each show a shift (6,) to this standard deviation."""
+    parts = []
+    for step in steps:
+        rows = np.concatenate([np.eye(6), -np.asarray(step)[:, None]], axis=1) / sigma
+        parts.append(rows.T @ rows)
+    return np.array(parts)
+
+
+def parts(seed, size):
+    noise = np.random.default_rng(seed).normal(0.0, 0.01, (20, 6))
+    return noise + np.where(np.arange(20)[:, None] < 8, 0.0, size * SHIFT)
+
+
+def test_a_shift_between_parts_counts_with_half_of_it():
+    assert possible_shift(products_of(parts(0, 0.0)), 1.0) is None
+    found = possible_shift(products_of(parts(0, 1.0)), 1.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.spread)), np.abs(SHIFT) / 2, atol=4e-3)
+    assert possible_shift(products_of(parts(0, 1.0)[:7]), 1.0) is None
+
+
+def test_a_shift_that_noise_explains_does_not_count():
+    found = possible_shift(products_of(parts(1, 0.2)), 1.0)
+    assert found is None or (np.diag(found.spread).max() < 1e-6 and not found.warnings)
+
+
+def test_only_what_is_more_than_recordings_scatter_is_said_to_have_moved():
+    moved = possible_shift(products_of(parts(0, 1.5)), 1.0)
+    assert "The first 40% and the last 60%" in moved.warnings[0]
+    scattered = np.where(np.arange(20)[:, None] < 8, 0.0, 0.3 * SHIFT)
+    found = possible_shift(products_of(scattered, sigma=1e-3), 1.0)
+    assert found.spread.max() > 0.0
+    assert not found.warnings

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from result_making import NAMES, calibration
+from result_making import NAMES, dofs
+from result_making import good_calibration as good
 
 from hand_eye_calib.results import verdict as rules
 from hand_eye_calib.results.calibration import (
     Calibration,
-    DofObservability,
-    DofVerdict,
     SolveStatus,
     Verdict,
 )
@@ -40,15 +39,8 @@ def test_the_page_has_the_rules_of_the_code():
 
 def observed(sigma_m=0.003, sigma_rad=0.001, **changes):
     """Verdicts of six axes; ``changes`` names axes with another sigma (inf: unobservable)."""
-    sigmas = dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3).tolist(), strict=True)) | changes
-    seen, hidden, values = DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE, sigmas.values()
-    verdicts = [seen if sigma < np.inf else hidden for sigma in values]
-    return tuple(map(DofObservability, sigmas, verdicts, values))
-
-
-def good(**changes):
-    values = {"status": SolveStatus.OK, "observability": observed(), "covariance": np.eye(6) * 1e-6}
-    return calibration(**values | changes)
+    sigmas = dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3), strict=True)) | changes
+    return dofs(sigmas.values(), [name for name, sigma in sigmas.items() if sigma == np.inf])
 
 
 def checked(axis, scatter, excess, kind):
