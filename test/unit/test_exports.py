@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from result_making import NAMES, good_calibration
+from result_making import dofs, good_calibration
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.cli.main import main
@@ -16,7 +16,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.installed import open_installed
 from hand_eye_calib.io.results import save_result
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.exports import arranged, formats, role_of
 
 OFFSET_S = 0.0125
@@ -62,9 +62,7 @@ def result(parent="imu", child="camera", **changes):
 
 def unknown(*axes):
     """What makes some axes unobservable."""
-    verdicts = [DofVerdict.UNOBSERVABLE if name in axes else DofVerdict.OBSERVED for name in NAMES]
-    dofs = tuple(map(DofObservability, NAMES, verdicts, [0.001] * 6))
-    return {"status": SolveStatus.UNOBSERVABLE, "observability": dofs}
+    return {"status": SolveStatus.UNOBSERVABLE, "observability": dofs([0.001] * 6, axes)}
 
 
 def document(text):

@@ -1,5 +1,5 @@
-"""Scale: estimated for every method, by whatever motion there is, with outliers, with its standard
-deviation.
+"""Scale and clock offset: estimated by whatever motion there is, with outliers, with their standard
+deviations, and refused where the evidence is weak.
 """
 
 import dataclasses
@@ -11,14 +11,19 @@ from motions import (
     as_trajectory,
     child_of,
     disturbed,
+    feed,
     planar_poses,
     wandering_poses,
 )
 
 from hand_eye_calib.alignment.similarity import estimate_scale
+from hand_eye_calib.alignment.time_offset import correlate_rates, estimate_time_offset
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 
 
@@ -92,3 +97,161 @@ def test_a_scale_that_explains_nothing_is_refused():
     with pytest.raises(NotEnoughDataError, match="scale cannot be estimated: even with a scale"):
         calibrate(parent, other, reference="B10", scale="estimate")
     assert calibrate(parent, other, reference="B10", scale="auto").scale == 1.0
+
+
+# ---- the clock offset
+
+
+RATES_HZ = 20.0, 33.0
+
+
+def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=wandering_poses):
+    """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is
+    the offset to find.
+    """
+    truth = as_trajectory(wander(seconds * 10, seed), 10.0)
+    start_ns, end_ns = (int(stamp) for stamp in truth.stamps_ns[[0, -1]])
+
+    def sampled(rate_hz, first_ns):
+        stamps_ns = np.arange(first_ns, end_ns, round(1e9 / rate_hz))
+        return stamps_ns, truth.at(stamps_ns)
+
+    stamps_ns, poses = sampled(hz[0], start_ns)
+    parent = Trajectory(stamps_ns, disturbed(poses, seed + 1, noise, noise))
+    stamps_ns, poses = sampled(hz[1], start_ns + 7_000_000)
+    child = Trajectory(stamps_ns, disturbed(child_of(poses), seed + 2, noise, noise)).shifted(
+        -shift_s
+    )
+    return parent, child
+
+
+@pytest.mark.parametrize("shift_s", [0.0, 0.1234, -3.7, 500.0, -12345.678])
+def test_any_offset_is_found_also_without_common_time(shift_s):
+    found = estimate_time_offset(*drive(shift_s=shift_s, noise=0.0005))
+    assert found.seconds == pytest.approx(shift_s, abs=0.002)
+    assert found.correlation.is_clear
+    assert found.sigma_s < 0.002
+
+
+def test_a_body_that_rotates_about_one_of_its_sensors():
+    """No scale shows, and the offset does all the same."""
+
+    def rotating(n_poses, seed):
+        poses = wandering_poses(n_poses, seed)
+        poses[:, :3, 3] = 0.0
+        return poses
+
+    found = estimate_time_offset(*drive(shift_s=0.1234, noise=0.002, wander=rotating))
+    assert found.seconds == pytest.approx(0.1234, abs=0.002)
+    assert found.sigma_s < 0.002
+
+
+def test_standard_deviation_of_the_offset_is_of_the_size_of_the_errors():
+    found = [estimate_time_offset(*drive(seed, shift_s=1.5, noise=0.003)) for seed in range(12)]
+    ratios = [(offset.seconds - 1.5) / offset.sigma_s for offset in found]
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 3.0
+
+
+def test_jumps_do_no_harm():
+    parent, child = drive(shift_s=41.0, noise=0.001)
+    poses = child.poses.copy()
+    random = np.random.default_rng(3)
+    jumping = random.random(len(child)) < 0.05
+    poses[jumping] = poses[jumping] @ se3.exp(random.normal(size=(int(jumping.sum()), 6)) * 0.5)
+    assert estimate_time_offset(
+        parent, dataclasses.replace(child, poses=poses)
+    ).seconds == pytest.approx(41.0, abs=0.01)
+
+
+def test_angular_rates_do_not_depend_on_conventions():
+    parent, child = drive(shift_s=8.0)
+    plain = correlate_rates(parent, child).offset_s
+    inverse = dataclasses.replace(child, poses=se3.inverse(child.poses))
+    reordered = Trajectory.from_quat_xyzw(
+        child.stamps_ns, child.poses[:, :3, 3], np.roll(se3.to_quat_xyzw(child.poses), 1, axis=1)
+    )
+    for stream in (inverse, reordered):
+        assert correlate_rates(parent, stream).offset_s == pytest.approx(plain, abs=1e-6)
+
+
+class TestWeakEvidenceIsRefused:
+    def test_streams_that_have_nothing_to_do_with_each_other(self):
+        for seed in range(5):
+            with pytest.raises(
+                NotEnoughDataError,
+                match="time offset cannot be estimated: .*(correlated by|times better)",
+            ):
+                estimate_time_offset(drive(seed)[0], drive(seed + 50)[1])
+
+    def test_motion_without_turns(self):
+        poses = np.tile(np.eye(4), (300, 1, 1))
+        poses[:, 0, 3] = np.linspace(0, 50, 300)
+        straight = as_trajectory(poses)
+        with pytest.raises(NotEnoughDataError, match="hardly rotate"):
+            estimate_time_offset(straight, straight)
+
+    def test_motion_that_is_too_short(self):
+        parent, child = drive()
+        with pytest.raises(NotEnoughDataError, match="give time_offset in seconds"):
+            estimate_time_offset(parent[:40], child[:60])
+
+
+class TestClockRate:
+    def test_it_is_found_unasked_and_the_answer_is_as_without(self):
+        parent, child = drive(seconds=300, hz=(10.0, 10.0), noise=0.001)
+        middle_ns = int(child.stamps_ns[len(child) // 2])
+        slow = child.shifted(0.0, -75e-6, middle_ns)
+        found, plain = calibrate(parent, slow), calibrate(parent, child)
+        assert found.clock_rate.is_used
+        assert abs(found.clock_rate.ppm - 75.0) < min(5.0, 5.0 * found.clock_rate.sigma_ppm)
+        assert "ppm slow: solved with time_offset estimate" in found.warnings[0]
+        away = se3.log(se3.inverse(plain.T_parent_child) @ found.T_parent_child)
+        assert np.abs(away / np.sqrt(np.diag(plain.covariance))).max() < 0.3
+        again = type(found).from_dict(found.to_dict())
+        assert again.clock_rate == found.clock_rate
+
+    def test_one_that_is_not_there_is_stated_and_not_used(self):
+        found = estimate_time_offset(*drive(shift_s=0.3, noise=0.001))
+        assert abs(found.rate.ppm) < 5.0 * found.rate.sigma_ppm
+        assert not found.rate.is_used
+
+
+class TestInTheEngine:
+    def test_uncertainty_of_the_offset_enters_that_of_the_extrinsic(self):
+        parent, child = drive(noise=0.0005)
+        estimated = calibrate(parent, child, time_offset="estimate", reference="B5")
+        assert 0 < estimated.time_offset_sigma_s < 0.002
+        again = type(estimated).from_dict(estimated.to_dict())
+        assert again.time_offset_sigma_s == estimated.time_offset_sigma_s
+        given = calibrate(parent, child, time_offset=estimated.time_offset_s, reference="B5")
+        np.testing.assert_array_equal(given.T_parent_child, estimated.T_parent_child)
+        assert given.time_offset_sigma_s == 0.0
+        assert np.linalg.eigvalsh(estimated.covariance - given.covariance)[-1] > 0
+
+    def test_long_sessions_settle_it_when_a_buffer_is_full(self):
+        parent, child = drive(seconds=120, shift_s=0.2)
+        calibrator = Calibrator(
+            CalibratorConfig(time_offset="estimate", reference="B5"), BufferLimits(capacity=900)
+        )
+        for part in range(8):
+            for stream, trajectory in (("parent", parent), ("child", child)):
+                first, last = (k * len(trajectory) // 8 for k in (part, part + 1))
+                feed(calibrator, stream, trajectory[first:last])
+        snapshot = calibrator.snapshot()
+        assert len(snapshot.kept) > 0
+        assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
+        result = snapshot.estimate()
+        assert result.time_offset_s == snapshot.time_offset.seconds
+        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
+
+    def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self):
+        calibrator = Calibrator(
+            CalibratorConfig(time_offset="estimate"), BufferLimits(capacity=300)
+        )
+        for stream, trajectory in zip(
+            ("parent", "child"), (drive(1)[0], drive(77)[1]), strict=True
+        ):
+            feed(calibrator, stream, trajectory)
+        assert calibrator.statistics("child").dropped_unpaired > 0
+        with pytest.raises(NotEnoughDataError):
+            calibrator.estimate()

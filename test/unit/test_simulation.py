@@ -10,7 +10,6 @@ import pytest
 from published_data import data_folder
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.cli import main
 from hand_eye_calib.cli import simulate as simulate_command
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files.reading import read_trajectory
@@ -141,14 +140,9 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
 # --- the command ----------------------------------------------------------------------
 
 
-def simulate(capsys, *arguments):
-    code = main.main(["simulate", *map(str, arguments)])
-    return code, *capsys.readouterr()
-
-
-def test_command_writes_the_published_layout(tmp_path, capsys):
+def test_command_writes_the_published_layout(tmp_path, run):
     given = ["--runs", "3", "--seed", "4", "--poses", "20", "--mixture"]
-    code, output, _ = simulate(capsys, "--out", tmp_path / "sims", *given)
+    code, output, _ = run("simulate", "--out", tmp_path / "sims", *given)
     assert (code, output) == (0, f"3 recordings written to {tmp_path / 'sims'}\n")
     folders = sorted((tmp_path / "sims").iterdir())
     assert [path.name for path in folders] == ["run_01", "run_02", "run_03"]
@@ -167,11 +161,11 @@ def test_command_writes_the_published_layout(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
 )
-def test_command_writes_bags(tmp_path, capsys, storage, name):
+def test_command_writes_bags(tmp_path, run, storage, name):
     from hand_eye_calib.io.bags.reader import PoseBag
 
     given = f"--drive hilly --poses 30 --bag {storage}".split()
-    assert simulate(capsys, "--out", tmp_path / "sims", *given)[0] == 0
+    assert run("simulate", "--out", tmp_path / "sims", *given)[0] == 0
     drive = simulate_drive((0, 0), dataclasses.replace(HILLY_DRIVE, poses=30), REALISTIC)
     with PoseBag(tmp_path / "sims" / "run_01" / name) as bag:
         topics = simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC
@@ -183,10 +177,10 @@ def test_command_writes_bags(tmp_path, capsys, storage, name):
         np.testing.assert_array_equal(ours.poses[:, :3], trajectory.poses[:, :3, 3])
 
 
-def test_command_overwrites_nothing(tmp_path, capsys):
+def test_command_overwrites_nothing(tmp_path, run):
     precious = tmp_path / "thesis.txt"
     precious.write_text("results")
-    code, _, error = simulate(capsys, "--out", tmp_path)
+    code, _, error = run("simulate", "--out", tmp_path)
     assert (code, len(error.splitlines())) == (1, 1)
     assert "not empty" in error
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
