@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.alignment.time_offset import TimeOffset, correlate_rates
+from hand_eye_calib.alignment.time_offset import TimeOffset, correlate_rates, glance, refine_time_offset
 from hand_eye_calib.checks.check import (
     CheckResult,
     check_offset,
@@ -30,6 +30,9 @@ from hand_eye_calib.results.records import AXES
 #: Called with the share that is done, 0 to 1, and the step that begins.
 Progress: TypeAlias = Callable[[float, str], None]
 Options: TypeAlias = Mapping[str, Any]
+
+# What a clock that differs asks for.
+_ESTIMATED: Options = {"time_offset": "estimate"}
 
 # Findings whose options are certain; and options that repair a stream: the second solve proves it.
 _MENDED = ("time_offset", "scale", "units")
@@ -85,6 +88,10 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     """
     tell = progress or (lambda share, step: None)
     tell(0.0, "solving")
+    other = _on_another_clock(snapshot, checks)
+    if other and _is_sound(other):
+        tell(1.0, "done")
+        return _telling(other, _ESTIMATED, ())
     try:
         found = Run(snapshot.estimate(cross_check=checks), snapshot)
     except NotEnoughDataError:
@@ -97,9 +104,28 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     else:
         if checks is not False:
             tell(0.8, "checking the streams")
-            found = review(found.calibration, snapshot)
+            found = _reviewed(_checked(found.calibration, snapshot), (), other)
     tell(1.0, "done")
     return found
+
+
+def _on_another_clock(snapshot: Snapshot, checks: bool | None) -> Run | None:
+    """The run with an estimated time offset, if the angular rates show clearly that the clocks
+    differ; None otherwise, or if no solve is saved by looking first.
+    """
+    config = snapshot.config
+    is_free = config.method in ("auto", "adaptive") and config.reference == "auto"
+    if checks is False or not is_free or config.measured != "poses" or len(snapshot.kept):
+        return None
+    if "time_offset" in config.given or not snapshot.correlation.is_clear:
+        return None
+    streams = *snapshot.streams, snapshot.correlation, snapshot.max_gap_s
+    look = glance(*streams, least_s=MOST_MOVED_S)
+    if look.fit is None or abs(look.seconds) - 3.0 * look.sigma_s < MOST_MOVED_S:
+        return None
+    offset = refine_time_offset(*streams, start=look.fit)
+    other = replace(snapshot, config=replace(config, **_ESTIMATED), time_offset=offset)
+    return _solved_with(other, {})
 
 
 def review(
@@ -114,7 +140,8 @@ def review(
     return _reviewed(_checked(calibration, snapshot), settled)
 
 
-def _reviewed(first: Run, settled: Collection[str]) -> Run:
+def _reviewed(first: Run, settled: Collection[str], known: Run | None = None) -> Run:
+    """The same of a run; ``known`` is the one with an estimated time offset, if it was tried."""
     calibration, snapshot, found = first.calibration, first.snapshot, first.check.findings
     given = snapshot.config.given.union(settled)
     options = _certain(found, given)
@@ -130,25 +157,25 @@ def _reviewed(first: Run, settled: Collection[str]) -> Run:
             moved_s = max(abs(moved_s), left_s - 0.5 * clock.spread_s)
     most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else MOST_MOVED_S
     if "time_offset" not in given and abs(moved_s) >= most_s:
-        options = {"time_offset": "estimate", **options}
-    second = _improved(first, options, by=least) if options else None
-    return _telling(second, options, found) if second else first
+        options = {**_ESTIMATED, **options}
+    second = known if options == _ESTIMATED else None
+    second = second or (_solved_with(first.snapshot, options) if options else None)
+    if not second:
+        return first
+    (n_first, fit_first), (n_second, fit_second) = map(_against, (first, second))
+    is_better = n_second <= n_first - least and fit_second >= fit_first
+    return _telling(second, options, found) if is_better or _is_sound(second) else first
 
 
-def _improved(first: Run, options: Options, by: int) -> Run | None:
-    """A second run with other options, if nothing speaks against it, or at least so many findings
-    fewer than against the first and its noise model fits as well.
-    """
-    if not (second := _solved_with(first.snapshot, options)):
-        return None
-    serious, fits = [], []
-    for each in (first, second):
-        noise = each.calibration.noise
-        fits.append(noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT)
-        serious.append(sum(one.severity is not Severity.NOTE for one in each.check.findings))
-    is_sound = fits[1] and not serious[1]
-    is_better = serious[1] <= serious[0] - by and fits[1] >= fits[0]
-    return second if is_sound or is_better else None
+def _against(found: Run) -> tuple[int, bool]:
+    """How many findings speak against a run, and whether its noise model fits."""
+    noise = found.calibration.noise
+    serious = sum(one.severity is not Severity.NOTE for one in found.check.findings)
+    return serious, noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
+
+
+def _is_sound(found: Run) -> bool:
+    return _against(found) == (0, True)
 
 
 def _repaired(
