@@ -119,8 +119,8 @@ def solve_without(
 ) -> FloatArray:
     """Solve again without some of the pairs, for resampling.
 
-    A few pairs less may change the choice of the inliers and with it the answer. So the search
-    starts both at the full answer and by annealing.
+    A few pairs less may change the choice of the inliers and with it the answer, which is followed
+    from the full one.
 
     Parameters
     ----------
@@ -133,13 +133,8 @@ def solve_without(
     """
     fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
     search = _Search(quadratic_form.condense(pairs), threshold, fewest)
-    everything = near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
-    for _ in range(_STEPS_OVER_ALL):
-        everything = search.refit((~left_out).astype(float), everything)
-    starts = np.concatenate([near, search.anneal(everything, left_out)])
-    answers, objectives = search.settle(starts, _CONVERGED, np.tile(left_out, (2, 1)))
-    nearby, other = np.split(answers, 2)
-    return np.where(np.less(*np.split(objectives, 2))[:, None, None], nearby, other)
+    near = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
+    return search.settle(near, _CONVERGED, left_out)[0]
 
 
 def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatArray, FloatArray]:
@@ -225,17 +220,17 @@ class _Search:
         order = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")
         return Ts[(order[:, :_FOLLOWED] + [[0], [started]]).ravel()]
 
-    def anneal(self, Ts: FloatArray, left_out: BoolArray | None = None) -> FloatArray:
+    def anneal(self, Ts: FloatArray) -> FloatArray:
         """Graduated non-convexity from each start (S, 4, 4), with the truncation at c or at the
         d-th smallest cost, whichever is larger.
         """
         last = max(math.ceil(self.floor) - 1, 0)
         sharpness = np.zeros(len(Ts))
         while True:
-            costs = self.costs(Ts, left_out)
+            costs = self.costs(Ts)
             cut = np.maximum(self.threshold, np.partition(costs, last)[:, last])
             if not sharpness.any():
-                largest = np.max(costs, axis=1, initial=0.0, where=costs < _NEVER)
+                largest = costs.max(axis=1)
                 sharpness = np.maximum(cut / np.maximum(2 * largest - cut, cut), 1e-4)
             if sharpness.min() >= _SHARP:
                 return Ts
