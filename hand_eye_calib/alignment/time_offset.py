@@ -19,7 +19,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MAX_PAIRS, find_leap, pairs_over, synchronise
 from hand_eye_calib.results.records import ClockRate
-from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.stats import quantile
 
 # Angles are taken over windows of this many sampling steps, and at least so long, so that the noise
@@ -323,33 +322,13 @@ def refine_time_offset(
     return replace(best, spread_s=np.ptp(held)) if len(held) == len(_LAGS_S) else best
 
 
-def glance(
-    parent: Trajectory,
-    child: Trajectory,
-    correlation: Correlation,
-    max_gap_s: float,
-    least_s: float,
-) -> TimeOffset:
-    """What motions over one time say of the offset, no better than ``least_s`` asks for, in a
-    tenth of the time; without a fit if they do not explain the motion.
-    """
-    shifted = child.shifted(correlation.offset_s)
-    pairs = pairs_over(synchronise(parent, shifted, max_gap_s), _LAGS_S[0])
-    if len(pairs) < MIN_PAIRS:
-        return TimeOffset(correlation.offset_s, np.inf, correlation)
-    start = Method("dnlo").solve(pairs).T_parent_child
-    found = _fine_offset(parent, child, correlation, _LAGS_S[0], max_gap_s, start, least_s)
-    holds = found.fit is not None and found.fit.explains_translation
-    return found if holds else replace(found, fit=None)
-
-
 def _fine_offset(
     parent: Trajectory,
     child: Trajectory,
     correlation: Correlation,
     lag_s: float,
     max_gap_s: float,
-    start: SimilarityFit | FloatArray | None,
+    fit: SimilarityFit | None,
     least_s: float,
 ) -> TimeOffset:
     """Offset and fit over motions of ``lag_s``; no fit if there are too few. A clearly smaller
@@ -358,7 +337,7 @@ def _fine_offset(
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
     offset_s, most_pairs, settled_s = correlation.offset_s, MAX_PAIRS, max(_SETTLED_S, least_s / 20)
-    rate, fit = ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns), start
+    rate = ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
     for _ in range(_MAX_ROUNDS):
         shifted = child.shifted(offset_s, rate.used, rate.at_ns)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
@@ -390,7 +369,7 @@ def _fine_offset(
                 break
             most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
     known = rate if np.isfinite(rate.sigma_ppm) else None
-    assert isinstance(fit, SimilarityFit)
+    assert fit is not None
     return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known)
 
 
