@@ -60,7 +60,7 @@ _MOST, _SOME = 0.3, 0.1
 # evidence. Smallest smoothing (s^2); that of interpolation is a share of the squared interval.
 _SHORT_S, _MOST_SHORT = 1.0, 6000
 _DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
-_SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.1
+_SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
 
 # Orientations are copies if they agree to this angle, several times better than any two sensors of
 # the recordings at hand, and so many times better than each stream is rough: slow motion is smooth,
@@ -153,9 +153,8 @@ def _rotation_gain(slow: Regression, axes: FloatArray) -> _Suspect:
     fitted, biases = slow.fit("gain"), slow.biases("gain")
     sigmas, least, *_ = LIMITS["rotation_gain"]
     limits = np.maximum(sigmas * fitted.sigmas, _BIASES * biases)
-    powers = 1.0 / biases
     ratios = np.abs(fitted.values) / np.maximum(limits, least)
-    ratios = np.where(powers > _LITTLE**2 * powers[0], ratios, 0.0)
+    ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
         return fitted.share, None
@@ -262,15 +261,18 @@ def _delays(
 
 
 def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Suspect]:
-    """Smoothing of one part of the poses."""
+    """Smoothing of one part of the poses: an error by what it displaces, a warning by what its time
+    is at this speed.
+    """
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
             fitted = fast.fit(f"{part}_{stream}", f"late_{stream}")
             value_s2, sigma_s2 = float(fitted.values[0]), float(fitted.sigmas[0])
             if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
-                smoothing_s = float(np.sqrt(value_s2))
-                shift_m = smoothing_s * speed
-                values = {"part": part, "smoothing_s": smoothing_s, "shift_m": shift_m}
+                smoothing_s = value_s2**0.5
+                displaced_m = value_s2 * float(fast.displaced(f"{part}_{stream}")[0])
+                shift_m = max(displaced_m, min(smoothing_s * speed, LIMITS["smoothed"][-1]))
+                values = {"part": part, "smoothing_s": smoothing_s, "shift_m": displaced_m}
                 yield fitted.share, graded("smoothed", stream, shift_m, **values)
 
 

@@ -31,13 +31,14 @@ from hand_eye_calib.stats import median, robust_sigma
 
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
-_STEP_S, _TOLERANCE = 0.1, 0.3
+_STEP_S, _TOLERANCE = 0.05, 0.3
 _BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING, _ROUNDS = 3.0, 4
 
 _Columns: TypeAlias = Mapping[str, FloatArray]
+_Where: TypeAlias = Mapping[str, list[int]]
 
 
 @dataclass(frozen=True)
@@ -52,16 +53,18 @@ class Fitted:
 
 
 class Regression:
-    """Robust linear regression of rows (K, r, p + 1), in standard deviations, the values last, on
-    groups of the p columns: by name, where they are; those of ``base`` in every fit. Rows are in
-    order of time. What is left is to be orthogonal to the ``probes``, a table like that of the
-    rows: of columns without their noise, if there are such.
+    """Robust linear regression of rows (K, 6, p + 1) of displacements and rotations, the values
+    last, in ``units`` (6, 1), on groups of the p columns: by name, where they are; those of
+    ``base`` in every fit. Rows are in order of time. What is left is to be orthogonal to the
+    ``probes``, a table like that of the rows: of columns without their noise, if there are such.
     """
 
     def __init__(
-        self, rows: FloatArray, probes: FloatArray, where: Mapping[str, list[int]], *base: str
+        self, rows: FloatArray, probes: FloatArray, units: FloatArray, where: _Where, *base: str
     ) -> None:
         self._where, self._base = where, base
+        self._displaced = np.sqrt((rows[:, :3] ** 2).sum(axis=1).mean(axis=0))
+        rows, probes = rows / units, probes / units
         n_rows, size, n_columns = rows.shape
         flat = rows.reshape(-1, n_columns)
         known = flat[:, [*self._columns(), n_columns - 1]]
@@ -91,6 +94,10 @@ class Regression:
         """
         at = self._where[group]
         return np.asarray(self._sigma**2 * self._weight / np.maximum(self._squares[at, at], 1e-300))
+
+    def displaced(self, group: str) -> FloatArray:
+        """Root mean square (m,) of the displacements that each value of a group makes, per unit."""
+        return np.asarray(self._displaced[self._where[group]])
 
     def fit(self, group: str, *beside: str, without: str = "") -> Fitted:
         """Fit a group beside the base, or what is left of it, and ``beside`` other groups."""
@@ -299,8 +306,7 @@ def _regression(
     starts = zip(columns, [0, *ends], ends, strict=False)
     where = {name: list(range(start, end)) for name, start, end in starts}
     rows = np.concatenate([*columns.values()], axis=2)
-    rows /= units
     probing = rows.copy()
     for name, each in (_of_mount(child, child) | dict(probes)).items():
-        probing[:, :, where[name]] = each / units
-    return Regression(rows, probing, where, *of_mount, *base)
+        probing[:, :, where[name]] = each
+    return Regression(rows, probing, units, where, *of_mount, *base)

@@ -31,8 +31,8 @@ _SAME, _MOVES, _FROZEN_S = 1e-6, 0.02, 1.0
 # longer lag (in poses), by at least so many metres. Repeated poses are another matter.
 _ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M, _MAX_REPEATS = 2.0, 6, 0.01, 0.1
 # Their levels are steady over so many turns, in the world or in the sensor's axes, and make up this
-# share of the roughness: a body that shakes at about half the rate of the poses does not keep step.
-_TURNS, _STEADY_SHARE = 10, 0.5
+# share of the roughness: a body that shakes, or walks, in step with the poses soon falls out of it.
+_TURNS, _STEADY_SHARE = 40, 0.6
 
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
 # of the smallest, to this share of a step.
