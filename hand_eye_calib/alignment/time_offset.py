@@ -84,6 +84,8 @@ class Correlation:
         Time that both streams have in common at that offset.
     variation : float
         Standard deviation of the angular rate, of the stream that varies less, rad/s.
+    ratio : float
+        Of the child's angular rates to the parent's.
     """
 
     offset_s: float = 0.0
@@ -91,6 +93,7 @@ class Correlation:
     distinctness: float = 0.0
     overlap_s: float = 0.0
     variation: float = 0.0
+    ratio: float = 1.0
 
     @property
     def is_clear(self) -> bool:
@@ -138,7 +141,7 @@ def correlate_rates(
     )
     if min(np.isfinite(each).sum() for each in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
         return Correlation()
-    lags, coefficients, overlaps = _masked_correlation(of_parent, of_child)
+    lags, coefficients, overlaps, ratios = _masked_correlation(of_parent, of_child)
     durations = overlaps * step_s
     shorter_s = min(len(of_parent), len(of_child)) * step_s
     enough = durations >= max(_MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S)
@@ -159,6 +162,7 @@ def correlate_rates(
         distinctness=float(significance[best] / max(rivals.max(initial=-np.inf), 1.0)),
         overlap_s=float(durations[best]),
         variation=min(float(np.nanstd(rates)) for rates in (of_parent, of_child)),
+        ratio=float(ratios[best]),
     )
 
 
@@ -187,9 +191,9 @@ def angular_rates(
 
 def _masked_correlation(
     first: FloatArray, second: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Lags, correlation coefficients and counts of common samples of rates: first[i + lag] against
-    second[i], NaNs left out.
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Lags, correlation coefficients, counts of common samples, and how many times the second is as
+    large, of rates: first[i + lag] against second[i], NaNs left out.
     """
     size = 1 << (len(first) + len(second) - 1).bit_length()
     spectra = []
@@ -210,9 +214,10 @@ def _masked_correlation(
     varied = variance_a > 1e-9 * square_a.max(initial=0.0)
     varied &= variance_b > 1e-9 * square_b.max(initial=0.0)
     scale = np.sqrt(np.where(varied, variance_a * variance_b, 1.0))
+    ratios = np.where(varied, variance_b, 1.0) / np.where(varied, variance_a, 1.0)
     lags = np.arange(size)
     lags = np.where(lags < len(first), lags, lags - size)
-    return lags, np.where(varied, covariance / scale, 0.0), count
+    return lags, np.where(varied, covariance / scale, 0.0), count, ratios
 
 
 @dataclass(frozen=True)

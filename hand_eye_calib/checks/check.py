@@ -35,6 +35,7 @@ from hand_eye_calib.checks.agreement import (
 )
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.checks.hypotheses import (
+    HOLDS,
     LAGS_S,
     MAX_PAIRS,
     MIN_PAIRS,
@@ -117,6 +118,10 @@ def check_streams(
     if any(each.makes_unusable for each in findings):
         return CheckResult(gravest_first(findings))
     correlation = correlation or correlate_rates(parent, child, max_gap_s)
+    times = correlation.ratio
+    turns = graded("turns", "child", float(np.log(times)), times=times)
+    if turns and 1.0 - correlation.correlation < HOLDS:
+        return CheckResult(gravest_first([*findings, turns]))
     streams, correlation = _on_one_clock(
         StreamPair(parent, child.scaled(scale), max_gap_s), time_offset_s, correlation
     )

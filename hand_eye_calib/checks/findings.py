@@ -81,7 +81,8 @@ _ROWS = {
     "unrelated": _Row(
         "{text}",
         "check that both sensors are on one rigid body, that the streams are those of the sensors, "
-        "of the same recording and in known units, and the clocks (time_offset estimate)",
+        "of the same recording and in known units, the clocks (time_offset estimate), and of a "
+        "file with angles whether they are of yaw or heading (clockwise from north)",
     ),
     "no_turning": _Row(
         "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
@@ -121,7 +122,8 @@ _ROWS = {
     ),
     "axes": _Row(
         "{whose} positions are in other axes than its orientations: (x, y, z) should be ({detail})",
-        "write positions and orientations in the same right-handed axes",
+        "write positions and orientations in the same right-handed axes; of angles in a file name "
+        "the column heading if they are clockwise from north, otherwise yaw",
     ),
     "ambiguous": _Row(
         "this motion does not tell that from {whose} positions in other axes, (x, y, z) for "
@@ -188,6 +190,13 @@ _ROWS = {
         "calibrate that scale first",
         "a gyroscope or wheel base with a wrong scale, in either stream",
     ),
+    "turns": _Row(
+        "the child rotates {times:.2g} times as far as the parent, whenever it does",
+        "correct its orientations: a quaternion has half the angle, angles in a file the unit that "
+        "the header names, such as yaw_deg",
+        "radians read as degrees, or half or twice the angles",
+        code="rotation_gain",
+    ),
     "late": _Row(
         "{whose} {part} are {delay_s:.3f} +/- {sigma_s:.3f} s late against its {others}: at this "
         "speed a shift of {shift_m:.2g} m",
@@ -248,6 +257,7 @@ LIMITS = {
     "late": (4.5, 0.008, 0.008, 0.05),
     "smoothed": (8.0, 0.008, 0.008, 0.05),
     "rotation_gain": (6.0, 0.003, 0.003, 0.03),  # of the factor, less 1
+    "turns": (0.0, 0.4, 0.4, 0.4),  # logarithm of a factor that noise does not cause
     "axis_scale": (6.0, 0.015, 0.015, 0.05),  # of the factor, less 1
     "worlds_turned": (6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),  # rad
     # Share of the speed: the direction is then off by half the usual target of a rotation.

@@ -240,8 +240,10 @@ def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, st
     count = known.get("messages", known.get("poses"))
     row = {"name": name, "source": known.get("topic") or Path(known.get("file", "-")).name}
     row |= dict.fromkeys(("poses", "rate", "duration", "gap", "path"), "-")
-    # In a very long recording only the newest poses are at hand: of the stream as a whole they say
-    # nothing.
+    # Of a bag only poses of pairs are at hand, of a long one the newest: they say nothing of gaps.
+    ends_ns = [known[name] for name in ("first_stamp_ns", "last_stamp_ns") if known.get(name)]
+    if count and ends_ns and (seconds := (ends_ns[-1] - ends_ns[0]) * 1e-9):
+        row |= {"duration": duration(seconds), "rate": f"{(count - 1) / seconds:.1f} Hz"}
     if stream is not None and len(stream) >= max(2, count or 0):
         whole, count = summarise(stream), len(stream)
         row |= {"gap": f"{whole.longest_interval_s:.2f} s", "rate": f"{whole.rate_hz:.1f} Hz"}

@@ -177,7 +177,8 @@ def what_is_known(result: Result) -> str:
             worst = max(known, key=lambda axis: axis.total)
             texts.append(amount(worst.name, worst.total))
     if not result.out_of_reach:
-        return f"all six axes are known to {listing(texts)} or better, one standard deviation"
+        known_to = " along and ".join(texts)
+        return f"all six axes are known to {known_to} about them or better, one standard deviation"
     return (
         f"{listing([axis.name for axis in axes])} are known to {listing(texts)} or better, one "
         f"standard deviation; {listing(result.out_of_reach)} are out of reach of these streams"
@@ -285,7 +286,10 @@ def _floor(result: Result) -> Iterator[_Found]:
             "constant odometry errors, which no recording can show, limit the knowledge of "
             f"{listing(told)}: more than the target of {targets}"
         )
-        advice = "compare several recordings; give parent_kind or child_kind exact if one is"
+        advice = (
+            "set the target that you need; if a stream has no such errors, such as motion capture, "
+            "give parent_kind or child_kind exact"
+        )
         yield text, advice, names, {}
 
 

@@ -230,11 +230,14 @@ def test_without_the_library_mcap_whole_files_are_read(tmp_path, monkeypatch):
 def test_paths_that_are_no_bag(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "folder").mkdir()
+    (tmp_path / "runs/one/bag").mkdir(parents=True)
+    (tmp_path / "runs/one/bag/bag.mcap").touch()
     os.mkfifo(tmp_path / "fifo.mcap")
     messages = {
         "absent": "no bag at .*absent",
         "notes.txt": r"notes\.txt is not a bag; expected",
         "folder": r"no bag in .*: expected files that end in .*check the path",
+        "runs": "no bag in .*; give .*runs/one/bag ",
         "fifo.mcap": r"fifo\.mcap is not a bag; expected",
     }
     for suffix in ("bag", "mcap", "db3"):

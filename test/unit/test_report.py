@@ -238,11 +238,8 @@ def test_hostile_names_stay_text():
     finding = Finding(
         code="x", severity=Severity.NOTE, stream="<em>", what="<img src=x>", advice="</li>"
     )
-    inputs = {
-        "parent": {"topic": "<em>"},
-    }
     calibration = dataclasses.replace(calibration, findings=(finding,))
-    _, page = page_of(snapshot, calibration, inputs=inputs)
+    _, page = page_of(snapshot, calibration, inputs={"parent": {"topic": "<em>"}})
     assert {"script", "img", "em"} & {tag for tag, _ in page.elements} == set()
     for name in (*hostile, "<img src=x>"):
         assert name in page.text
@@ -353,10 +350,12 @@ def test_no_page_names_folders(hilly):
         "bag": folder,
         "journal": {"directory": f"{folder}/test_report.py"},
         "parent": {"file": f"{folder}/test_report.py", "poses": 3},
-        "child": {"topic": "/camera/odometry"},
+        "child": {"topic": "/camera/odometry", "messages": 6001}
+        | {"first_stamp_ns": 10**9, "last_stamp_ns": 61 * 10**9},
     }
     _, page = page_of(snapshot, calibration, inputs=inputs)
     assert folder not in page.text
+    assert "/camera/odometry 6,001 100.0 Hz" in page.text
     header = page.text[: page.text.index("Contents") if "Contents" in page.text else 600]
     assert "Parent: lidar, from test_report.py; Child: camera, from /camera/odometry." in header
 

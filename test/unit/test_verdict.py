@@ -140,7 +140,8 @@ def test_nothing_against_it_is_use():
     result = good()
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
     assert result.headline == (
-        "USE: all six axes are known to 3 mm and 0.057 deg or better, one standard deviation"
+        "USE: all six axes are known to 3 mm along and 0.057 deg about them or better, one "
+        "standard deviation"
     )
 
 

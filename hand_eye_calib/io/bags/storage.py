@@ -366,8 +366,11 @@ def _files_of(path: Path) -> list[Path]:
     found = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
     found -= {file for file in found if file.suffix == ".zstd" and file.with_suffix("") in found}
     if not found:
+        near = sorted(file.parent for depth in ("*/*", "*/*/*") for file in path.glob(depth))
+        below = next((folder for folder in near if any(map(_suffix, folder.iterdir()))), "")
         raise InputError(
-            f"no bag in {path}: expected files that end in {', '.join(_REPAIRS)}; check the path"
+            f"no bag in {path}: expected files that end in {', '.join(_REPAIRS)}; "
+            + (f"give {below} (--batch takes all below a folder)" if below else "check the path")
         )
     return sorted(found)
 
