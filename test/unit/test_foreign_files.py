@@ -71,7 +71,8 @@ def of_rtklib(weeks=False):
         since = SECONDS - 315_964_800
         times = [f"{int(each // 604_800)} {each % 604_800:.3f}" for each in since]
     head = "% program   : RTKPOST\n%  GPST   latitude(deg) longitude(deg)  height(m)   Q  ns\n"
-    rows = zip(times, LAT, LON, HEIGHT, [1] * N, [9] * N, strict=True)
+    degrees = ([f"{each:.12f}" for each in values] for values in (LAT, LON))
+    rows = zip(times, *degrees, HEIGHT, [1] * N, [9] * N, strict=True)
     return head + joined(rows)
 
 
@@ -113,6 +114,27 @@ def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad", bodies=("drone:drone",)):
     return of_rows(f"{head},{f',{units},mm,mm,mm' * n}\n", range(N), [0] * N, *poses)
 
 
+def of_novatel(short=False):
+    """INSPVAX with a long header, or INSPVA with a short one, among other logs."""
+    head, body, log = "%INSPVASA,{0},{1:.3f};{0},{1:.3f},", "{:.12f},{:.12f},{:.9f},1,2,3,", ""
+    if not short:
+        head = "#INSPVAXA,COM1,0,7.5,FINESTEERING,{0},{1:.3f},0,4e77,4;INS_SOLUTION_GOOD,INS_PSRSP,"
+        body = "{:.12f},{:.12f},{:.9f},45.0,1,2,3,"
+    angles = Rotation.from_quat(Q).as_euler("ZYX", degrees=True) * [-1, -1, 1] + [90, 0, 0]
+    for second, lat, lon, height, turn in zip(SECONDS, LAT, LON, HEIGHT, angles, strict=True):
+        log += head.format(*divmod(second - 315_964_800, 604_800)).replace(".0,", ",", 1)
+        log += body.format(lat, lon, height - (0 if short else 45.0))
+        log += "{2:.9f},{1:.9f},{0:.9f},3*e877c178\n#TIMEA,COM1;VALID*1\n".format(*turn)
+    return log
+
+
+def of_lio_sam():
+    names = "x y z intensity roll pitch yaw time"
+    head = f"# .PCD v0.7\nFIELDS {names}\nSIZE 4 4 4 4 4 4 4 8\nTYPE{' F' * 8}\nPOINTS {N}\n"
+    angles, zeros = Rotation.from_quat(Q).as_euler("xyz"), np.zeros(N)
+    return of_rows(f"{head}DATA ascii\n", P, zeros, angles, SECONDS, separator=" ")
+
+
 def of_rows(header, *values, separator=","):
     """Numbers below a header, each value (N, ...) one or several columns."""
     columns = [np.reshape(each, (N, -1)).tolist() for each in values]
@@ -142,6 +164,10 @@ ROT = "Stamp [ns],Pos_X [m],Pos_Y,Pos_Z,rot_w,rot_x,rot_y,rot_z\n"
 OKVIS = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n"
 ULOG2CSV = "timestamp,position[0],position[1],position[2],q[0],q[1],q[2],q[3]\n"
 ARM = "t,x_ft,y_ft,z_ft,rotvec_x,rotvec_y,rotvec_z\n"
+UNITS = "Device Time,Easting,Northing,H-Ell,qw,qx,qy,qz\n(ns),(mm),(mm),(mm),,,,\n"
+GNSS_POSES = (
+    "# frame_id (timestamp in ns), translation (t_x, t_y, t_z), rotation (q_x, q_y, q_z, q_w)"
+)
 FORMATS = {
     "tum": (of_rows("# of a program of eight words or so\n", SECONDS, P, Q, separator=" "), ""),
     "ids": (
@@ -150,6 +176,9 @@ FORMATS = {
     ),
     "comments": (of_rows(f"// of Xsens\nt,{POSE}", SECONDS, P, Q), ""),
     "seconds_and_nanoseconds": (of_rows(f"#sec,nsec,{POSE}", *divmod(STAMPS, 10**9), P, Q), ""),
+    "units_below": (of_rows(UNITS, STAMPS, P * 1e3, WXYZ), ""),
+    "order_in_a_comment": (of_rows(f"{GNSS_POSES}\n", STAMPS, P, Q), "looks like format csv"),
+    "lio_sam": (of_lio_sam(), "read in rad"),
     "iso": (of_rows(f"time,{POSE}", DATES, P, Q), ""),
     "decimal_comma": (of_rows(f"t,{POSE}", SECONDS, P, Q).replace(",", ";").replace(".", ","), ""),
     "csv_mm_ms": (of_rows(WITH_UNITS.format("ms", "mm"), STAMPS // 10**6, P * 1e3, WXYZ), ""),
@@ -176,6 +205,7 @@ FORMATS = {
     "gpx": (of_gpx(), "above the sea"),
     "rtklib": (of_rtklib(), "18 s ahead of UTC"),
     "rtklib_weeks": (of_rtklib(weeks=True), "18 s ahead of UTC"),
+    "emlid": (of_rtklib().partition("ns\n")[2], "18 s ahead of UTC"),
 }
 MOUNT = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, -1.0, 0.7]))
 
@@ -199,7 +229,7 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
         expected[:, :3, :3], expected[:, :3, 3] = np.eye(3), P - P[0]
     np.testing.assert_allclose(trajectory.poses, expected, atol=2e-6)
     assert note in " ".join(found.guesses)
-    assert trajectory.measures == ("positions" if name in [*FORMATS][-4:] else "poses")
+    assert trajectory.measures == ("positions" if name in [*FORMATS][-5:] else "poses")
     if trajectory.measures == "poses":
         child = Trajectory(trajectory.stamps_ns, TRUTH.poses @ MOUNT)
         np.testing.assert_allclose(calibrated(trajectory, child), MOUNT, atol=1e-6)
@@ -309,12 +339,19 @@ def test_a_log_of_px4(tmp_path, topics):
             "chain",
         ),
         (b'<?xml version="1.0"?>\n<kml></kml>', "export the track as GPX"),
+        (b"FMT, 128, 89, FMT, BBnNZ, Type\n", "a log of ArduPilot; export"),
+        (b"#BESTPOSA,COM1,0,9.5,FINE,1,2,0,0,0;SOL_COMPUTED,1,2*1\n", "without INSPVA"),
+        (b"header {\n  stamp {\n", "messages as text; record"),
+        (b"3.04           OBSERVATION DATA    RINEX VERSION / TYPE\n", "positions with RTKLIB"),
         (b"SQLite format 3\0", "a bag ends in .db3"),
         (
             b"# Frame list\n#   FRAME_ID, RIG_ID, RIG_FROM_WORLD\n1 1 1 0 0 0 0 0 0 0\n",
             "images.txt",
         ),
-        (b"# .PCD v0.7\nVERSION 0.7\n", "points, no trajectory"),
+        (
+            b"# .PCD v0.7\nFIELDS x y z\nSIZE 4\nTYPE F\nDATA ascii\n1 2 3\n",
+            "points, no trajectory",
+        ),
         (b"header:\n  stamp:\n    sec: 1\n", "YAML, no trajectory; record messages as a bag"),
         (of_echo("a,b,c").encode(), "messages without poses"),
         (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
@@ -333,6 +370,15 @@ def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message)
         read_trajectory_file(path, AUTO)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("is_short", [True, False])
+def test_poses_of_an_ins_turn_with_the_heading(tmp_path, is_short):
+    (tmp_path / "log").write_text(of_novatel(is_short))
+    found = read_trajectory_file(tmp_path / "log", AUTO).trajectory
+    np.testing.assert_allclose(found.stamps_ns, STAMPS, atol=1_000_000)
+    np.testing.assert_allclose(found.poses[:, :3, 3], P - P[0], atol=1e-4)
+    np.testing.assert_allclose(found.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4)
 
 
 def test_of_several_bodies_one_is_named(tmp_path):

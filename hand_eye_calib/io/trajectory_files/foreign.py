@@ -37,6 +37,7 @@ from hand_eye_calib.text import shortened
 
 _POSE = (*POSITION, *QUATERNION)
 _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
+_GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
 # Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
@@ -117,19 +118,40 @@ def _of_gpx(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_rtklib(data: bytes, _: str | None) -> _Rows:
-    if b"latitude(deg)" not in data:
+    if b"latitude(deg)" not in data and data.startswith(b"%"):
         raise ValueError("RTKLIB without degrees: set out-solformat to llh, degrees")
-    gps_epoch, rows = 315_964_800, []
+    rows = []
     for line in _lines(data):
         cells = line.replace(",", " ").split()
         if cells and not cells[0].startswith("%"):
             if "/" in cells[0]:
                 stamp = f"{cells[0].replace('/', '-')}T{cells[1]}Z"
             else:
-                stamp = repr(gps_epoch + 604_800 * int(cells[0]) + float(cells[1]))
+                stamp = _of_week(*cells[:2])
             rows.append((stamp, *cells[2:5]))
-    note = "stamps are of GPS time, 18 s ahead of UTC since 2017"
-    return _PLACE, rows, [note] if re.search(rb"(?m)^%\s+GPST\b", data) else ()
+    return _PLACE, rows, () if re.search(rb"(?m)^%\s+(UTC|JST)\b", data) else [_GPS_TIME]
+
+
+def _of_novatel(data: bytes, _: str | None) -> _Rows:
+    """INSPVA and INSPVAX, with a long or a short header."""
+    rows = []
+    for line in _lines(data):
+        head, _, body = line.partition(";")
+        about, cells = head.split(","), body.split(",")
+        if about[0][1:].startswith("INSPVA") and float(cells[2]):  # 0 before there is a solution
+            has_undulation = "INSPVAX" in about[0]
+            height = float(cells[4]) + has_undulation * float(cells[5])
+            week = 5 if line[0] == "#" else 1
+            turn = cells[9:12] if has_undulation else cells[8:11]
+            rows.append((_of_week(*about[week : week + 2]), *cells[2:4], height, *turn))
+    if not rows:
+        raise ValueError("a log of NovAtel without INSPVA or INSPVAX: log one of them")
+    return (*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [_GPS_TIME]
+
+
+def _of_week(week: str, second: str) -> str:
+    """The stamp, s, of a second of a week of GPS."""
+    return repr(315_964_800 + 604_800 * int(week) + float(second))
 
 
 # ---- poses
@@ -246,6 +268,19 @@ def _of_numpy(data: bytes, _: str | None) -> _Rows:
     return names, values.tolist(), ()
 
 
+def _of_pcd(data: bytes, _: str | None) -> _Rows:
+    """Key poses as LIO-SAM saves them: points with angles and a time."""
+    head, form, body = re.split(rb"(?m)^DATA (\w+)\r?\n", data, maxsplit=1)
+    about = {name: values for name, *values in map(str.split, _lines(head))}
+    names, sizes = about["FIELDS"], zip(about["TYPE"], about["SIZE"], strict=True)
+    if "roll" not in names:
+        raise ValueError("points, no trajectory; record the odometry as a bag")
+    if form == b"ascii":
+        return names, map(str.split, _lines(body)), ()
+    kinds = zip(names, [f"<{kind.lower()}{size}" for kind, size in sizes], strict=True)
+    return names, np.frombuffer(body, [*kinds], int(about["POINTS"][0])).tolist(), ()
+
+
 def _of_ulog(data: bytes, _: str | None) -> _Rows:
     """A log of PX4: the odometry of its estimator, or local positions with attitudes."""
     reading = required("pyulog", "a log of PX4", "hand_eye_calib[px4]")
@@ -320,19 +355,26 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
 #: to do instead.
 PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\Asource_timestamp,destination_timestamp": "motions between images, no poses; chain them",
-    rb"\A(<\?xml[^>]*>\s*)?<kml": "KML without times; export the track as GPX",
+    rb"<gpx[\s>]": _of_gpx,
+    rb"\A<": "XML, no trajectory that is read; export the track as GPX, or poses as csv",
+    rb"\AFMT, \d": "a log of ArduPilot; export positions and attitudes as csv, or record a bag",
+    rb"\A\w+ \{\s": "messages as text; record them as a bag",
+    rb"\A[^\n]*RINEX VERSION": "observations of satellites; compute positions with RTKLIB",
     rb"\ASQLite format 3": "a database; a bag ends in .db3, and COLMAP exports its model as text",
     rb"\A(#.*\n)+#\s+FRAME_ID, RIG_ID": "frames of COLMAP; give its images.txt",
-    rb"\A(# \.PCD|VERSION 0?\.7)": "points, no trajectory; record the odometry as a bag",
+    rb"\A(# \.PCD|VERSION 0?\.7)": _of_pcd,
+    rb"\A[#%][A-Z\d]+A,[^;\n]*;": _of_novatel,
     rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML, no trajectory; record messages as a bag; "
     "samples of an arm are a recording of their own",
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
-    rb"<gpx[\s>]": _of_gpx,
     rb"\A(\{|\[\s*[\[{\"\d-])": _of_json,
     rb"\$[A-Z]{2}(GGA|RMC),": _of_nmea,
     rb"\A\d{9,10},\d{1,9},[^,\n]*[A-Za-z/][^,\n]*,": _of_echo,
     rb"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)": _of_rtklib,
+    # As of Emlid, without a header; metres have fewer digits.
+    rb"\A\d{4}/\d\d/\d\d +\S+( +-?\d+\.\d{9,}){2} ": _of_rtklib,
+    rb"\A\d{4}/\d\d/\d\d +\S+ +-?\d+\.\d{4} ": "RTKLIB without degrees: set its format to llh",
     rb"\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW": _of_colmap,
     rb"(?m)^(VERTEX|EDGE)_SE(2|3:QUAT) ": _of_g2o,
     rb"\AFormat Version,": _of_motive,

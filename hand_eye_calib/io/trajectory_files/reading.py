@@ -321,13 +321,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     for pattern, read in PROGRAMS.items():
         if re.search(pattern, head):
             return foreign_table(path, data, read, options.columns, options.measures)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: not a text file; expected lines of a trajectory: save the poses of MATLAB, "
-            "HDF5, Arrow, spreadsheets and pickles as csv, and a model of COLMAP as text"
-        ) from None
+    text = _decoded(path, data)
     number, cells, names, format, header = _beginning(path, text)
     columns, times, guesses = options.columns, options.times, list[str]()
     if options.format != AUTO or columns or times:
@@ -342,6 +336,8 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
             times = beside
             guesses.append(f"stamps read from {beside}; to change that, give `times`")
     is_header = not any(map(NUMBER.fullmatch, cells))
+    if format == "csv" and header is names and not columns:
+        header, number = _completed(header, number, _lines(path, text, number * (names is cells)))
     if columns:
         header = [name.strip() for name in columns.split(",")]
     elif format == "csv":
@@ -362,6 +358,16 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     if format == "kitti" and times is not None:
         table.stamps = _stamps_of(times, table)
     return table
+
+
+def _decoded(path: str | Path, data: bytes) -> str:
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: not a text file; expected lines of a trajectory: save the poses of MATLAB, "
+            "HDF5, Arrow, spreadsheets, receivers and autopilots as csv, a model of COLMAP as text"
+        ) from None
 
 
 def _lines(path: str | Path, text: str, after: int | None = None) -> Iterator[tuple[int, str]]:
@@ -426,6 +432,22 @@ def _beginning(
     else:
         found = "csv", _UNNAMED if n_cells == 8 else None
     return number, cells, names, *found
+
+
+def _completed(
+    names: Sequence[str] | None, number: int, lines: Iterator[tuple[int, str]]
+) -> tuple[Sequence[str] | None, int]:
+    """Names of columns, with units from the row below them, and "t" for a first column without a
+    known name that has stamps since 1970; the number of the last line above the rows.
+    """
+    below, cells = next(((each, _cells(line)) for each, line in lines), (0, [""]))
+    if names and below and not any(map(NUMBER.fullmatch, cells)):
+        if len(cells) == len(names):
+            names = [" ".join(each) for each in zip(names, cells, strict=True)]
+        number, cells = below, next((_cells(line) for _, line in lines), [""])
+    if names and not {"t", "secs", *named_columns(names[:1])[0]} & named_columns(names)[0].keys():
+        names = ["t", *names[1:]] if re.fullmatch(r"\d{10,}(\.\d*)?", cells[0]) else names
+    return names, number
 
 
 def _has_rotation(cells: Sequence[str]) -> bool:

@@ -50,23 +50,23 @@ _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
 _BEGINNINGS = {
     "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
     "v": "v",
-    "q": "q q_ quat_ quaternion_ rot_ orientation_ rotation_",
+    "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
 }
-_OF_POSITION = "{0} t{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
+_OF_POSITION = "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
 _ALIASES = {
-    "t": "t time timestamp timestamps stamp gpstime header_stamp",
+    "t": "t ts time timestamp timestamps stamp gpstime header_stamp",
     "x": _OF_POSITION.format("x") + "easting position0",
     "y": _OF_POSITION.format("y") + "northing position1",
     "z": _OF_POSITION.format("z") + "altitude position2",
     "lat": "lat latitude",
     "lon": "lon long lng longitude",
-    "height": "height h_ell ellipsoidal_height altitude alt",
+    "height": "height ht h_ell ellipsoid_height ellipsoidal_height altitude alt elevation ele",
     "roll": "roll roll_angle",
     "pitch": "pitch pitch_angle",
     "yaw": "yaw yaw_angle theta",
-    "heading": "heading true_heading hdg azimuth",
+    "heading": "heading true_heading platform_heading hdg azimuth",
     "secs": "header_stamp_secs header_stamp_sec stamp_secs stamp_sec secs sec",
     "nsecs": "header_stamp_nsecs header_stamp_nanosec stamp_nsecs stamp_nanosec nsecs nanosec nsec",
     "image": "image",
@@ -82,7 +82,7 @@ _ALIASES = {
 # Names, after each other, that stand for a part of an orientation, or of a position, even if it is
 # not known which.
 _ORIENTED = re.compile(
-    r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|(^|,)(a,b,c|w,p,r|rx,ry,rz)(,|$)"
+    r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
 ).search
 _PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)").search
 
