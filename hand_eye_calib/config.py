@@ -123,7 +123,6 @@ def _prior(axis: str) -> Any:
         f"Prior on {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, "
         f"such as {example}. Empty for none.",
         unit=unit,
-        name=f"prior.{axis}",
         parse=parse_prior,
     )
 
@@ -198,7 +197,6 @@ class CalibratorConfig(OptionSet):
         "rotated by keyframe.min_rotation. 0 switches this off.",
         unit="m",
         within=(0.0, 100.0),
-        name="keyframe.min_translation",
     )
     keyframe_min_rotation: float = option(
         0.0,
@@ -206,14 +204,12 @@ class CalibratorConfig(OptionSet):
         "or moved keyframe.min_translation. 0 switches this off.",
         unit="rad",
         within=(0.0, math.pi),
-        name="keyframe.min_rotation",
     )
     keyframe_min_interval: float = option(
         0.0,
         "Smallest time between pose pairs that are kept.",
         unit="s",
         within=(0.0, 60.0),
-        name="keyframe.min_interval",
     )
     max_gap: float = option(
         0.5,
@@ -259,7 +255,6 @@ class CalibratorConfig(OptionSet):
         "",
         "Prior on the whole pose: X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION, such as "
         "0.4 0 1.85 0 0 -90deg+/-0.05 5deg. Empty for none.",
-        name="prior.transform",
         parse=parse_prior,
     )
     target_translation: float = option(
@@ -268,7 +263,6 @@ class CalibratorConfig(OptionSet):
         "it.",
         unit="m",
         within=(1e-6, 100.0),
-        name="target.translation",
     )
     target_rotation: float = option(
         0.00524,
@@ -276,13 +270,11 @@ class CalibratorConfig(OptionSet):
         "and the stop rule use it.",
         unit="rad",
         within=(1e-6, math.pi),
-        name="target.rotation",
     )
     target_axes: str = option(
         "",
         "Targets of single axes in place of target.translation and target.rotation, such as z=10cm "
         "yaw=0.5deg. Empty for none.",
-        name="target.axes",
         parse=parse_targets,
     )
     parent_frame: str = option(

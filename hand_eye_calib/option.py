@@ -12,6 +12,7 @@ from hand_eye_calib.text import shown_value
 OptionValue: TypeAlias = bool | int | float | str
 OptionField: TypeAlias = dataclasses.Field[Any]
 
+_GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
@@ -23,7 +24,6 @@ def option(
     within: tuple[float, float] | None = None,
     choices: tuple[str, ...] | None = None,
     words: tuple[str, ...] = (),
-    name: str | None = None,
     read_only: bool = False,
     parse: Callable[[str, str], object] | None = None,
 ) -> Any:
@@ -39,9 +39,8 @@ def option(
         Smallest and largest allowed value; the allowed values.
     words
         Words that may stand for a number, such as "none".
-    name, read_only
-        Public name if it differs from the attribute's, such as ``keyframe.min_translation``; the
-        node cannot change the option while it runs.
+    read_only
+        The node cannot change the option while it runs.
     parse
         For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
@@ -50,9 +49,11 @@ def option(
 
 
 def option_name(field: OptionField) -> str:
-    """Public name of an option: the ROS parameter, the YAML key."""
-    name: str = field.metadata["name"] or field.name
-    return name
+    """Public name of an option: the ROS parameter, the YAML key. Those of a group have a dot, as in
+    ``keyframe.min_translation``.
+    """
+    group, _, name = field.name.partition("_")
+    return f"{group}.{name}" if group in _GROUPS else field.name
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

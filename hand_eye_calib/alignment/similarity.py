@@ -184,13 +184,11 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
             f"{MIN_PAIRS} of them are {min(_SCALE_LAGS_S):g} s apart; record longer, or give scale"
         )
     # By the relative standard deviation, plus the unexplained share if the fit does not hold.
-    return min(
-        fits,
-        key=lambda fit: (
-            fit.scale_sigma / fit.scale
-            + (0.0 if fit.explains_translation else fit.unexplained_translation)
-        ),
-    )
+    unexplained = [0.0 if fit.explains_translation else fit.unexplained_translation for fit in fits]
+    doubts = [
+        fit.scale_sigma / fit.scale + more for fit, more in zip(fits, unexplained, strict=True)
+    ]
+    return fits[int(np.argmin(doubts))]
 
 
 def scale_differs(fit: SimilarityFit) -> bool:
@@ -262,13 +260,11 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     for T, scale in candidates:
         of_child[:] = child_lengths * scale
         costs.append(median(quadratic_form.costs(coefficients, T)) / min(scale, 1.0) ** 2)
-    return [
-        (
-            se3.from_rotation_translation(T[:3, :3], T[:3, 3] * units[0]),
-            scale * units[0] / units[1],
-        )
-        for T, scale in (candidates[index] for index in np.argsort(costs)[:_REFINED_STARTS])
-    ]
+    starts = []
+    for T, scale in (candidates[index] for index in np.argsort(costs)[:_REFINED_STARTS]):
+        T = se3.from_rotation_translation(T[:3, :3], T[:3, 3] * units[0])
+        starts.append((T, scale * units[0] / units[1]))
+    return starts
 
 
 def _with_translation(form: FloatArray, rotation: FloatArray) -> tuple[FloatArray, float]:

@@ -80,8 +80,6 @@ class Correlation:
         Correlation coefficient of the angular rates at that offset.
     distinctness : float
         Ratio of its significance to that of the best rival.
-    overlap_s : float
-        Time that both streams have in common at that offset.
     variation : float
         Standard deviation of the angular rate, of the stream that varies less, rad/s.
     ratio : float
@@ -91,7 +89,6 @@ class Correlation:
     offset_s: float = 0.0
     correlation: float = 0.0
     distinctness: float = 0.0
-    overlap_s: float = 0.0
     variation: float = 0.0
     ratio: float = 1.0
 
@@ -160,7 +157,6 @@ def correlate_rates(
         offset_s=float(start_s + (lags[best] + beside) * step_s),
         correlation=float(top),
         distinctness=float(significance[best] / max(rivals.max(initial=-np.inf), 1.0)),
-        overlap_s=float(durations[best]),
         variation=min(float(np.nanstd(rates)) for rates in (of_parent, of_child)),
         ratio=float(ratios[best]),
     )

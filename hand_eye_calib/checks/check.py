@@ -269,13 +269,9 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
 
 def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
     """What findings say of the child's clock, which is off by this beside what is known."""
-    direction, total_s = "behind" if offset_s > 0 else "ahead of", round(known_s + offset_s, 4)
-    return {
-        "offset_s": offset_s,
-        "size_s": abs(offset_s),
-        "total_s": total_s,
-        "direction": direction,
-    }
+    values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
+    values["direction"] = "behind" if offset_s > 0 else "ahead of"
+    return values | {"total_s": round(known_s + offset_s, 4)}
 
 
 def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:

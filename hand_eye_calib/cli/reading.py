@@ -52,11 +52,9 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     """Whether these are bags, or parts of one, rather than trajectory files; a ConfigError if some
     are bags and others are not, or a file stands alone.
     """
-    bags = [
-        path
-        for path in paths
-        if isinstance(path, str) or path.suffix in _BAG_SUFFIXES or path.is_dir()
-    ]
+    urls = [path for path in paths if isinstance(path, str)]
+    files = [path for path in paths if isinstance(path, Path)]
+    bags = [*urls, *(path for path in files if path.suffix in _BAG_SUFFIXES or path.is_dir())]
     if len(bags) == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
         return True
     if bags:

@@ -67,15 +67,9 @@ def other_answers(
     the time offset and the scale of the result, without priors; those with too few data are left
     out. Parameters as of :func:`cross_checked`.
     """
-    no_prior: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
-    settled = replace(
-        config,
-        method=_METHOD,
-        time_offset=calibration.time_offset_s,
-        scale=calibration.scale,
-        backend="fast",
-        **no_prior,
-    )
+    known: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
+    known |= {"time_offset": calibration.time_offset_s, "scale": calibration.scale}
+    settled = replace(config, method=_METHOD, backend="fast", **known)
 
     def answers(parts: Sequence[tuple[str, slice]]) -> list[Calibration]:
         found = []

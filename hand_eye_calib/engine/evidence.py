@@ -96,11 +96,8 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
 def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> StreamView:
     """The StreamView of two trajectories on one clock, in one unit of length."""
     start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
-    step_s = max(
-        parent.interval_s,
-        child.interval_s,
-        max(parent.duration_s, child.duration_s) / _MAX_RATES,
-    )
+    longest_s = max(parent.duration_s, child.duration_s)
+    step_s = max(parent.interval_s, child.interval_s, longest_s / _MAX_RATES)
     has_rates = parent.has_rotations and child.has_rotations
     rates, spans = [], []
     for stream in (parent, child):

@@ -11,6 +11,7 @@ from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
 from hand_eye_calib.text import AXIS_UNITS, Prior
@@ -106,7 +107,7 @@ def calibrate(
         first, second = upstairs("io.trajectory_files.reading", "read_trajectories")(first, second)
     values |= prior_fields(prior or {})
     named = [each for each in fields(CalibratorConfig) if each.name in values]
-    given = {each.metadata["name"] or each.name: values[each.name] for each in named}
+    given = {option_name(each): values[each.name] for each in named}
     found = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
     return replace(found.calibration, recording=found.snapshot)
 

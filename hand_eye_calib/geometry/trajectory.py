@@ -426,12 +426,10 @@ def _shares_of_motion(changes: FloatArray) -> FloatArray:
     for part in (slice(0, 3), slice(3, 6)):
         of_part = changes[:, part]
         power = (of_part**2).sum(axis=1)
+        both = (of_part[1:] * of_part[:-1]).sum(axis=1), 0.5 * (power[1:] + power[:-1])
         products, powers = (
             np.lib.stride_tricks.sliding_window_view(np.pad(values, _NEARBY), window).sum(axis=1)
-            for values in (
-                (of_part[1:] * of_part[:-1]).sum(axis=1),
-                0.5 * (power[1:] + power[:-1]),
-            )
+            for values in both
         )
         alike = products / np.maximum(powers, 1e-300)
         motion = np.clip((alike - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)

@@ -64,10 +64,8 @@ class Factor:
         self._levels: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > TUNING.few:
-            (inverse, logarithms), n_behind = (
-                inverse_roots(diagonal[1::2]),
-                (len(diagonal) - 1) // 2,
-            )
+            inverse, logarithms = inverse_roots(diagonal[1::2])
+            n_behind = (len(diagonal) - 1) // 2
             before = inverse @ below[::2]
             behind = inverse[:n_behind] @ transposed(below[1::2])
             self._levels.append((inverse, before, behind))

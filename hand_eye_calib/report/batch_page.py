@@ -12,7 +12,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from hand_eye_calib.errors import printable
-from hand_eye_calib.report.figures import BAD, GRID, INK, LOOK, PARENT, Drawn, as_svg, page_style
+from hand_eye_calib.report.figures import BAD, GRID, INK, LOOK, PARENT, Drawn, as_drawn, page_style
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
@@ -92,8 +92,8 @@ def _trend(result: Calibration, number: int) -> Drawn:
         "with its standard deviation. The band is three standard deviations of the common value. "
         "Squares do not belong to the others."
     )
-    title, svg = "Each recording against the common extrinsic", as_svg(figure, f"trend{number}")
-    return Drawn(f"vehicle-{number}", title, said, svg)
+    title = "Each recording against the common extrinsic"
+    return as_drawn(figure, f"vehicle-{number}", title, said)
 
 
 def _values(row: Plain) -> list[str]:

@@ -33,15 +33,8 @@ from hand_eye_calib.text import amount, angle, length, listing, share
 # Colours as drawn on a page, each with the name of the page's own colour that replaces it.
 INK, MUTED, GRID = "#1b1f24", "#5c6670", "#d9dee3"
 PARENT, CHILD, BAD, GREEN = "#0072b2", "#d98300", "#c8452f", "#009e73"
-_VARIABLES = {
-    INK: "ink",
-    MUTED: "muted",
-    GRID: "grid",
-    PARENT: "parent",
-    CHILD: "child",
-    BAD: "bad",
-    GREEN: "good",
-}
+_VARIABLES = {INK: "ink", MUTED: "muted", GRID: "grid", PARENT: "parent", CHILD: "child"}
+_VARIABLES |= {BAD: "bad", GREEN: "good"}
 
 
 class Look(NamedTuple):
@@ -109,7 +102,17 @@ def page_style(**more: Any) -> Iterator[None]:
         yield
 
 
-def as_svg(figure: Figure, name: str) -> str:
+@dataclass(frozen=True)
+class Drawn:
+    """A figure of a page: ``name`` of its element, title, caption and SVG."""
+
+    name: str
+    title: str
+    said: str
+    svg: str
+
+
+def as_drawn(figure: Figure, name: str, title: str, said: str) -> Drawn:
     """The figure as an element of a page: no prologue, ids of its own, the page's colours."""
     written = io.StringIO()
     figure.savefig(
@@ -125,9 +128,9 @@ def as_svg(figure: Figure, name: str) -> str:
     svg = re.sub(r'href="#', f'href="#{name}-', svg).replace("url(#", f"url(#{name}-")
     svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px var(--sans)", svg)
     svg = re.sub(r"<!--.*?-->\n?", "", svg, flags=re.DOTALL)
-    for drawn, variable in _VARIABLES.items():
-        svg = svg.replace(drawn.lower(), f"var(--{variable})")
-    return svg
+    for colour, variable in _VARIABLES.items():
+        svg = svg.replace(colour.lower(), f"var(--{variable})")
+    return Drawn(name, title, said, svg)
 
 
 def plain_label(label: str) -> str:
@@ -151,16 +154,6 @@ _WHAT_COINCIDES = {
 }
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A figure of a page: ``name`` of its element, title, caption and SVG."""
-
-    name: str
-    title: str
-    said: str
-    svg: str
-
-
 def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Drawn]:
     """The figures that a result of its kind has; stops have no evidence of streams."""
     drawn = []
@@ -181,8 +174,7 @@ def figure_of_views(calibrations: Sequence[Calibration]) -> Drawn:
     """Where the child sensors of one or several results are in their parent's frame."""
     figure, panels = _figure(3.1, 1, 3, gap=0.36)
     draw_views(panels, *calibrations)
-    svg = as_svg(figure, "views")
-    return Drawn("views", "The sensors in space", said_of_views(*calibrations), svg)
+    return as_drawn(figure, "views", "The sensors in space", said_of_views(*calibrations))
 
 
 @page_style()
@@ -206,7 +198,6 @@ def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
     strip.set_yticks([1.0, 0.0], ["parent", "child"])
     strip.tick_params(axis="y", length=0)
     strip.grid(visible=False)
-    svg = as_svg(figure, "streams")
     differ = "Here the streams never overlap."
     if np.isfinite(seen.apart):
         apart = length(seen.apart) if is_speed else angle(seen.apart)
@@ -215,7 +206,7 @@ def figure_of_streams(seen: StreamView, names: tuple[str, str]) -> Drawn:
         f"{_WHAT_COINCIDES[seen.quantity]} {differ} The bars below the curves show when there is "
         "data."
     )
-    return Drawn("streams", "Both streams before any solve", said, svg)
+    return as_drawn(figure, "streams", "Both streams before any solve", said)
 
 
 def _figure(
@@ -269,8 +260,7 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
         f"{length(apart.max())} apart, at {furthest_s * factor:.1f} {unit}. "
         "That includes drift and jumps of the odometry."
     )
-    svg = as_svg(figure, "trajectories")
-    return Drawn("trajectories", "Both trajectories, aligned", said, svg)
+    return as_drawn(figure, "trajectories", "Both trajectories, aligned", said)
 
 
 @page_style()
@@ -305,7 +295,7 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
         f"Half of the {len(residuals):,} {what} agree with the result to {halves}, all of them to "
         f"{furthest}. {rejected} of them are rejected as outliers."
     )
-    return Drawn("residuals", "Residuals", said, as_svg(figure, "residuals"))
+    return as_drawn(figure, "residuals", "Residuals", said)
 
 
 def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:

@@ -81,16 +81,10 @@ class Calibration(Result):
             Without pandas.
         """
         rows = zip(self.observability, self._printed(), self.sigmas_printed, strict=True)
-        table = [
-            {
-                "axis": dof.name,
-                "value": value,
-                "sigma": sigma,
-                "unit": AXIS_UNITS[dof.name],
-                "verdict": dof.verdict.value,
-            }
-            for dof, value, sigma in rows
-        ]
+        table = []
+        for dof, value, sigma in rows:
+            row = {"axis": dof.name, "value": value, "sigma": sigma}
+            table.append(row | {"unit": AXIS_UNITS[dof.name], "verdict": dof.verdict.value})
         return data_frame(table, "axis")
 
     def inverse(self) -> "Calibration":

@@ -15,7 +15,6 @@ from hand_eye_calib.config import METHODS
 from hand_eye_calib.results.records import (
     ROTATIONS,
     TRANSLATIONS,
-    DofVerdict,
     Severity,
     SolveStatus,
 )
@@ -50,12 +49,12 @@ class Reason:
     sentence : str
         What was found, with its values.
     what_to_do : str
-    kind : {"physics", "suspicion"}
-        A limit of the motion, the recording or the sensors; or a sign that something is wrong.
     axes : tuple of str
         x, y, z, roll, pitch, yaw; empty if it is about the whole result.
     options : mapping
         Options that mend it, by their public names.
+    kind : {"physics", "suspicion"}
+        A limit of the motion, the recording or the sensors; or a sign that something is wrong.
 
     Examples
     --------
@@ -68,9 +67,9 @@ class Reason:
     verdict: Verdict
     sentence: str
     what_to_do: str
-    kind: str = "suspicion"
     axes: tuple[str, ...] = ()
     options: Mapping[str, float | str] = field(default_factory=dict)
+    kind: str = "suspicion"
 
     @property
     def is_finding(self) -> bool:
@@ -125,17 +124,9 @@ def reasons(result: Result) -> tuple[Reason, ...]:
     it.
     """
     return tuple(
-        Reason(
-            rule.name,
-            rule.verdict,
-            sentence,
-            what_to_do,
-            "physics" if rule.name in _PHYSICS else "suspicion",
-            axes,
-            options,
-        )
+        Reason(rule.name, rule.verdict, *found, "physics" if rule.name in _PHYSICS else "suspicion")
         for rule in RULES
-        for sentence, what_to_do, axes, options in rule.find(result)
+        for found in rule.find(result)
     )
 
 
@@ -201,16 +192,12 @@ def _not_converged(result: Result) -> Iterator[_Found]:
 
 def _contradicted(result: Result) -> Iterator[_Found]:
     if result.status is SolveStatus.CONTRADICTED:
-        apart = listing(
-            [
-                f"on {axis} is {far:.1f} standard deviations from"
-                for axis, far in result.contradictions.items()
-            ]
-        )
-        which = f"the prior {apart}" if apart else "a prior contradicts"
-        names = listing([f"prior.{axis}" for axis in result.contradictions]) or "the prior"
+        far = result.contradictions
+        apart = [f"on {axis} is {far[axis]:.1f} standard deviations from" for axis in far]
+        which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
+        names = listing([f"prior.{axis}" for axis in far]) or "the prior"
         advice = f"check value, unit and sign of {names}"
-        yield f"{which} the estimate from the motion", advice, tuple(result.contradictions), {}
+        yield f"{which} the estimate from the motion", advice, tuple(far), {}
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
@@ -319,15 +306,10 @@ class _Axis(NamedTuple):
 
 
 def _axes(result: Result) -> list[_Axis]:
+    hidden, totals = result.unobservable(), result.sigmas_with_floor.tolist()
     return [
-        _Axis(
-            dof.name,
-            dof.sigma,
-            total,
-            target_of(dof.name, result),
-            dof.verdict is DofVerdict.UNOBSERVABLE,
-        )
-        for dof, total in zip(result.observability, result.sigmas_with_floor.tolist(), strict=True)
+        _Axis(dof.name, dof.sigma, total, target_of(dof.name, result), dof.name in hidden)
+        for dof, total in zip(result.observability, totals, strict=True)
         if dof.name not in result.out_of_reach
     ]
 

@@ -110,13 +110,11 @@ class Agreement:
         variances = (self.sigmas[apart] ** 2).mean(axis=0) / len(apart) + np.diag(self.covariance)
         ratios = np.nan_to_num(np.abs(values) / np.sqrt(variances))
         order = [axis for axis in np.argsort(-ratios) if ratios[axis] >= min(2.0, ratios.max())]
-        return listing(
-            [
-                f"{axes_in_words([AXES[axis]])} by {amount(AXES[axis], values[axis])} +/- "
-                f"{amount(AXES[axis], float(np.sqrt(variances[axis])))}"
-                for axis in order
-            ]
-        )
+        told = []
+        for axis, name in ((axis, AXES[axis]) for axis in order):
+            size, sigma = amount(name, values[axis]), amount(name, float(np.sqrt(variances[axis])))
+            told.append(f"{axes_in_words([name])} by {size} +/- {sigma}")
+        return listing(told)
 
 
 def agreement_of(
