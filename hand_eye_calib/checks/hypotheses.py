@@ -46,7 +46,7 @@ from hand_eye_calib.pairing.motion_pairs import (
     pairs_over,
     synchronise,
 )
-from hand_eye_calib.stats import median
+from hand_eye_calib.stats import median, medians
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
 # so many at most, and to see which mistake it is.
@@ -407,8 +407,7 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
     return streams.interval_s > streams.max_gap_s or all(
-        np.linalg.norm(each - np.median(each, axis=0), axis=1).max() < _REACH_M
-        for each in positions
+        np.linalg.norm(each - medians(each.T), axis=1).max() < _REACH_M for each in positions
     )
 
 
@@ -428,7 +427,7 @@ def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float,
     shorter, around = np.mean(paths, axis=0)
     pairs = right.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
-    Ts = np.array([fit.T_parent_child, np.median(worlds, axis=0)])
+    Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
     arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)
     is_same = np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])).min() <= _SAME_FRAME
     arms = 0.0 if is_same else 0.5 * np.log(arms_m[0] / arms_m[1])

@@ -281,13 +281,18 @@ class Trajectory:
     ) -> Self:
         changed = copy.copy(self)
         object.__setattr__(changed, name, value)
-        if not keeps_bends:
-            changed.__dict__.pop("_bends", None)
+        alike = changed.__dict__.pop(
+            "_alike", self
+        )  # whose bends are the same, once they are known
+        changed.__dict__.pop("_bends", None)
+        if keeps_bends:
+            changed.__dict__["_alike"] = alike
         return changed
 
     @cached_property
     def _bends(self) -> tuple[FloatArray, FloatArray]:
-        return bends(self.stamps_ns, self.poses)
+        alike = self.__dict__.get("_alike")
+        return alike._bends if alike else bends(self.stamps_ns, self.poses)
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
