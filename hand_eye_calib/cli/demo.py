@@ -32,7 +32,6 @@ TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
 
 PLAY_SPEED = 20.0
-_STOP_S = 10.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -106,7 +105,7 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
         try:
             yield check
             process.send_signal(signal.SIGINT)
-            if process.wait(_STOP_S) != 0:
+            if process.wait(10.0) != 0:
                 check()  # says so
         finally:
             process.kill()
