@@ -47,7 +47,7 @@ def change(axis: str, value: float, sigma: float) -> str:
 
 
 def capital(text: str) -> str:
-    """With a capital, unless it begins with a name such as ``/lidar`` or that of an axis."""
+    """A text with a capital, unless it begins with a name such as ``/lidar`` or that of an axis."""
     return text if re.match(r"[xyz]\b", text) else f"{text[:1].upper()}{text[1:]}"
 
 

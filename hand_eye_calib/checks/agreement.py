@@ -175,8 +175,8 @@ def _turned(slow: Regression, stream: str) -> _Suspect:
 
 
 def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
-    """Of three values that should be one: the index of the one that differs most from the others,
-    by how much, and the standard deviation of that.
+    """The index of the value that differs most from the others, of three that should be one; by how
+    much, and the standard deviation of that.
     """
     best = (0, 0.0, 1.0)
     weights = 1.0 / np.maximum(fitted.sigmas, 1e-9) ** 2

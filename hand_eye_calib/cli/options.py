@@ -233,7 +233,7 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
     for stream in STREAMS:
         topic, fields = (getattr(arguments, f"{stream}_{kind}") for kind in ("topic", "fields"))
         if fields and not topic:
-            raise ConfigError(f"--{stream}-fields is of messages: give --{stream}-topic, too")
+            raise ConfigError(f"--{stream}-fields is for messages; give --{stream}-topic as well")
         if stream == "child" and topic and getattr(arguments, "target", None):
             fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
         found[stream] = f"{topic}?{fields}" if fields else topic

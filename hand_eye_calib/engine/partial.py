@@ -106,7 +106,7 @@ def _steps(
     poses: FloatArray,
     positions: FloatArray,
 ) -> Residuals:
-    """Of the steps from each position to the next, along the axes of the sensor with poses."""
+    """Residuals of the steps between positions, along the axes of the sensor with poses."""
     steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)

@@ -210,7 +210,7 @@ def _repaired(
 
 
 def _doubting(found: Run, doubts: Collection[Finding]) -> Run:
-    """With findings about options that were set; a large offset that nobody gave is one."""
+    """Add findings about options that were set; a large offset that nobody gave is one."""
     offset_s = found.calibration.time_offset_s
     if "time_offset" in found.options and abs(offset_s) > UNASKED_S:
         large = finding("large_time_offset", "child", **offset_values(offset_s))
@@ -220,7 +220,7 @@ def _doubting(found: Run, doubts: Collection[Finding]) -> Run:
 
 
 def _saying(found: Run, options: Options, told: tuple[str, ...]) -> Run:
-    """With options that were set, and what is said of them among the warnings."""
+    """Add options that were set, and say so among the warnings."""
     warnings = tuple(dict.fromkeys((*told, *found.calibration.warnings)))
     calibration = replace(found.calibration, warnings=warnings)
     return replace(found, calibration=calibration, options=dict(options), told=told)
@@ -266,7 +266,7 @@ def _solved_with(snapshot: Snapshot, options: Options) -> Run | None:
 
 
 def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run:
-    """With warnings about options that were set because of findings, and what they gave."""
+    """Add warnings about options that were set because of findings, and what they gave."""
     what = {name: each.what for each in findings for name in each.options}
     offset_s = found.calibration.time_offset_s
     what["time_offset"] = (

@@ -104,7 +104,7 @@ class Problem:
         )
 
     def posterior(self, fit: Fit) -> Posterior:
-        """Of all poses."""
+        """The posterior of all poses; that of the last fit is kept."""
         if not self._last or self._last[0][0] is not fit:
             self._last.clear()
             self._last.append((fit, Posterior(self.space(fit), fit.levels)))
@@ -164,7 +164,7 @@ class Fit:
         return replace(self, T=T, parameters=parameters)
 
     def freed(self, streams: Streams, states: FloatArray) -> Fit:
-        """With the given poses freed of the errors that latent states (N, d) make.
+        """The fit with the given poses freed of the errors that latent states (N, d) make.
 
         White errors are split between the sensors by their covariances, which holds for errors of
         these covariances only. A lasting error of some centimetres beside white noise of a

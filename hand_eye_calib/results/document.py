@@ -249,7 +249,7 @@ def values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
-    """The same; KeyError, TypeError or ValueError for what was not written so."""
+    """Fields of a calibration; a KeyError, TypeError or ValueError for what was not written so."""
     from hand_eye_calib.results import context
 
     values: dict[str, Any] = {}

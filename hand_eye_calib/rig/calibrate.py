@@ -83,7 +83,7 @@ def calibrate_rig(
 def _between(
     answer: Calibration, before: Trajectory, after: Trajectory, max_gap_s: float
 ) -> Calibration:
-    """Of two neighbours on one clock and in one unit, with the method of an answer."""
+    """The answer for two neighbours, on one clock and in one unit, by the method of another."""
     pairs = synchronise(before, after, max_gap_s)
     config = CalibratorConfig(method=answer.method, max_pairs=max(len(pairs), 10))
     found = solve_poses(pairs, config).calibration()
@@ -107,8 +107,8 @@ def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) 
             raise ConfigError(f"{name} is of two sensors; it cannot be given for a rig")
         if name in ("time_offset", "scale") and not isinstance(value, str):
             raise ConfigError(
-                f"{name} {value} would be of which sensor of the rig? Give {name} estimate, or "
-                "correct the trajectories before"
+                f"{name} {value} does not say which sensor of the rig it is for; give {name} "
+                "estimate, or correct the trajectories before"
             )
 
 
@@ -121,7 +121,7 @@ _ROUNDING = 1e-16
 
 @dataclass(frozen=True)
 class Closure:
-    """By how much the pairwise answers of three sensors miss closing.
+    """How far the pairwise answers of three sensors are from closing.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ class Closure:
 
     @property
     def sentence(self) -> str:
-        """In words."""
+        """The closure in one sentence."""
         how = "closes" if self.closes else "DOES NOT CLOSE"
         return (
             f"{' - '.join(self.sensors)} {how}: off by {length(self.translation_m)} and "

@@ -104,7 +104,7 @@ class Agreement:
         return f"{found} ({numbers})"
 
     def _moves(self) -> str:
-        """By how much those apart differ, by more than two standard deviations; at least one."""
+        """The axes on which those apart differ by over two standard deviations; at least one."""
         apart = [*self.apart]
         values = self.deviations[apart].mean(axis=0)
         variances = (self.sigmas[apart] ** 2).mean(axis=0) / len(apart) + np.diag(self.covariance)

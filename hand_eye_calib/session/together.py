@@ -328,7 +328,7 @@ def compare(
 def _who_moved(
     names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
-    """Those without which the others agree, and a sentence; none if nothing explains it."""
+    """The results without which the others agree, if there are such, and a sentence."""
     # Two differ, so that less evidence says which.
     found = agreement_of_results(results, level=0.05)
     if found.kind in ("one off", "moved"):

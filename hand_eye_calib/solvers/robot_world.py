@@ -169,7 +169,7 @@ def solve(stops: Stops) -> RobotWorld:
 
 
 def _likelihood(fit: RobotWorld) -> float:
-    """Of fits of one recording that left out different stops: those count as _OUTLIER."""
+    """Log likelihood of a fit, in which each stop that it left out counts as _OUTLIER."""
     left_out = float(np.sum(fit.weights == 0.0))
     levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
     return -fit.objective - 0.5 * left_out * (levels + _OUTLIER)
@@ -241,7 +241,7 @@ def _most_central(Ts: FloatArray) -> FloatArray:
 
 
 def _logs_of_medians(errors: FloatArray) -> FloatArray:
-    """By row of errors (M, N, 4, 4): log of the median distance times the median angle."""
+    """Logarithm (M,) of median distance times median angle of each row of errors (M, N, 4, 4)."""
     tiny = np.finfo(float).tiny
     distance_m = np.median(np.linalg.norm(errors[..., :3, 3], axis=-1), axis=1)
     angle_rad = np.median(se3.rotation_angle(errors[..., :3, :3]), axis=1)

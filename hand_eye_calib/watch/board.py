@@ -270,7 +270,7 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
 
 
 def _sentence(text: str) -> str:
-    """With a capital and a full stop."""
+    """A sentence: the text with a capital and a full stop."""
     text = capital(text.replace("+/-", "±"))
     return text if text.endswith((".", "!", "?")) else f"{text}."
 

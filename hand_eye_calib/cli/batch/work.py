@@ -199,7 +199,7 @@ class Outcome(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """In a word, which may be "failed"."""
+        """The verdict of the result, or "failed"."""
         return "failed" if self.row["error"] else str(self.row["verdict"])
 
 

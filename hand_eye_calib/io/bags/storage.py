@@ -50,7 +50,7 @@ Message: TypeAlias = tuple[MessageKind, int, bytes]
 
 @lru_cache
 def _kind(topic: str, name: str, encoding: str, language: str, content: bytes) -> MessageKind:
-    """One for all connections that are alike, with names as they can be printed."""
+    """The kind of a connection, one for all that are alike, with names as they can be printed."""
     if encoding == "ros1" and name.count("/") == 1:  # as ROS 1 itself names types
         name = name.replace("/", "/msg/")
     topic, name = (printable(each[: files.LONGEST_NAME]) for each in (topic, name))
