@@ -133,11 +133,11 @@ class Tuning:
     odds: float = 0.03
     none: float = 1e-6
     certain: float = 50.0
-    # A bias of the path that gains hardly more than a scale is one along the direction of travel.
-    like_scale: float = 0.95
+    # A bias of the path that does not gain a third more than a scale is a scale, or one along the
+    # direction of travel.
+    like_scale: float = 0.75
     # None is assumed that can hardly be told from X, whose standard deviations would grow by this
-    # factor: on a road a child that slips sideways looks like one that is mounted askew.
-    # There such biases grow them by 4 or more, biases of the published simulations by 2 or less.
+    # factor: by 4 or more where a child slips sideways on a road, by 2 or less in simulations.
     most_growth: float = 3.0
 
     # -- The end --
