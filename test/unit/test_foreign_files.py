@@ -334,6 +334,7 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"1e999" + b",1" * 15 + b"\n", "so that their order is unknown; name the 16"),
         (b",1" * 12, "so that their order is unknown; name the 13"),
         (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n", "a g2o graph without vertices"),
+        (b"t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,1e200\n", "line 2: found angle 1e.200"),
         (
             b"source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw\n1,2,0,0,0,0,0,0\n",
             "chain",

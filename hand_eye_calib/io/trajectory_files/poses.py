@@ -191,7 +191,12 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
             f"{table.path}: columns {', '.join(names)} in {', '.join(sorted(named))}; expected one "
             f"of {', '.join(known)}"
         )
-    largest = float(np.abs(values).max())
+    sizes = np.abs(values).max(axis=1)
+    table.refuse(
+        (sizes > FARTHEST_M) & (kind != "length"),
+        lambda row: f"found {kind} {sizes[row]:.4g}; repair its source",
+    )
+    largest = float(sizes.max())
     unit = min(named) if named else [*known][largest > largest_of_first]
     if not named and kind != "length":
         table.guess(
