@@ -20,7 +20,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.bags.messages import measured_as
 from hand_eye_calib.io.transforms import PoseFields
-from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import REPORT_PERIOD_S, InputState, Level
 
@@ -303,6 +303,8 @@ class PoseInput:
             return Level.ERROR, f"{self.topic}: {self._bad}"
         if self.is_silent(steady_s):
             text = f"{self.topic} has been silent for {steady_s - self._arrived_s:.0f} s"
+            if not may_rest:
+                self._log.info(text, GOES_ON_S)
             return (Level.OK if may_rest else Level.WARN), text
         if lost_share < _MUCH_LOST:
             return Level.OK, f"{rate_hz:.1f} Hz"
