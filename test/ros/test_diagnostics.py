@@ -82,9 +82,9 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
     ):
         for stamp_ns, T in zip(stamps_ns, Ts, strict=True):
             publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
-    apart = state(lambda each: "set time_offset" in each.extrinsic.text).extrinsic
-    assert apart.level is Level.WARN
-    assert "the streams do not overlap in time (120 parent and 120 child poses" in apart.text
+    said = "the streams do not overlap in time (120 parent and 120 child poses"
+    apart = state(lambda each: said in each.extrinsic.text).extrinsic  # a solve may come before
+    assert (apart.level, "set time_offset" in apart.text) == (Level.WARN, True)
     assert peer.set_parameter("time_offset", 20.0).successful
     good = state(lambda each: each.extrinsic.level is Level.OK and each.extrinsic.n_poses == 120)
     assert good.extrinsic.text.startswith("USE: all six axes are known to ")
