@@ -255,6 +255,8 @@ class SolveCycle:
                 return False, text
         assert answer.calibration is not None
         told = tuple(dict.fromkeys((*self._told, *answer.calibration.warnings)))
+        for warning in told:
+            self._log.warning(warning)
         newest = self._with_findings(replace(answer.calibration, warnings=told))
         if newest.status.failure:
             return False, self._say(newest)
@@ -271,8 +273,9 @@ class SolveCycle:
             self._solved = self._submitted, self._certain
         else:
             kept = f"kept is the result of {result.n_poses} poses, as the newest is worse"
-            told = (*result.warnings, f"{kept}: {describe(newest)}")
-            result = replace(result, warnings=told)
+            kept = f"{kept}: {describe(newest)}"
+            self._log.info(kept, GOES_ON_S, key="kept")
+            result = replace(result, warnings=(*result.warnings, kept))
         self.result, self._solved_at_s = self._with_findings(result), time.monotonic()
         self._told_result = _result_state(self.result)
         if not progress.is_faulty and progress.sentence:
@@ -293,8 +296,6 @@ class SolveCycle:
             said.append(f"{reason.sentence}; {reason.what_to_do}")
             if is_final and not reason.is_finding:  # which are in the log already
                 self._log.warning(f"{reason.verdict.value}: {said[-1]}")
-        for warning in calibration.warnings:
-            self._log.warning(warning)
         return "; ".join((text, *said, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:

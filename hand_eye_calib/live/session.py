@@ -193,7 +193,8 @@ class LiveSession:
         journal, level, text = self._journal, Level.OK, "the session is being written"
         if journal is not None and journal.error:
             level = Level.ERROR
-            text = f"cannot write: {journal.error}; a crash would lose the session"
+            text = f"cannot write the journal: {journal.error}; "
+            text += "save the result: a crash would lose the session"
         elif journal is None:
             text = "off"
             if options.journal != "off":

@@ -69,7 +69,7 @@ def reach_goal(cycle):
     return good, text
 
 
-def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle):
+def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines):
     reach_goal(cycle)
     kept = cycle.result
     moved = result().T_parent_child + np.eye(4, k=3) * 0.1
@@ -78,6 +78,7 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle):
     assert f"{kept.n_poses} poses, {kept.n_pairs} pairs" in text
     (warning,) = cycle.result.warnings
     assert warning in text
+    assert ("info", warning) in lines  # nobody has to do anything
     assert warning.startswith("kept is the result of 100 poses, as the newest is worse: ")
     assert f"{moved[0, 3]:.4f}" in warning
     assert "(5.0, 10.0, 5.0) mm" in warning
