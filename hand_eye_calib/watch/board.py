@@ -28,7 +28,7 @@ from hand_eye_calib.text import amount, capital, change, duration, fixed, two_di
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 MOVED = "MOUNT MOVED"
-_ADVICE = " Check it, then recalibrate or acknowledge."
+_ADVICE = "; check it, then recalibrate or acknowledge"
 
 # The answer to a button is shown for so long (s).
 ANSWER_FOR_S = 20.0
@@ -221,7 +221,7 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
     for tone, word, part, level in told:
         is_open = part is checks and checks is not None and checks.age_s is None
         if part is not None and part.level is level and not is_open:
-            return tone, word, _sentence(part.text) + _ADVICE * (word == MOVED)
+            return tone, word, _sentence(part.text + _ADVICE * (word == MOVED))
     if mount is not None:
         tone, word = (Tone.BUSY, "LEARNING") if mount.is_learning else (Tone.GOOD, "WATCHING")
         return tone, word, _sentence(mount.text)

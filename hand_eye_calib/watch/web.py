@@ -61,21 +61,19 @@ def _kept_key() -> str:
     for this time if no file that is only this user's can keep it.
     """
     made = secrets.token_urlsafe(6)
-    with contextlib.suppress(OSError, RuntimeError):
+    with contextlib.suppress(OSError, RuntimeError, ValueError):
         state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
         file = Path(state, "hand_eye_calib", "watch_key")
         file.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileExistsError), open(file, "x", opener=_for_user) as new:
-            new.write(made)
-        with open(file, opener=_for_user) as kept:
-            about, text = os.fstat(kept.fileno()), kept.read(len(made) + 1)
-        is_own = about.st_uid == os.getuid() and not stat.S_IMODE(about.st_mode) & 0o077
-        made = text if is_own and re.fullmatch(rf"[\w-]{{{len(made)}}}", text, re.ASCII) else made
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+        with open(os.open(file, flags, 0o600), "r+") as kept:
+            about, text = os.fstat(kept.fileno()), kept.read()
+            if about.st_uid == os.getuid() and not stat.S_IMODE(about.st_mode) & 0o077:
+                if re.fullmatch(r"[\w-]{8,}", text, re.ASCII):
+                    return text
+                if not text:
+                    kept.write(made)
     return made
-
-
-def _for_user(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW, 0o600)
 
 
 class WebServer(ThreadingHTTPServer):

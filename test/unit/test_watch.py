@@ -136,7 +136,7 @@ ERROR = {"level": Level.ERROR}
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
-        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved. Check it, then"),
+        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved; check it, then"),
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
@@ -244,7 +244,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert lines["along x"] == (Tone.GOOD, "not moved (would see 4 mm)")
     assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
-    assert view.sentence == "The mount has moved. Check it, then recalibrate or acknowledge."
+    assert view.sentence == "The mount has moved; check it, then recalibrate or acknowledge."
     assert view.facts == "2 min ago; a reset ends the alarm"
     assert view.buttons[:2] == ("recalibrate", "acknowledge")
     assert "the mount, after ten minutes" in fragment(view)
