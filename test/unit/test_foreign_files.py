@@ -177,6 +177,7 @@ FORMATS = {
     "comments": (of_rows(f"// of Xsens\nt,{POSE}", SECONDS, P, Q), ""),
     "seconds_and_nanoseconds": (of_rows(f"#sec,nsec,{POSE}", *divmod(STAMPS, 10**9), P, Q), ""),
     "units_below": (of_rows(UNITS, STAMPS, P * 1e3, WXYZ), ""),
+    "order_in_words": (of_rows("# as: t x y z qw qx qy qz\n", SECONDS, P, WXYZ, separator=" "), ""),
     "order_in_a_comment": (of_rows(f"{GNSS_POSES}\n", STAMPS, P, Q), "looks like format csv"),
     "lio_sam": (of_lio_sam(), "read in rad"),
     "iso": (of_rows(f"time,{POSE}", DATES, P, Q), ""),

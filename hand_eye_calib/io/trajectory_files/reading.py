@@ -401,8 +401,9 @@ def _beginning(
 ) -> tuple[int, list[str], Sequence[str] | None, str, Sequence[str] | None]:
     """What the beginning of a text tells: number and cells of the first line that is no comment (0
     and none without one); the names of the columns, which are that line, unless it is a row of
-    numbers, otherwise the last comment above it that has as many cells; the format, tum in doubt,
-    so that its reader says what is wrong; and the columns of that format, if they are known.
+    numbers, otherwise the last comment above it that has as many cells, or one that ends in names;
+    the format, tum in doubt, so that its reader says what is wrong; and the columns of that format,
+    if they are known.
     """
     comments: dict[int, list[str]] = {}
     first = 0, "", list[str](), True
@@ -416,7 +417,11 @@ def _beginning(
             comments[len(cells)] = cells
     number, line, cells, is_row = first
     found: tuple[str, Sequence[str] | None]
-    names: Sequence[str] | None = comments.get(len(cells)) if is_row else cells
+    ends = (each[-len(cells) :] for each in comments.values())  # after "format:"
+    stated = (end for end in ends if {"x", "qw"} <= named_columns(end)[0].keys())
+    names: Sequence[str] | None = cells
+    if is_row:
+        names = comments.get(len(cells)) or next(stated, None)
     is_separated, n_cells = "," in line or ";" in line, len(cells)
     known = named_columns(names or ())[0].keys()
     if names is cells or any({*group} <= known for group in (*PLANAR_POSITIONS, RATES)):
