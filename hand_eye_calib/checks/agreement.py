@@ -167,7 +167,8 @@ def _turned(slow: Regression, stream: str) -> _Suspect:
     """Positions of a stream that are turned against its orientations."""
     fitted = slow.fit(f"turned_{stream}")
     sizes, (sigmas, least, *_) = np.abs(fitted.values), LIMITS["worlds_turned"]
-    if (sizes < sigmas * fitted.sigmas).all() or sizes.max() < least:
+    limits = np.hypot(sigmas * fitted.sigmas, _BIASES * slow.biases(f"turned_{stream}"))
+    if (sizes < limits).all() or sizes.max() < least:
         return fitted.share, None
     turned_rad = float(np.linalg.norm(sizes))
     values = {"axis": "xyz"[int(np.argmax(sizes))], "turned_deg": float(np.degrees(turned_rad))}
@@ -254,8 +255,9 @@ def _delays(
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
                 if is_expected := abs(late_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED:
                     sigma_m *= _EXPECTED
-                if is_expected or late_s < _GRAVE * _DELAY_S:
-                    shift_m = min(shift_m, LIMITS["late"][-1])
+                if is_expected or late_s < _GRAVE * _DELAY_S or fitted.share < _SOME:
+                    least = min(1.0, LIMITS["late"][-1] / max(shift_m, 1e-9))
+                    shift_m, sigma_m = least * shift_m, least * sigma_m
                 values |= {"part": part, "others": others}
                 yield fitted.share, graded("late", stream, shift_m, sigma_m, **values)
 
