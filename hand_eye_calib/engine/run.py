@@ -120,9 +120,11 @@ def _on_another_clock(snapshot: Snapshot, checks: bool | None) -> Run | None:
     if "time_offset" in config.given or not snapshot.correlation.is_clear:
         return None
     streams = *snapshot.streams, snapshot.correlation, snapshot.max_gap_s
-    offset = refine_time_offset(*streams, least_s=MOST_MOVED_S)
-    if offset.fit is None or abs(offset.seconds) - 3.0 * offset.sigma_s < MOST_MOVED_S:
+    # Of motions over one time, in one step.
+    look = refine_time_offset(*streams, least_s=UNASKED_S)
+    if look.fit is None or abs(look.seconds) - 3.0 * look.sigma_s < MOST_MOVED_S:
         return None
+    offset = refine_time_offset(*streams, start=look.fit)
     other = replace(snapshot, config=replace(config, **_ESTIMATED), time_offset=offset)
     return _solved_with(other, {})
 
