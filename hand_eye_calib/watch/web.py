@@ -11,7 +11,6 @@ import os
 import re
 import secrets
 import socket
-import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -68,11 +67,10 @@ def _kept_key() -> str:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         with open(os.open(file, flags, 0o600), "r+") as kept:
             about, text = os.fstat(kept.fileno()), kept.read()
-            if about.st_uid == os.getuid() and not stat.S_IMODE(about.st_mode) & 0o077:
-                if re.fullmatch(r"[\w-]{8,}", text, re.ASCII):
-                    return text
-                if not text:
-                    kept.write(made)
+            is_own = about.st_uid == os.getuid() and not about.st_mode & 0o077
+            if is_own and re.fullmatch(r"[\w-]{8,}", text, re.ASCII):
+                return text
+            kept.write(made if is_own and not text else "")
     return made
 
 
