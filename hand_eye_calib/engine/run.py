@@ -115,9 +115,8 @@ def _on_another_clock(snapshot: Snapshot, checks: bool | None) -> Run | None:
     """
     config = snapshot.config
     is_free = config.method in ("auto", "adaptive") and config.reference == "auto"
-    if checks is False or not is_free or config.measured != "poses" or len(snapshot.kept):
-        return None
-    if "time_offset" in config.given or not snapshot.correlation.is_clear:
+    is_known = "time_offset" in config.given or len(snapshot.kept) > 0 or checks is False
+    if is_known or not is_free or config.measured != "poses" or not snapshot.correlation.is_clear:
         return None
     streams = *snapshot.streams, snapshot.correlation, snapshot.max_gap_s
     # Of motions over one time, in one step.

@@ -281,9 +281,7 @@ class Trajectory:
     ) -> Self:
         changed = copy.copy(self)
         object.__setattr__(changed, name, value)
-        alike = changed.__dict__.pop(
-            "_alike", self
-        )  # whose bends are the same, once they are known
+        alike = changed.__dict__.pop("_alike", self)  # the bends are the same
         changed.__dict__.pop("_bends", None)
         if keeps_bends:
             changed.__dict__["_alike"] = alike
