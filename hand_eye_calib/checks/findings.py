@@ -220,7 +220,7 @@ _ROWS = {
     ),
     "smoothed": _Row(
         "{whose} {part} are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
-        "the translation may be off by {shift_m:.2g} m",
+        "poses are displaced by about {shift_m:.2g} m, the translation by that or more",
         "use the poses before that filter",
         "a low-pass or smoothing filter",
         code="smoothed_{part}",
@@ -255,7 +255,7 @@ LIMITS = {
     # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
     # smoothing does not contain noise of the columns. Both by the shift of positions, m.
     "late": (4.5, 0.008, 0.008, 0.05),
-    "smoothed": (8.0, 0.008, 0.008, 0.05),
+    "smoothed": (8.0, 0.008, 0.008, 0.02),
     "rotation_gain": (6.0, 0.003, 0.003, 0.03),  # of the factor, less 1
     "turns": (0.0, 0.4, 0.4, 0.4),  # logarithm of a factor that noise does not cause
     "axis_scale": (6.0, 0.015, 0.015, 0.05),  # of the factor, less 1

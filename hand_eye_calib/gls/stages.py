@@ -234,7 +234,7 @@ def start(problem: Problem) -> Fit:
         levels=rough_levels(residuals, beside),
         outliers=outliers,
         weights=np.ones(len(streams)),
-        sigmas=np.array(tuning.sizes),
+        sigmas=np.array(tuning.first_sizes),
     )
 
 

@@ -87,8 +87,7 @@ class Tuning:
     # Wide, for the noise levels are not known yet.
     first_jump_sigmas: float = 5.0
     least_jump: float = 1e-6
-    # No more than these shares of the poses are wrong by themselves: pairs of jumps at first; when
-    # the noise is known.
+    # At most these shares of the poses are outliers: pairs of jumps, and once the noise is known.
     most_first_spikes: float = 0.3
     most_spikes: float = 0.2
     # The noise levels are fitted again only if more than this share of poses changed status.
@@ -130,6 +129,8 @@ class Tuning:
     # (s), of a bias of rates (rad/s), if they are there, at these odds; and the one that stands for
     # none. A time offset that is not known beforehand is all but certain (log odds).
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
+    # As long as it is not decided which are there: biases are usually small.
+    first_sizes: tuple[float, ...] = (0.03, 0.0026, 0.0026, 0.0026, 0.1, 1.0, 1.0, 1.0)
     odds: float = 0.03
     none: float = 1e-6
     certain: float = 50.0

@@ -53,7 +53,7 @@ def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
     assert not goal.add(result(), seen(44.0)).done
     done = goal.add(result(), seen(46.0))
     assert (done.done, done.limiting_axis, max(seconds_left(done))) == (True, "", 0.0)
-    assert done.sentence.startswith("Done: all six axes are known to 5 mm and 0.057 deg or better")
+    assert done.sentence.startswith("Done: all six axes are known to 5 mm along and 0.057 deg")
 
 
 def test_every_axis_has_its_own_target():

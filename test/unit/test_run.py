@@ -235,7 +235,7 @@ def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
 
 @pytest.mark.parametrize(
     ("kind", "span_s", "code"),
-    [("car_lever", 1.0, "position_clock"), ("car_ins_lidar", 0.5, "smoothed_positions")],
+    [("car_lever", 1.0, "position_clock"), ("car_ins_lidar", 0.7, "smoothed_positions")],
 )
 def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(kind, span_s, code):
     drive = make(kind, 932)
