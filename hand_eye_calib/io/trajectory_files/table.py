@@ -79,10 +79,10 @@ _ALIASES = {
     **{name: name for name in ROTATION_VECTOR},
     **{name: f"{name} t{int(name[1:]) - 11:02d}" for name in MATRIX},
 }
-# Names, after each other, that stand for a part of an orientation, or of a position, even if it is
-# not known which.
+# Names, after each other, of some part of an orientation or of a position, known or not.
 _ORIENTED = re.compile(
-    r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
+    r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|"
+    r"(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
 ).search
 _PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)").search
 
