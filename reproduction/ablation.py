@@ -16,7 +16,7 @@ import numpy as np
 from hand_eye_calib.alignment.similarity import settle_scale
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry.extrinsic import deviation
+from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import PosePairs

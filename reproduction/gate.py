@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.geometry.extrinsic import deviation
+from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import between, real_rigs

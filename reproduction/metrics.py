@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry.extrinsic import absolute_errors
+from hand_eye_calib.geometry.se3 import absolute_errors
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 
 

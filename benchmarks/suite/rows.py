@@ -14,7 +14,7 @@ from hand_eye_calib.assessment.covariance import assess
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import absolute_errors
+from hand_eye_calib.geometry.se3 import absolute_errors
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.writer import write_bag

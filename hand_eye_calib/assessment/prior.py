@@ -20,7 +20,7 @@ from hand_eye_calib.assessment.covariance import (
     judged,
 )
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import sigmas_in_parent
+from hand_eye_calib.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS
 

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.floor import FLOOR_TRAVEL_S, usual_speed
+from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
 from hand_eye_calib.checks.response import Fitted, Regression, delays, response

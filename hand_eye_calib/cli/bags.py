@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from hand_eye_calib.cli.console import STREAMS, note, waiting_for, with_progress
+from hand_eye_calib.cli.options import STREAMS, note, waiting_for, with_progress
 from hand_eye_calib.cli.reading import Recording
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli import options
-from hand_eye_calib.cli.console import note, print_result, waiting_for
+from hand_eye_calib.cli.options import note, print_result, waiting_for
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:

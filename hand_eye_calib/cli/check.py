@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.cli import options
-from hand_eye_calib.cli.console import STREAMS, fail, print_result, typed_options, waiting_for
+from hand_eye_calib.cli.options import STREAMS, fail, print_result, typed_options, waiting_for
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.text import angle, length
 

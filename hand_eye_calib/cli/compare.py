@@ -4,8 +4,7 @@ import argparse
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import print_result, waiting_for
-from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.cli.options import add_json_argument, print_result, waiting_for
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.text import amount, told_apart
 

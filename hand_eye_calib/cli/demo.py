@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import note, print_result, waiting_for
+from hand_eye_calib.cli.options import note, print_result, waiting_for
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
@@ -114,7 +114,7 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> Iterator[str]:
     """The verdict, each result beside the truth, and how far it is off."""
     from hand_eye_calib.geometry import se3
-    from hand_eye_calib.geometry.extrinsic import absolute_errors
+    from hand_eye_calib.geometry.se3 import absolute_errors
 
     yield offline.headline
     heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))

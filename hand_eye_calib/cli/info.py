@@ -2,8 +2,7 @@
 
 import argparse
 
-from hand_eye_calib.cli.console import print_result
-from hand_eye_calib.cli.options import add_json_argument
+from hand_eye_calib.cli.options import add_json_argument, print_result
 from hand_eye_calib.config import EXPORT_FORMATS
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
-from hand_eye_calib.cli.console import Exit, as_typed, fail
+from hand_eye_calib.cli.options import Exit, as_typed, fail
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.option import did_you_mean

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import (
+from hand_eye_calib.cli.options import (
     Exit,
     as_typed,
     fail,

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.cli.console import STREAMS, flag, note, waiting_for, with_progress
-from hand_eye_calib.cli.options import FILE_OPTIONS
+from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, flag, note, waiting_for, with_progress
 from hand_eye_calib.engine.run import run
 from hand_eye_calib.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.errors import ConfigError

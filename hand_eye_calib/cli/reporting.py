@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import fail, note, waiting_for
+from hand_eye_calib.cli.options import fail, note, waiting_for
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.results import save_text
 from hand_eye_calib.results.calibration import Calibration

@@ -3,8 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from hand_eye_calib.cli.console import fail, note, print_result, waiting_for
-from hand_eye_calib.cli.options import options_from
+from hand_eye_calib.cli.options import fail, note, options_from, print_result, waiting_for
 from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.cli.reporting import write_rig_report

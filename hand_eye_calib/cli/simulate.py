@@ -4,8 +4,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from hand_eye_calib.cli.console import print_result, with_progress
-from hand_eye_calib.cli.options import add_json_argument, at_least
+from hand_eye_calib.cli.options import add_json_argument, at_least, print_result, with_progress
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.simulation.options import HILLY_DRIVE, MIXTURE, PUBLISHED_DRIVE, REALISTIC
 from hand_eye_calib.text import counted

@@ -6,8 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.cli.console import STREAMS, note, with_progress
-from hand_eye_calib.cli.options import options_from
+from hand_eye_calib.cli.options import STREAMS, note, options_from, with_progress
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops

@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterator
 from io import StringIO
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.console import note
-from hand_eye_calib.cli.options import argument_type
+from hand_eye_calib.cli.options import argument_type, note
 from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 from typing import Literal, TypeAlias
 
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.answers import compare_answers, other_answers
+from hand_eye_calib.engine.estimation import compare_answers, other_answers
 from hand_eye_calib.engine.run import Progress, run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError

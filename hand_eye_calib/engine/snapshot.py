@@ -13,8 +13,7 @@ from hand_eye_calib.alignment.time_offset import (
     estimate_time_offset,
 )
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.answers import cross_checked
-from hand_eye_calib.engine.estimation import solve_poses
+from hand_eye_calib.engine.estimation import cross_checked, solve_poses
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

@@ -6,8 +6,8 @@ shift is taken over the last three seconds of motion, the last four, ... up to t
 over all of them; the largest tells. It is measured by what the scores really scatter over time.
 
 What was there before a shift, the installed extrinsic is off by: by its own uncertainty, and by the
-common-mode error of both odometries (:mod:`hand_eye_calib.assessment.floor`). That is learned from
-all motion before. A scale that drifts, as that of visual odometry, looks like a lever arm in
+common-mode error of both odometries (:mod:`hand_eye_calib.assessment.covariance`). It is learned
+from all motion before. A scale that drifts, as that of visual odometry, looks like a lever arm in
 curves: in each second the scale is a parameter. Standing still adds nothing. docs/session.md has
 what the monitor can see.
 """
@@ -19,7 +19,7 @@ from datetime import datetime
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.floor import floor_of_pairs
+from hand_eye_calib.assessment.covariance import floor_of_pairs
 from hand_eye_calib.assessment.moved import (
     UNKNOWN_FROM,
     Moved,
@@ -33,7 +33,7 @@ from hand_eye_calib.assessment.moved import (
 )
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import Extrinsic, sigmas_in_parent
+from hand_eye_calib.geometry.se3 import Extrinsic, sigmas_in_parent
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis

@@ -11,7 +11,7 @@ import numpy as np
 
 from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_in_parent
+from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.results.document import UNKNOWN_M, document_of, transform_arguments, values_of
 from hand_eye_calib.results.records import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.result import Result

@@ -12,7 +12,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import METHODS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_rpy, sigmas_translation
+from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_rpy, sigmas_translation
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
 from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand

@@ -10,7 +10,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import sigmas_in_parent, sigmas_rpy
+from hand_eye_calib.geometry.se3 import sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.results.records import (
     AXES,
     ClockRate,
@@ -75,7 +75,7 @@ class Result:
     floor : (6, 6) array
         Common-mode uncertainty: covariance, of the same xi, of errors that are the same in every
         part of the recording, so that nothing in it shows them
-        (:mod:`hand_eye_calib.assessment.floor`). ``covariance`` does not contain it.
+        (:mod:`hand_eye_calib.assessment.covariance`). ``covariance`` does not contain it.
     contradictions : mapping
         Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
 

@@ -10,7 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import turned
+from hand_eye_calib.geometry.se3 import turned
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.results.calibration import Calibration
 

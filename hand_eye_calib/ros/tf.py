@@ -16,8 +16,8 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
-from hand_eye_calib.geometry.extrinsic import Extrinsic, turned
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
+from hand_eye_calib.geometry.se3 import Extrinsic, turned
 from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast

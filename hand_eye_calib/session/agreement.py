@@ -25,7 +25,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import deviation
+from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.results.records import AXES
 from hand_eye_calib.text import amount, axes_in_words, listing
 

@@ -16,7 +16,7 @@ from hand_eye_calib.assessment.covariance import combined
 from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
-from hand_eye_calib.geometry.extrinsic import Extrinsic, deviation, turned
+from hand_eye_calib.geometry.se3 import Extrinsic, deviation, turned
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame
 from hand_eye_calib.results.context import (

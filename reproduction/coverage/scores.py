@@ -11,7 +11,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import absolute_errors, deviation
+from hand_eye_calib.geometry.se3 import absolute_errors, deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.results.records import AXES

@@ -19,7 +19,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.offline import prior_fields
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.geometry.extrinsic import deviation
+from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.goal import Goal

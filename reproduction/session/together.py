@@ -13,7 +13,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import deviation
+from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import compare, together
 from reproduction.coverage.classes import CLASSES, simulate

@@ -12,7 +12,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from hand_eye_calib import config
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import turned
+from hand_eye_calib.geometry.se3 import turned
 from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.ros import conversions

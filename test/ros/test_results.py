@@ -12,7 +12,7 @@ from std_msgs.msg import String
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import absolute_errors
+from hand_eye_calib.geometry.se3 import absolute_errors
 from hand_eye_calib.ros import conversions
 
 FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]

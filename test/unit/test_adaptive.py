@@ -10,7 +10,7 @@ from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import deviation
+from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.increments import (
     N_SYSTEMATIC,

@@ -17,14 +17,16 @@ from motions import (
 )
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.covariance import assess, judged, widened_by_halves
-from hand_eye_calib.assessment.floor import (
+from hand_eye_calib.assessment.covariance import (
     FLOOR_ROTATION,
     FLOOR_TRANSLATION,
+    assess,
     common_mode_floor,
     floor_of_pairs,
+    judged,
     open_scale_floor,
     usual_speed,
+    widened_by_halves,
 )
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.cli.main import main
@@ -33,7 +35,7 @@ from hand_eye_calib.engine import estimation
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import absolute_errors
+from hand_eye_calib.geometry.se3 import absolute_errors
 from hand_eye_calib.gls import estimator
 from hand_eye_calib.gls.normal import answers_without
 from hand_eye_calib.io.results import load_result

@@ -22,8 +22,8 @@ import yaml
 from motions import disturbed, write_pair
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.console import fail, note, print_result, waiting_for, with_progress
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.cli.options import fail, note, print_result, waiting_for, with_progress
 from hand_eye_calib.cli.present import as_lines
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3

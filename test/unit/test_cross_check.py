@@ -9,7 +9,7 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
-from hand_eye_calib.engine.answers import compare_answers
+from hand_eye_calib.engine.estimation import compare_answers
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import (
     Calibration,

@@ -6,7 +6,7 @@ from result_making import calibration as made
 from result_making import dofs
 
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.extrinsic import inverse_covariance, sigmas_rpy, sigmas_translation
+from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_rpy, sigmas_translation
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.document import printed_numbers
 

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from hand_eye_calib.cli.batch import work
 from hand_eye_calib.cli.batch.work import Outcome, Row, Task, matching, outcomes, tasks_of
-from hand_eye_calib.cli.console import note, waiting_for, with_progress
-from hand_eye_calib.cli.options import options_from, sources_from
+from hand_eye_calib.cli.options import note, options_from, sources_from, waiting_for, with_progress
 from hand_eye_calib.cli.present import deliver, wrapped
 from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import InputError

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hand_eye_calib.cli.bags import read_recording
-from hand_eye_calib.cli.console import STREAMS
-from hand_eye_calib.cli.options import Options
+from hand_eye_calib.cli.options import STREAMS, Options
 from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, required
 from hand_eye_calib.io import remote
