@@ -63,9 +63,9 @@ class TopicInput(PoseInput):
         wanted = [self._wanted_type] if is_wanted else _TYPES
         usable = [each for each in wanted if each in offered]
         if offered and not usable:
-            self.problem = f"has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
+            self.problem = f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
             self._log.warning(
-                f"{self.topic} {self.problem}: remap {self._relative_topic} to a topic with poses"
+                f"{self.topic}: {self.problem}: remap {self._relative_topic} to a topic with poses"
             )
         if self._subscription is not None or not (usable or is_wanted):
             return

@@ -103,7 +103,7 @@ class View:
     buttons: tuple[str, ...] = ()
     by_hand: str = ""
     saved_in: str = ""
-    answer: Line | None = None
+    answer: tuple[Line, ...] = ()
 
 
 class Board:
@@ -150,11 +150,12 @@ class Board:
         view = _view(state, now_s - heard_s)
         if view.word == MOVED and _alarm_of(state) == self._acknowledged:
             facts, buttons = f"{view.facts}; acknowledged", ("recalibrate", "reset")
-            view = replace(view, tone=Tone.ACT, buttons=buttons, facts=facts)
+            told = view.sentence.replace(" or acknowledge", "")
+            view = replace(view, tone=Tone.ACT, sentence=told, buttons=buttons, facts=facts)
         if view.word in ("CHECK INPUT", "BAD INPUT"):
             view = replace(view, topics=self.topics)
         if self._answer and now_s - self._answer[1] < ANSWER_FOR_S:
-            view = replace(view, answer=self._answer[0])
+            view = replace(view, answer=self._answer[:1])
         return view
 
 
@@ -208,12 +209,13 @@ def _where(saved: SavedState) -> str:
 def _headline(state: NodeState) -> tuple[Tone, str, str]:
     """Sign, word and sentence: what a person should know or do first, the gravest that applies."""
     extrinsic, mount, at, checks = state.extrinsic, state.mount, state.progress, state.checks
+    is_safe = at is not None and at.progress.done and state.saved  # whatever the journal lacks
     inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
     told = [
         (Tone.BAD, "BROKEN", extrinsic, Level.ERROR),
         (Tone.BAD, MOVED, mount, Level.ERROR),
         *((Tone.BAD, "BAD INPUT", each, Level.ERROR) for each in inputs),
-        (Tone.BAD, "BROKEN", state.journal, Level.ERROR),
+        (Tone.BAD, "BROKEN", None if is_safe else state.journal, Level.ERROR),
         *((Tone.ACT, "CHECK INPUT", each, Level.WARN) for each in inputs),
         (Tone.ACT, "CHECK THE STREAMS", checks, Level.WARN),
         (Tone.ACT, "NOT WATCHING", mount, Level.WARN),
@@ -264,7 +266,7 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
     if state.saved is not None:
         text = f"The node has ended. The result was saved {_where(state.saved)}."
         return Tone.GOOD, "ENDED", text
-    lost = "The result is not saved: output_directory is not set."
+    lost = "The result is not saved: the log says why."
     text = lost if _result_of(state) else "There was no result yet."
     return Tone.ACT, "ENDED", f"The node has ended. {text}"
 
@@ -338,13 +340,13 @@ def _watched(axis: str, mount: MountState) -> Line:
     """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
     shift, sigma = mount.shift.get(axis) or 0.0, mount.shift_sigma.get(axis) or math.inf
     visible = mount.visible_10min.get(axis)
+    tone, text = Tone.UNKNOWN, "cannot be watched with this motion"
     if abs(shift) > LARGEST_OF_SIX * sigma:
         tone, text = Tone.BAD, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
     elif visible is not None:
         tone, text = Tone.GOOD, f"not moved (would see {amount(axis, visible)})"
-    else:
-        text = "not known yet" if mount.is_learning else "cannot be watched with this motion"
-        tone = Tone.UNKNOWN
+    elif mount.is_learning or not mount.visible_10min:
+        text = "not known yet"
     return Line(tone, _NAMES[axis], text)
 
 

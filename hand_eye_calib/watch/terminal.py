@@ -31,7 +31,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
     head = Text.assemble((f" {view.tone.value} {view.word} ", f"reverse {_STYLES[view.tone]}"))
     parts: list[RenderableType] = [head, Text(view.sentence, style="bold")]
     parts += [Text(view.facts, style="dim")] * bool(view.facts)
-    parts += [_lines((view.answer,))] if view.answer is not None else []
+    parts += [_lines(view.answer)] * bool(view.answer)
     parts += [Text(f"    {topic}") for topic in view.topics]
     if view.bars:
         values = Table.grid(padding=(0, 3))  # x, y, z above roll, pitch, yaw
@@ -71,7 +71,5 @@ def _lines(lines: tuple[Line, ...]) -> Table:
 
 def lines(view: View) -> list[str]:
     """The headline, and the answer to a button: for a file or a pipe."""
-    told = [f"{view.tone.value} {view.word}: {view.sentence}"]
-    if view.answer is not None:
-        told.append(f"{view.answer.tone.value} {view.answer.name}: {view.answer.text}")
-    return told
+    answers = [f"{each.tone.value} {each.name}: {each.text}" for each in view.answer]
+    return [f"{view.tone.value} {view.word}: {view.sentence}", *answers]

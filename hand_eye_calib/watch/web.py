@@ -246,7 +246,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     result = [*map(_line, view.result[:1]), *_wrapped("ul", reasons), *map(_line, view.result[1:])]
     topics = (f"<li>{escape(topic)}</li>" for topic in view.topics)
     sections = (
-        _section("answer", "", [_line(view.answer)] if view.answer else []),
+        _section("answer", "", map(_line, view.answer)),
         _section("topics", "topics with poses", _wrapped("ul", topics)),
         _section("axes", axes, [*sketch, *map(_bar, view.bars)]),
         _section("axes", "the mount, after ten minutes of motion", map(_line, view.watched)),

@@ -130,10 +130,11 @@ BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 def test_best_effort_publishers_of_a_remapped_topic_are_counted_heard_and_named(start_node, peer):
     """Whatever QoS the other input has."""
     node = start_node("-p solve_period:=0.1", "-r parent_odom:=/lidar/odom", RELIABLE_INPUTS[1])
+    child = peer.publisher(Odometry, "child_odom")
+    peer.wait_matched(child)  # its override comes first
     parent = peer.node.create_publisher(Odometry, "/lidar/odom", BEST_EFFORT)
-    peer.wait_matched(parent)
     node.wait_for_log("no pose yet on /lidar/odom: 1 publisher")
-    peer.feed((parent, peer.publisher(Odometry, "child_odom")), *drive(8))
+    peer.feed((parent, child), *drive(8))
     node.wait_for_log("first pose on /lidar/odom", "first pose on /child_odom")
 
 

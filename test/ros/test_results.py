@@ -87,12 +87,12 @@ def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, pee
     peer.publisher(String, "parent_odom")
     peer.publisher(Odometry, "child_odom")
     node.wait_for_log(
-        "/parent_odom has type std_msgs/msg/String; expected nav_msgs/msg/Odometry, "
+        "/parent_odom: it has type std_msgs/msg/String; expected nav_msgs/msg/Odometry, "
         "geometry_msgs/msg/PoseStamped",
-        "/child_odom has type nav_msgs/msg/Odometry; expected geometry_msgs/msg/PoseStamped: remap",
+        "/child_odom: it has type nav_msgs/msg/Odometry; expected geometry_msgs/msg/PoseStamped: ",
     )
     statuses = peer.diagnostics()
-    said = "no message on /child_odom yet: has type nav_msgs/msg/Odometry; expected"
+    said = "no message on /child_odom yet: it has type nav_msgs/msg/Odometry; expected"
     peer.spin_until(lambda: said in str(statuses.get("/calibrator: child input")), "the status")
 
 

@@ -20,6 +20,7 @@ from hand_eye_calib.live.state import (
     ChecksState,
     ExtrinsicState,
     InputState,
+    JournalState,
     Level,
     MountState,
     NodeState,
@@ -46,15 +47,13 @@ PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 RESULT = ResultState(
     parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
     reasons=("a: b", "c: d"), warnings=("repaired",), n_poses=9,
-    time_offset_s=0.0, scale=1.0,
-    age_s=1.0,
+    time_offset_s=0.0, scale=1.0, age_s=1.0,
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
     pose_sigma={"x": 0.004, "y": 0.004, "z": None, "roll": 0.01, "pitch": 0.01, "yaw": 0.01},
 )  # fmt: skip
 EXTRINSIC = ExtrinsicState(
     level=Level.OK, text="known", is_solving=False, n_poses=9, path_m=3.0, rotation_deg={},
-    tf_static=Broadcast.OFF,
-    tf_static_reason="", result=RESULT,
+    tf_static=Broadcast.OFF, tf_static_reason="", result=RESULT,
 )  # fmt: skip
 ROTATION = AxisProgress(sigma=0.001, target=0.00524, seconds_left=0.0)
 KNOWN = AxisProgress(sigma=0.004, target=0.02, seconds_left=0.0)
@@ -68,6 +67,7 @@ CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, findings=())
 MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
 
 
+FULL = JournalState(level=Level.ERROR, text="cannot write", directory="")
 SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six axes")
 
 
@@ -140,6 +140,8 @@ ERROR = {"level": Level.ERROR}
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
+        (state(journal=FULL), 0.5, Tone.BAD, "BROKEN", "Cannot write."),
+        (state(journal=FULL, at={"done": True}, saved=SAVED), 0.5, Tone.GOOD, "DONE", "Go on"),
         (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
         (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. The"),
         (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: nobody"),
@@ -251,6 +253,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert "precision" not in fragment(view)
     assert "moved by 1 deg" in drawn(view, 80)
     assert "s solve" not in drawn(view, 80)
+    assert view_of(mount(level=Level.WARN)).watched[0].text == "not known yet"
 
 
 def test_of_several_nodes_the_first_that_speaks_is_shown_or_the_one_that_is_wanted():
@@ -277,6 +280,7 @@ def test_an_alarm_that_somebody_knows_of_is_quiet_until_the_next():
         ("recalibrate", "reset"),
     )
     assert view.facts.endswith("; acknowledged")
+    assert view.sentence.endswith("then recalibrate.")
     board.take(mount(**ERROR, text="moved", since_ns=2 * 10**18), 1.0)
     assert board.view(1.0).tone is Tone.BAD
 
@@ -326,7 +330,7 @@ def test_a_line_is_printed_when_something_else_is_said(capsys):
         assert [len(printed(each, 4.0)) for each in learning] == [1, 0]
         board.answer("save", True, "result saved", 5.0)
         assert printed(learning[0], 5.0) == ["✓ save: result saved"]
-        assert board.view(60.0).answer is None
+        assert board.view(60.0).answer == ()
 
 
 @pytest.fixture
@@ -347,7 +351,7 @@ def typed():
 def test_keys_ask_and_a_reset_takes_two(typed):
     typed("sx9w")
     assert [typed.requests.get(), typed.requests.get()] == ["solve", "save"]
-    assert typed("r").answer.text == "forgets all poses: press r again"
+    assert typed("r").answer[0].text == "forgets all poses: press r again"
     typed("ca")  # no mount has moved
     assert typed.requests.empty()
     typed("r")
