@@ -1,5 +1,6 @@
 """Synthetic motion with a known answer, for tests that need poses rather than a vehicle."""
 
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,14 @@ from hand_eye_calib.io.trajectory_files.table import write_trajectory
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 
 
+_HOME = np.eye(4)
+
+
+def walked(steps, first=_HOME):
+    """(N + 1, 4, 4) poses that follow the first one by N steps."""
+    return np.array(list(accumulate([first, *steps], np.matmul)))
+
+
 def wandering_poses(n_poses, seed=0, step_m=0.1, step_rad=0.08):
     """(N, 4, 4) poses of a random walk in six degrees of freedom, smooth over about ten poses."""
     random = np.random.default_rng(seed)
@@ -21,10 +30,7 @@ def wandering_poses(n_poses, seed=0, step_m=0.1, step_rad=0.08):
         np.convolve, 0, random.normal(size=(n_poses + 9, 6)), kernel, mode="valid"
     )
     steps *= np.r_[np.full(3, step_m), np.full(3, step_rad)]
-    poses = [np.eye(4)]
-    for step in se3.exp(steps[1:]):
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
+    return walked(se3.exp(steps[1:]))
 
 
 def planar_poses(n_poses, seed=0):
@@ -63,6 +69,12 @@ def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **fra
     return Trajectory(
         start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64), poses, **frames
     )
+
+
+def noisy_pair(poses, seed, *noise, rate_hz=10.0, mount=T_PARENT_CHILD):
+    """Both trajectories, each with white noise (m, rad) of its own."""
+    both = enumerate((poses, child_of(poses, mount)), start=seed)
+    return [as_trajectory(disturbed(each, own, *noise), rate_hz) for own, each in both]
 
 
 def write_pair(folder, parent, child):

@@ -122,9 +122,9 @@ def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> 
     truth, replayed = drive.T_parent_child, offline.T_parent_child
     for title, T in (("truth", truth), ("replay of the bag", replayed), ("live node", live)):
         metres, radians = absolute_errors(T, truth)
-        position = "".join(f"{value:10.4f}" for value in T[:3, 3])
-        angles = se3.rotation_to_rpy(T[:3, :3])
-        degrees = "".join(f"{math.degrees(value):10.3f}" for value in angles)
+        pose = se3.xyz_rpy(T).tolist()
+        position = "".join(f"{value:10.4f}" for value in pose[:3])
+        degrees = "".join(f"{math.degrees(value):10.3f}" for value in pose[3:])
         off = f"off by {length(metres)} and {angle(radians)}" * (T is not truth)
         yield f"  {title:<24}{position}{'':10}{degrees}  {off}".rstrip()
     metres, radians = absolute_errors(live, replayed)

@@ -258,9 +258,7 @@ class Calibrator:
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
         parent, child = self._buffers["parent"], self._buffers["child"]
-        parent_frame, child_frame, warnings = name_frames(
-            self.config, {"parent": parent.frame, "child": child.frame}
-        )
+        parent_frame, child_frame, warnings = name_frames(self.config, parent.frame, child.frame)
         return Snapshot(
             config=self.config,
             kept=self._kept,

@@ -246,9 +246,8 @@ def whole_snapshot(
         "child_measures": child.measures,
     }
     config = CalibratorConfig.from_options(of_streams | dict(options))
-    parent_frame, child_frame, warnings = name_frames(
-        config, {"parent": parent.sensor_frame, "child": child.sensor_frame}
-    )
+    frames = parent.sensor_frame, child.sensor_frame
+    parent_frame, child_frame, warnings = name_frames(config, *frames)
     if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
         warnings += (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
     return Snapshot(
@@ -262,12 +261,12 @@ def whole_snapshot(
 
 
 def name_frames(
-    config: CalibratorConfig, known: Mapping[str, str]
+    config: CalibratorConfig, parent: str, child: str
 ) -> tuple[str, str, tuple[str, ...]]:
     """Names of the parent's and the child's sensor frame, and a warning for each without a name.
     Those of the options override those that the streams give, which are empty if unknown.
     """
-    parent, child = (getattr(config, f"{stream}_frame") or known[stream] for stream in STREAMS)
+    parent, child = config.parent_frame or parent, config.child_frame or child
     warnings = tuple(
         f"the {stream} stream does not name its sensor's frame; it is called '{stream}_sensor' "
         f"here (name it with {stream}_frame)"

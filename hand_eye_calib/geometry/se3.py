@@ -338,6 +338,11 @@ def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") ->
     return Ts
 
 
+def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
+    """x, y, z (m), roll, pitch and yaw (rad) of a transform (4, 4)."""
+    return np.r_[T_target_source[:3, 3], rotation_to_rpy(T_target_source[:3, :3])]
+
+
 # -------------------------------------------------------------------------- extrinsics
 
 # Standard deviations above this (rad) count as unknown: the derivative does not hold that far.
@@ -368,12 +373,6 @@ class Extrinsic:
     origin: str
     covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     is_calibration: bool = False
-
-    @property
-    def values(self) -> FloatArray:
-        """(6,) array: x, y, z (m) and roll, pitch, yaw (rad)."""
-        rpy = rotation_to_rpy(self.T_parent_child[:3, :3])
-        return np.r_[self.T_parent_child[:3, 3], rpy]
 
 
 def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -373,8 +373,7 @@ class SolveCycle:
 
 
 def _result_state(result: Calibration) -> ResultState:
-    T, sigmas = result.T_parent_child, result.sigmas_printed
-    pose = np.concatenate([T[:3, 3], se3.rotation_to_rpy(T[:3, :3])])
+    pose, sigmas = se3.xyz_rpy(result.T_parent_child), result.sigmas_printed
     return ResultState(
         parent_frame=result.parent_frame,
         child_frame=result.child_frame,
@@ -393,9 +392,9 @@ def _result_state(result: Calibration) -> ResultState:
 
 def describe(calibration: Calibration) -> str:
     """One line for a log: whose pose in whose frame, how good, from how much."""
-    T, sigmas = calibration.T_parent_child, calibration.sigmas_printed
-    angles = np.degrees(se3.rotation_to_rpy(T[:3, :3]))
-    xyz, rpy = (", ".join(f"{each:.{n}f}" for each in v) for v, n in ((T[:3, 3], 4), (angles, 3)))
+    pose, sigmas = se3.xyz_rpy(calibration.T_parent_child), calibration.sigmas_printed
+    xyz = ", ".join(f"{value:.4f}" for value in pose[:3])
+    rpy = ", ".join(f"{value:.3f}" for value in np.degrees(pose[3:]))
     mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
     deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
     return (

@@ -62,10 +62,8 @@ class Calibration(Result):
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
-        values = ", ".join(
-            f"{dof.name} {value:.6g} +/- {dof.sigma:.2g}"
-            for dof, value in zip(self.observability, self._printed(), strict=True)
-        )
+        printed = zip(self.observability, se3.xyz_rpy(self.T_parent_child), strict=True)
+        values = ", ".join(f"{dof.name} {at:.6g} +/- {dof.sigma:.2g}" for dof, at in printed)
         return (
             f"<Calibration: {self.headline}\n {frames}: {values} (m, rad), "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
@@ -80,7 +78,8 @@ class Calibration(Result):
         MissingDependencyError
             Without pandas.
         """
-        rows = zip(self.observability, self._printed(), self.sigmas_printed, strict=True)
+        values = se3.xyz_rpy(self.T_parent_child).tolist()
+        rows = zip(self.observability, values, self.sigmas_printed, strict=True)
         table = []
         for dof, value, sigma in rows:
             row = {"axis": dof.name, "value": value, "sigma": sigma}
@@ -183,10 +182,6 @@ class Calibration(Result):
 
         is_usable = self.verdict is not Verdict.DO_NOT_USE
         return export_text(self, format, self.headline, is_usable)
-
-    def _printed(self) -> list[float]:
-        angles = se3.rotation_to_rpy(self.T_parent_child[:3, :3])
-        return [*self.T_parent_child[:3, 3].tolist(), *angles.tolist()]
 
     @property
     def verdict(self) -> Verdict:

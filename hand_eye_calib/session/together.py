@@ -16,7 +16,7 @@ from hand_eye_calib.assessment.covariance import combined
 from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
-from hand_eye_calib.geometry.se3 import Extrinsic, deviation, turned
+from hand_eye_calib.geometry.se3 import Extrinsic, deviation, turned, xyz_rpy
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame
 from hand_eye_calib.results.context import (
@@ -340,12 +340,10 @@ def _who_moved(
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
     """The result with its comparison with what is installed."""
-    stated = installed
-    if isinstance(stated, Calibration):
-        stated = Extrinsic(stated.T_parent_child, "a result")
-    values = dict(zip(AXES, stated.values.tolist(), strict=True))
+    origin = "a result" if isinstance(installed, Calibration) else installed.origin
+    values = _by_axis(xyz_rpy(installed.T_parent_child))
     found = compare([result], installed, ["result"])
-    return replace(result, comparison=replace(found, installed=stated.origin, values=values))
+    return replace(result, comparison=replace(found, installed=origin, values=values))
 
 
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:

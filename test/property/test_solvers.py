@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from motions import walked
 
 from hand_eye_calib.config import METHODS
 from hand_eye_calib.errors import NotEnoughDataError
@@ -49,13 +50,8 @@ def drive(seed):
     """Poses (N_POSES, 4, 4) of a body that moves up to 2 m and turns up to 0.8 rad per axis from
     pose to pose.
     """
-    random = np.random.default_rng(seed)
-    poses = [np.eye(4)]
-    for step in random.uniform(
-        [-2, -2, -2, -0.8, -0.8, -0.8], [2, 2, 2, 0.8, 0.8, 0.8], (N_POSES - 1, 6)
-    ):
-        poses.append(poses[-1] @ se3.exp(step))
-    return np.array(poses)
+    most = np.repeat([2.0, 0.8], 3)
+    return walked(se3.exp(np.random.default_rng(seed).uniform(-most, most, (N_POSES - 1, 6))))
 
 
 def trajectories(seed, T_parent_child, noise=0.0):

@@ -1,11 +1,10 @@
-import itertools
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import real_data
-from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, wandering_poses
+from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import assess_adaptive
@@ -62,7 +61,7 @@ def biased(poses, bias):
     for _ in range(50):
         disturbed_steps = true_steps + bias * np.linalg.norm(disturbed_steps, axis=1, keepdims=True)
     steps[:, :3, 3] = disturbed_steps
-    return np.array(list(itertools.accumulate(steps, np.matmul, initial=poses[0])))
+    return walked(steps, poses[0])
 
 
 def systematic(parent, nuisance, parameters):
@@ -128,10 +127,8 @@ def noisy_drive(seed, n_poses=150, white=(0.004, 0.006), drift=(0.0, 0.0)):
     child = child_of(parent)
     steps = se3.inverse(child[:-1]) @ child[1:]
     wander = np.random.default_rng(1000 + seed).normal(size=(n_poses - 1, 6)) * np.repeat(drift, 3)
-    poses = [child[0]]
-    for step, error in zip(steps, se3.exp(wander), strict=True):
-        poses.append(poses[-1] @ step @ error)
-    return disturbed(parent, 2 * seed + 5, *white), disturbed(np.array(poses), 2 * seed + 6, *white)
+    poses = walked(steps @ se3.exp(wander), child[0])
+    return disturbed(parent, 2 * seed + 5, *white), disturbed(poses, 2 * seed + 6, *white)
 
 
 def drift_of(noise):

@@ -1,17 +1,17 @@
 """Covariances, verdicts of axes, the floor, and which answer ``method: auto`` takes."""
 
 import dataclasses
-from itertools import accumulate
 
 import numpy as np
 import pytest
 import real_data
 from motions import (
     T_PARENT_CHILD,
-    as_trajectory,
     child_of,
     disturbed,
+    noisy_pair,
     planar_poses,
+    walked,
     wandering_poses,
     write_pair,
 )
@@ -105,7 +105,7 @@ def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_
 def drifting(poses, seed):
     steps = se3.inverse(poses[:-1]) @ poses[1:]
     steps = steps @ se3.exp(np.random.default_rng(seed).normal(0.0, 0.003, (len(steps), 6)))
-    return np.array(list(accumulate([poses[0], *steps], np.matmul)))
+    return walked(steps, poses[0])
 
 
 @pytest.mark.parametrize(
@@ -129,9 +129,8 @@ def test_an_axis_is_judged_by_its_standard_deviation(axis, sigma, verdict):
 
 
 def streams(scale=1.0):
-    parent = wandering_poses(120)
-    child = as_trajectory(disturbed(child_of(parent), 2, 1e-4, 1e-4)).scaled(scale)
-    return as_trajectory(disturbed(parent, 1, 1e-4, 1e-4)), child
+    parent, child = noisy_pair(wandering_poses(120), 1, 1e-4, 1e-4)
+    return parent, child.scaled(scale)
 
 
 class TestFloor:
@@ -221,11 +220,7 @@ class TestHalves:
 
 
 def noisy_streams(n_poses=150):
-    parent = wandering_poses(n_poses)
-    return tuple(
-        as_trajectory(disturbed(poses, seed, 0.002, 0.002), 10)
-        for seed, poses in ((1, parent), (2, child_of(parent)))
-    )
+    return noisy_pair(wandering_poses(n_poses), 1, 0.002, 0.002)
 
 
 class TestWhichAnswerStands:
@@ -302,9 +297,7 @@ MOUNT = se3.from_rotation_translation(
 
 
 def flat_drive(noise=0.001, mount=MOUNT):
-    poses = planar_poses(400)
-    child = disturbed(child_of(poses, mount), 2, noise, noise)
-    return as_trajectory(disturbed(poses, 1, noise, noise)), as_trajectory(child)
+    return noisy_pair(planar_poses(400), 1, noise, noise, mount=mount)
 
 
 def sigmas(result):
@@ -390,11 +383,7 @@ class TestFlatGround:
 @pytest.fixture(scope="module")
 def wandering():
     """Two streams of full motion, and their calibration without a prior."""
-    poses = wandering_poses(300)
-    streams = [
-        as_trajectory(disturbed(each, seed, 0.01, 0.005))
-        for seed, each in ((1, poses), (2, child_of(poses, MOUNT)))
-    ]
+    streams = noisy_pair(wandering_poses(300), 1, 0.01, 0.005, mount=MOUNT)
     return streams, calibrate(*streams, reference="B10")
 
 

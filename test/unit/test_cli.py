@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from motions import disturbed, write_pair
+from motions import disturbed, walked, write_pair
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -55,11 +55,8 @@ def drive(count=120, planar=False, first_ns=START_NS):
     twists[:, 0], twists[:, 5] = 0.1, 0.08 * np.sin(0.9 * time)
     if not planar:
         twists[:, 3], twists[:, 4] = 0.05 * np.sin(1.7 * time), 0.06 * np.cos(1.3 * time)
-    poses = [np.eye(4)]
-    for step in se3.exp(twists[1:]):
-        poses.append(poses[-1] @ step)
     stamps_ns = first_ns + 100_000_000 * np.arange(count)
-    parent = Trajectory(stamps_ns, np.array(poses), "lidar", "map")
+    parent = Trajectory(stamps_ns, walked(se3.exp(twists[1:])), "lidar", "map")
     child = disturbed(OTHER_WORLD @ parent.poses @ TRUTH, 1, *NOISE)
     return parent, Trajectory(stamps_ns, child, "camera", "odom")
 

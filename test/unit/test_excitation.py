@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses
+from motions import as_trajectory, child_of, noisy_pair, planar_poses, wandering_poses
 
 from hand_eye_calib.assessment.excitation import (
     LeverArms,
@@ -140,8 +140,7 @@ def test_verdict_finding_and_hint_agree(pitch_rad, hidden):
     )
     position = np.cumsum(0.1 * np.c_[np.cos(yaw), np.sin(yaw), 0 * yaw], axis=0)
     poses = se3.from_rotation_translation(rotation, position)
-    parent = as_trajectory(disturbed(poses, 1, 1e-4, 1e-5))
-    child = as_trajectory(disturbed(child_of(poses), 2, 1e-4, 1e-5))
+    parent, child = noisy_pair(poses, 1, 1e-4, 1e-5)
     result = calibrate(parent, child, reference="B10")
     codes = [finding.code for finding in check_streams(parent, child).findings]
     seen = excitation(PosePairs(parent.stamps_ns, parent.poses, child.poses))

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, walked, wandering_poses
 
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
@@ -105,10 +105,7 @@ class TestKeyframes:
         steps = np.zeros((10, 6))
         steps[1:5, 0] = 0.1
         steps[5:, 5] = 0.2
-        poses = [np.eye(4)]
-        for step in se3.exp(steps[1:]):
-            poses.append(poses[-1] @ step)
-        poses = np.array(poses)
+        poses = walked(se3.exp(steps[1:]))
         return PosePairs(np.arange(10) * 10**8, poses, poses)
 
     @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from motions import (
     as_trajectory,
     child_of,
     disturbed,
+    noisy_pair,
     planar_poses,
     smooth_poses,
     wandering_poses,
@@ -197,8 +198,7 @@ class TestAnswerOfTheMethod:
     def test_it_has_the_objective_and_the_result_is_the_settled_one(self):
         """Flat ground does not reveal z: the method's answer has one, the result has about 0."""
         poses = planar_poses(300)
-        parent = as_trajectory(disturbed(poses, 1, 2e-3, 1e-3))
-        child = as_trajectory(disturbed(child_of(poses), 2, 2e-3, 1e-3))
+        parent, child = noisy_pair(poses, 1, 2e-3, 1e-3)
         result = hec.calibrate(parent, child, method="dnl", reference="B10")
         assert result.unobservable() == ["z"]
         pairs = motion_pairs(parent.poses, child.poses, "B10")

@@ -337,7 +337,7 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     (file,) = tmp_path.glob("*.yaml")
     stated = yaml.safe_load(file.read_text())["comparison"]
     assert stated["installed"] == "robot.urdf <b>"
-    assert stated["values"]["x"] == pytest.approx(installed.values[0])
+    assert stated["values"]["x"] == pytest.approx(installed.T_parent_child[0, 3])
     assert stated["differences"][0]["axes"]["x"]["difference"] == pytest.approx(-0.5)
     assert stated["differences"][0]["axes"]["z"]["sigma"] is None
 

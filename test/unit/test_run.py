@@ -2,11 +2,10 @@
 
 import pickle
 from dataclasses import replace
-from itertools import accumulate
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, wandering_poses
+from motions import as_trajectory, child_of, disturbed, walked, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
@@ -200,8 +199,7 @@ def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
     # A drift of 5 % of the path along one axis of the child, hence partly along the path.
     steps = se3.inverse(child[:-1]) @ child[1:]
     steps[:, 0, 3] += 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1)
-    drifting = np.stack(list(accumulate(steps, np.matmul, initial=child[0])))
-    result = hec.calibrate(as_trajectory(poses), as_trajectory(drifting))
+    result = hec.calibrate(as_trajectory(poses), as_trajectory(walked(steps, child[0])))
     assert {finding.code for finding in result.findings} == {"scale", "not_independent"}
     assert (result.method, result.scale) == ("adaptive", 1.0)
     assert result.noise.systematic == "bias"

@@ -12,6 +12,7 @@ from motions import (
     child_of,
     disturbed,
     feed,
+    noisy_pair,
     planar_poses,
     wandering_poses,
 )
@@ -29,11 +30,8 @@ from hand_eye_calib.pairing.motion_pairs import PosePairs
 
 def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=wandering_poses):
     """Both at 10 Hz; the child's lengths must be multiplied by ``scale``."""
-    parent = poses(n_poses, seed)
-    child = disturbed(child_of(parent), seed + 2, noise, noise)
-    return as_trajectory(disturbed(parent, seed + 1, noise, noise)), as_trajectory(child).scaled(
-        1 / scale
-    )
+    parent, child = noisy_pair(poses(n_poses, seed), seed + 1, noise, noise)
+    return parent, child.scaled(1 / scale)
 
 
 def pose_pairs(parent, child):

@@ -8,7 +8,15 @@ import tracemalloc
 import numpy as np
 import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
-from motions import as_trajectory, child_of, disturbed, planar_poses, wandering_poses, write_pair
+from motions import (
+    as_trajectory,
+    child_of,
+    disturbed,
+    noisy_pair,
+    planar_poses,
+    wandering_poses,
+    write_pair,
+)
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, fit_similarity
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
@@ -27,12 +35,7 @@ from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseCon
 def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):
     """A walk far from the origin, so that it matters whose pose is in which frame."""
     start = se3.from_rotation_translation(np.eye(3), [30.0, -20.0, 2.0])
-    poses = start @ wander(n_poses, seed)
-    child = child_of(poses)
-    return (
-        as_trajectory(disturbed(poses, seed + 1, noise, noise)),
-        as_trajectory(disturbed(child, seed + 2, noise, noise)),
-    )
+    return noisy_pair(start @ wander(n_poses, seed), seed + 1, noise, noise)
 
 
 def grave(agreement):
@@ -316,8 +319,6 @@ def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
     severities = []
     for length_m, noise in ((0.0005, 1e-4), (0.004, 1e-4), (0.016, 0.004), (0.016, 0.02)):
         X = se3.from_rotation_translation(se3.rotation_exp([0.4, -0.8, 0.3]), [length_m, 0.0, 0.0])
-        parent = as_trajectory(disturbed(poses, 1, noise, noise))
-        child = as_trajectory(disturbed(child_of(poses, X), 2, noise, noise))
-        found = check_streams(parent, child).findings
+        found = check_streams(*noisy_pair(poses, 1, noise, noise, mount=X)).findings
         severities.append({each.severity for each in found if each.code == "same_position"})
     assert severities == [{Severity.ERROR}, {Severity.WARNING}, set(), set()]

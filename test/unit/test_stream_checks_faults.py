@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, wandering_poses
+from motions import as_trajectory, child_of, disturbed, noisy_pair, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change, possible_shift
@@ -156,9 +156,8 @@ class TestOneStreamComputedFromTheOther:
     @pytest.mark.parametrize("noise", [2e-4, 2e-3])
     def test_two_precise_sensors_are_independent(self, rate_hz, noise):
         poses = wandering_poses(600, 4, 1.0 / rate_hz, 0.8 / rate_hz)
-        parent = as_trajectory(disturbed(poses, 1, noise, noise), rate_hz)
-        child = as_trajectory(disturbed(child_of(poses), 2, noise, noise), rate_hz)
-        assert "not_independent" not in [f.code for f in check_streams(parent, child).findings]
+        found = check_streams(*noisy_pair(poses, 1, noise, noise, rate_hz=rate_hz)).findings
+        assert "not_independent" not in [each.code for each in found]
 
 
 # ---- a mount that moved within a recording
