@@ -112,7 +112,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         solution.rotation_variance,
         # Rotations below the noise of single poses cannot be told from none.
         # Otherwise they can, and the tilt of the axis is stated: half as much is enough.
-        MIN_SHARE if solution.is_drowned else MIN_SHARE / 2,
+        MIN_SHARE if solution.is_noise_dominated else MIN_SHARE / 2,
     )
     unseen = basis([*solution.unseen.T, *hidden])
     return combined(solution.T_parent_child, covariance, None, unseen)

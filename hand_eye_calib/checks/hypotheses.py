@@ -396,7 +396,7 @@ def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> 
     findings = []
     for code, stream in hypothesis.mistakes:
         key = "inverse_both" if (code, stream) == ("inverse", "both") else code
-        # An option mends only what is clear.
+        # An option repairs only what is clear.
         options = conventions(code, stream) if is_clear or code != "inverse" else {}
         findings.append(finding(key, stream, options=options, detail=hypothesis.detail))
     return replace(explanation, findings=tuple(findings))

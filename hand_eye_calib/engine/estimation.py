@@ -258,11 +258,11 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         [name for name in SYSTEMATIC if not known.get(name)],
         is_clock_free=is_clock_free,
     )
-    works = solution.converged and not solution.is_drowned
+    works = solution.converged and not solution.is_noise_dominated
     reason = "auto: adaptive, because its noise model works here" if is_auto else ""
     if is_auto and not works:
         why = "single poses are noisier than the motion between them"
-        why = why if solution.is_drowned else "the adaptive estimator did not converge"
+        why = why if solution.is_noise_dominated else "the adaptive estimator did not converge"
         with contextlib.suppress(NotEnoughDataError):
             dnlo = _solve_pairs(pose_pairs, with_dnlo, solution)
             reason = f"auto: dnlo on reference {dnlo.reference}, because {why}"

@@ -285,7 +285,7 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
 
 
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:
-    """Options that mend a finding for certain and that the user did not set, by name.
+    """Options that repair a stream for certain and that the user did not set, by name.
 
     Units and conventions are set as they are. Anything else is estimated, so that its uncertainty
     counts. Lengths that differ by a few per cent only give a warning: odometry whose scale drifts

@@ -135,7 +135,7 @@ class AdaptiveSolution(ModelSolution):
         Directions of xi that no increment says anything about.
     weights : (n + 1,) array
         Of the poses' white errors; other than 1 where tails are heavy.
-    is_drowned : bool
+    is_noise_dominated : bool
         Whether single poses are noisier than the rotation between them: only some were used.
     metres_per_pose : float
         Path of the parent from pose to pose.
@@ -146,7 +146,7 @@ class AdaptiveSolution(ModelSolution):
     unseen: FloatArray
     weights: FloatArray
     metres_per_pose: float
-    is_drowned: bool = False
+    is_noise_dominated: bool = False
 
     @property
     def systematic(self) -> str:
@@ -311,7 +311,7 @@ def _passed(problem: Problem, fit: Fit, stages: Sequence) -> Fit:
 
 def _strided(problem: Problem, fit: Fit) -> IntArray:
     """Poses to keep: all, but of a camera that sees a target, whose errors repeat from pose to pose
-    and drown the rotation between them, only every so many.
+    and exceed the rotation between them, only every so many.
     """
     tuning, streams = problem.tuning, problem.streams
     every = np.arange(len(streams))
@@ -329,13 +329,13 @@ def _strided(problem: Problem, fit: Fit) -> IntArray:
 
 
 def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
-    """The solution of some poses, jumps and spikes told of all."""
+    """The solution of some poses, jumps and outlier poses told of all."""
     jumps, spikes = np.zeros(len(spikes) - 1, dtype=bool), spikes.copy()
     weights = np.ones(len(spikes))
     jumps[kept[1:][fewer.jumps] - 1] = True
     spikes[kept[fewer.spikes]] = True
     weights[kept] = fewer.weights
-    return replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_drowned=True)
+    return replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_noise_dominated=True)
 
 
 def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:

@@ -55,7 +55,7 @@ def first_outliers(
 ) -> Outliers:
     """What stands out of residuals (n, 6) without knowing their noise.
 
-    A pose between two jumps counts as a spike, and its increments as evidence, until shown
+    A pose between two jumps counts as an outlier, and its increments as evidence, until shown
     otherwise; with a jump behind it where what stands out of the others stands out of the bridged
     one, too.
     """
@@ -75,7 +75,7 @@ def first_outliers(
     return Outliers(jumps, spikes)
 
 
-def surprises(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
+def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
     space, levels, (states, walk) = posterior.space, posterior.levels, posterior.restricted()
     of_walk = _chi_squares(
@@ -141,8 +141,7 @@ def _is_peak(values: FloatArray) -> BoolArray:
 
 
 def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
-    """Streams with the child's poses at spikes as the parent's motion from the pose before has
-    them.
+    """Streams whose outlier poses of the child follow the parent's motion from the pose before.
 
     A pose that is wrong by itself is no evidence, but its large error would not be small in the
     increments on both sides of it, which are of first order.

@@ -50,7 +50,7 @@ from hand_eye_calib.gls.noise_model import (
     Slow,
 )
 from hand_eye_calib.gls.normal import NormalEquations
-from hand_eye_calib.gls.outliers import Outliers, bridged, judged, surprises
+from hand_eye_calib.gls.outliers import Outliers, bridged, innovations, judged
 from hand_eye_calib.gls.stages import known_products, rough_levels, sample
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
@@ -277,7 +277,7 @@ class _State:
         """With jumps, which are large steps of the walk, positions wrong by themselves, and
         positions left out if those around are clearly worse than the rest.
         """
-        of_walk, of_white = surprises(posterior, self.left_out)
+        of_walk, of_white = innovations(posterior, self.left_out)
         found = judged(self.outliers, of_walk, of_white, with_spikes=True)
         boost = np.where(found.jumps, np.maximum(TUNING.jump_factor * of_walk, self.boost), 1.0)
         states = posterior.states_after(posterior.normal.step)[:, :3]

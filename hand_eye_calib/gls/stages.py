@@ -42,8 +42,8 @@ from hand_eye_calib.gls.outliers import (
     Outliers,
     bridged,
     first_outliers,
+    innovations,
     judged,
-    surprises,
     tail_weights,
 )
 from hand_eye_calib.gls.state_space import WHITE, Posterior, StateSpace
@@ -123,7 +123,7 @@ class Fit:
     Attributes
     ----------
     poses : Streams
-        Freed of the errors known so far, spikes bridged.
+        Freed of the errors known so far, outlier poses bridged.
     error : (N, 6) array
         Those errors.
     course : Course
@@ -169,7 +169,7 @@ class Fit:
         White errors are split between the sensors by their covariances, which holds for errors of
         these covariances only. A lasting error of some centimetres beside white noise of a
         millimetre would be taken for large and opposite rotations, so other errors are split in
-        halves; spikes, too.
+        halves; outlier poses, too.
         """
         spikes, T = self.outliers.spikes, self.T
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
@@ -283,7 +283,7 @@ def noise(problem: Problem, fit: Fit) -> Fit:
 
 
 def outliers(problem: Problem, fit: Fit) -> Fit:
-    """Jumps and spikes, and the noise without them."""
+    """Jumps and outlier poses, and the noise without them."""
     tuning = problem.tuning
     found = _outliers_found(problem, fit, tuning.outlier_rounds)
     changed = found.outliers.differs_by(fit.outliers) > tuning.negligible
@@ -297,12 +297,12 @@ def outliers(problem: Problem, fit: Fit) -> Fit:
 
 
 def _outliers_found(problem: Problem, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
-    """Jumps and spikes in turn, until they stay; or jumps alone, where tails have weights."""
+    """Jumps and outlier poses in turn, until none changes; jumps alone where tails have weights."""
     for _ in range(rounds):
         if problem.is_noisy(fit):
             posterior = problem.posterior(fit)
             fit = fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
-        of_walk, of_white = surprises(problem.posterior(fit), fit.outliers.spikes)
+        of_walk, of_white = innovations(problem.posterior(fit), fit.outliers.spikes)
         found = judged(fit.outliers, of_walk, of_white, with_spikes)
         if not found.differs_by(fit.outliers):
             break

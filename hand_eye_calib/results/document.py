@@ -252,13 +252,9 @@ def _values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a calibration; a KeyError, TypeError or ValueError for what was not written so."""
     from hand_eye_calib.results import context
 
-    values: dict[str, Any] = {}
-    for name in (*_TRANSFORMS, "T_base_child"):
-        if name in data:
-            values[name] = _transform_of(data[name])
-    for name in _COVARIANCES:
-        if name in data:
-            values[name] = _covariance_of(data[name])
+    readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), _transform_of)
+    readers |= dict.fromkeys(_COVARIANCES, _covariance_of)
+    values: dict[str, Any] = {n: read(data[n]) for n, read in readers.items() if n in data}
     if "T_base_child" in values:
         T_child_parent = se3.inverse(values["T_parent_child"])
         values["T_base_parent"] = values.pop("T_base_child") @ T_child_parent

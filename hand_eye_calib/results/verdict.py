@@ -52,7 +52,7 @@ class Reason:
     axes : tuple of str
         x, y, z, roll, pitch, yaw; empty if it is about the whole result.
     options : mapping
-        Options that mend it, by their public names.
+        Options that repair it, by their public names.
     kind : {"physics", "suspicion"}
         A limit of the motion, the recording or the sensors; or a sign that something is wrong.
 

@@ -165,7 +165,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     """
     results = dict(sorted(results.items(), key=lambda one: one[1].stamp_ns))
     require_same_frames(results.values())
-    unfit = {name: why for name, each in results.items() if (why := _unfit(each))}
+    unfit = {name: each.headline for name, each in results.items() if _says_nothing(each)}
     fit = {name: each for name, each in results.items() if name not in unfit}
     if not fit:
         told = "; ".join(f"{name}: {why}" for name, why in unfit.items())
@@ -217,10 +217,10 @@ def require_same_frames(results: Iterable[Calibration]) -> None:
         )
 
 
-def _unfit(result: Calibration) -> str:
-    """Why a recording says nothing of the mount; empty if it does."""
-    grave = [each for each in result.reasons if each.verdict is Verdict.DO_NOT_USE]
-    return result.headline if any(each.rule != "nothing_known" for each in grave) else ""
+def _says_nothing(result: Calibration) -> bool:
+    """Whether a recording says nothing of the mount."""
+    never = {each.rule for each in result.reasons if each.verdict is Verdict.DO_NOT_USE}
+    return bool(never - {"nothing_known"})
 
 
 def _by_axis(values: FloatArray) -> dict[str, float]:

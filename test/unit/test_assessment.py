@@ -238,7 +238,7 @@ class TestWhichAnswerStands:
     @pytest.mark.parametrize(
         ("changes", "why"),
         [
-            ({"is_drowned": True}, "single poses are noisier than the motion between them"),
+            ({"is_noise_dominated": True}, "single poses are noisier than the motion between them"),
             ({"converged": False}, "the adaptive estimator did not converge"),
         ],
     )

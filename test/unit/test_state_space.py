@@ -5,7 +5,7 @@ import pytest
 
 from hand_eye_calib.gls import reml
 from hand_eye_calib.gls.normal import Factor, NormalEquations, answers_without
-from hand_eye_calib.gls.outliers import surprises
+from hand_eye_calib.gls.outliers import innovations
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
 
 N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
@@ -135,7 +135,7 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
     space = space_of(cut=())
-    of_walk, _ = surprises(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
+    of_walk, _ = innovations(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
     V = dense_covariance(space, LEVELS)
     J, r = parameters_and_residuals(space)
     inverse = np.linalg.inv(V)
@@ -146,7 +146,7 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
         assert found == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
     # An increment that is no evidence is judged by the same number.
     without = space_of(cut=(6,))
-    again, _ = surprises(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
+    again, _ = innovations(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
     assert again[6] == pytest.approx(of_walk[6], rel=1e-5)
 
 
