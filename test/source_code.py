@@ -4,7 +4,8 @@ import ast
 from pathlib import Path
 
 PACKAGE = "hand_eye_calib"
-SOURCE = Path(__file__).resolve().parents[1] / PACKAGE
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / PACKAGE
 
 
 def imports_of(path, package_root):

@@ -34,9 +34,7 @@ def test_exp_agrees_with_the_matrix_exponential(xi):
 
     generator = np.zeros((4, 4))
     generator[:3, :3], generator[:3, 3] = se3.skew(xi[3:]), xi[:3]
-    np.testing.assert_allclose(
-        se3.exp(xi), expm(generator), atol=1e-11 * (1 + np.abs(xi).max()), rtol=0
-    )
+    assert se3.exp(xi) == pytest.approx(expm(generator), abs=1e-11 * (1 + np.abs(xi).max()))
 
 
 @given(tangents(), tangents())
@@ -84,9 +82,7 @@ def test_conversions_agree_with_scipy(direction, angle):
         atol=1e-14,
         rtol=0,
     )
-    np.testing.assert_allclose(
-        se3.rotation_exp(rotation.as_rotvec()), rotation.as_matrix(), atol=1e-14, rtol=0
-    )
+    assert se3.rotation_exp(rotation.as_rotvec()) == pytest.approx(rotation.as_matrix(), abs=1e-14)
     found, expected = (
         se3.to_quat_xyzw(rotation.as_matrix()),
         Rotation.from_matrix(rotation.as_matrix()).as_quat(),
@@ -104,9 +100,7 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-    np.testing.assert_allclose(
-        se3.rotation_from_rpy([roll, pitch, yaw]), rotation, atol=1e-14, rtol=0
-    )
+    assert se3.rotation_from_rpy([roll, pitch, yaw]) == pytest.approx(rotation, abs=1e-14)
     found = se3.rotation_to_rpy(rotation)
     np.testing.assert_allclose(se3.rotation_from_rpy(found), rotation, atol=1e-14, rtol=0)
     if abs(pitch) < 1.51:

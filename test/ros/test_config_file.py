@@ -6,14 +6,13 @@ option has changed.
 
 import dataclasses
 import textwrap
-from pathlib import Path
 
 import yaml
+from source_code import ROOT
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.option import option_name
 
-PROJECT = Path(__file__).resolve().parents[2]
 HEADER = """\
 # Parameters of the node calibrator: all there are, at their defaults.
 # Numbers with a decimal point must keep it: to ROS, 2 and 2.0 are of different types.
@@ -70,7 +69,7 @@ def value_of(field):
 
 
 def test_the_config_file_follows_the_options_and_has_their_types():
-    text = (PROJECT / "config" / "calibrator.yaml").read_text(encoding="utf-8")
+    text = (ROOT / "config" / "calibrator.yaml").read_text(encoding="utf-8")
     assert text == expected_file()
     written = yaml.safe_load(text)["/**"]["ros__parameters"]
     assert (written["threshold"], written["min_pairs"]) == (0.01, 10)

@@ -124,8 +124,6 @@ def test_covariance_is_about_the_fixed_axes_of_the_parent():
     scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
     # Standard error of a sampled correlation is below 1 / sqrt(samples); five of them, and the
     # second-order terms of exp.
-    np.testing.assert_allclose(
-        converted / scale, measured / scale, atol=5 / np.sqrt(samples) + 5e-3
-    )
+    assert converted / scale == pytest.approx(measured / scale, abs=5 / np.sqrt(samples) + 5e-3)
     # The test can tell: the unconverted covariance is far off.
     assert np.abs((cov_in_child - measured) / scale).max() > 0.3

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,6 +27,7 @@ from ros_harness import (
     message,
     values_of,
 )
+from source_code import ROOT
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -36,7 +36,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import has_session
 from hand_eye_calib.option import option_name
 
-PROJECT = Path(__file__).resolve().parents[2]
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 LAX = {"threshold": 1e-9}
 STREAMS = ("parent", "child")
@@ -354,13 +353,13 @@ sys.exit(service.run())
 """
 
 
-LAUNCHER = [sys.executable, "-c", LAUNCH, str(PROJECT / "launch" / "calibrator.launch.py")]
+LAUNCHER = [sys.executable, "-c", LAUNCH, str(ROOT / "launch" / "calibrator.launch.py")]
 
 
 def environment(prefix, **more):
     """The environment in which launch finds the package."""
     found = os.environ | {"ROS_LOG_DIR": str(prefix / "ros_log"), "PYTHONUNBUFFERED": "1"} | more
-    for name, path in (("AMENT_PREFIX_PATH", prefix), ("PYTHONPATH", PROJECT)):
+    for name, path in (("AMENT_PREFIX_PATH", prefix), ("PYTHONPATH", ROOT)):
         found[name] = os.pathsep.join(filter(None, [str(path), os.environ.get(name, "")]))
     return found
 

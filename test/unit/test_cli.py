@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from motions import disturbed, walked, write_pair
+from source_code import ROOT
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -36,7 +37,6 @@ from hand_eye_calib.results.records import Finding, Severity
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
-ROOT = Path(__file__).resolve().parents[2]
 ODOMETRY = "nav_msgs/msg/Odometry"
 PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"
 TOPICS = ["--parent-topic", PARENT_TOPIC, "--child-topic", CHILD_TOPIC]
@@ -338,6 +338,8 @@ def parsed(options):
         (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
         (["replay", "bag", "--batch", "fleet"], "--batch cannot be combined with PATH or --list"),
         (["replay", "--batch", "none*"], "no bag matches none*"),
+        (["watch", "--web", "high"], "expected PORT or HOST:PORT, got 'high'"),
+        (["watch", "--web", "99999"], "expected PORT or HOST:PORT, got '99999'"),
         (["replay"], "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n"),
     ],
 )

@@ -5,12 +5,12 @@ import textwrap
 import types
 import typing
 from enum import Enum
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from result_making import calibration, seen
+from source_code import ROOT
 
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
@@ -181,5 +181,5 @@ def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
     lines = [f"{name}: {shape(each)}" for name, each in typing.get_type_hints(NodeState).items()]
     wrapped = [textwrap.fill(each, 98, subsequent_indent="  ") for each in lines]
     text = "\n".join(["```text", *wrapped, "```"])
-    page = (Path(__file__).parents[2] / "docs" / "node.md").read_text()
+    page = (ROOT / "docs" / "node.md").read_text()
     assert text in page, f"docs/node.md must have this text:\n{text}"

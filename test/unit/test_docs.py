@@ -7,16 +7,15 @@ import os
 import re
 import shlex
 import shutil
-from pathlib import Path
 
 import example_recording
 import pytest
 import yaml
+from source_code import ROOT
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 
-ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 RUNS_ALL = os.environ.get("HAND_EYE_CALIB_ALL_PAGES") == "1"
 FEW = ("how_to.md", "troubleshooting.md")

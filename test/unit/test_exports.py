@@ -2,13 +2,13 @@
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from result_making import dofs, good_calibration
 from scipy.spatial.transform import Rotation
+from source_code import ROOT
 
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import EXPORT_FORMATS
@@ -294,7 +294,7 @@ def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):
 
 # ---- the pages
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "exports"
+DOCS = ROOT / "docs" / "exports"
 CAMERA = se3.from_rotation_translation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.12, 0.05, 0.3])
 LIDAR = se3.from_rotation_translation([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.12, 0.05, 0.3])
 # Frames of each page's example.

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from motions import geodetic, planar_poses, wandering_poses
+from motions import geodetic, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -31,12 +31,9 @@ def recorded(n_poses=300, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
     random = np.random.default_rng(seed)
     drift = np.c_[np.zeros((len(poses), 3)), drift_rad * random.normal(size=(len(poses), 3))]
     motions = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift[1:])
-    odometry = [np.eye(4)]
-    for motion in motions:
-        odometry.append(odometry[-1] @ motion)
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses))
     child = Trajectory.from_positions(stamps_ns, antenna_of(poses, noise_m), "antenna", "map")
-    return Trajectory(stamps_ns, np.array(odometry), "lidar", "odom"), child
+    return Trajectory(stamps_ns, walked(motions), "lidar", "odom"), child
 
 
 @pytest.fixture(scope="module")

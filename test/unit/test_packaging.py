@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from packaging.requirements import Requirement
+from source_code import ROOT
 
 from hand_eye_calib.cli.main import COMMANDS
 from hand_eye_calib.watch.board import AXES
 
-ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "hand_eye_calib"
 WHERE = "import hand_eye_calib; print(hand_eye_calib.__file__)"
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()

@@ -54,9 +54,7 @@ def test_every_motion_pair_fulfils_ax_xb():
         T_PARENT_CHILD @ pairs.Ts_childi_childj,
         atol=1e-12,
     )
-    np.testing.assert_allclose(
-        parent[pairs.i] @ pairs.Ts_parenti_parentj, parent[pairs.j], atol=1e-12
-    )
+    assert parent[pairs.i] @ pairs.Ts_parenti_parentj == pytest.approx(parent[pairs.j], abs=1e-12)
 
 
 def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
@@ -64,9 +62,7 @@ def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
     far = near.copy()
     far[:, :3, 3] += np.array([456_789.0, 4_567_890.0, 120.0])
     near_motion = motion_pairs(near, near, "B1").Ts_parenti_parentj
-    np.testing.assert_allclose(
-        motion_pairs(far, far, "B1").Ts_parenti_parentj, near_motion, atol=4e-9
-    )  # 1 ulp of 4.5e6 is 9e-10
+    assert motion_pairs(far, far, "B1").Ts_parenti_parentj == pytest.approx(near_motion, abs=4e-9)
 
 
 def test_the_slower_stream_gives_the_stamps():

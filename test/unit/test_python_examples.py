@@ -3,10 +3,10 @@
 import doctest
 import importlib.util
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
+from source_code import ROOT
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
@@ -68,7 +68,7 @@ def test_the_roles_may_be_exchanged(names):
 # ---- the folder examples/
 
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+EXAMPLES = ROOT / "examples"
 
 
 def imported(name):
@@ -111,6 +111,4 @@ def test_files_are_calibrated_and_saved(tmp_path, capsys):
 
 def test_arrays_are_calibrated(capsys):
     example = imported("from_arrays")
-    np.testing.assert_allclose(
-        example.main().T_parent_child, example.T_LIDAR_CAMERA, rtol=0, atol=1e-6
-    )
+    assert example.main().T_parent_child == pytest.approx(example.T_LIDAR_CAMERA, abs=1e-6)

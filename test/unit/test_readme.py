@@ -4,17 +4,16 @@ import argparse
 import dataclasses
 import re
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
+from source_code import ROOT
 
 from hand_eye_calib.cli.main import COMMANDS, main, module_of
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.io import files
 from hand_eye_calib.option import option_name
 
-ROOT = Path(__file__).resolve().parents[2]
 NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")

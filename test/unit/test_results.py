@@ -7,13 +7,13 @@ import os
 import re
 import shlex
 import stat
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import yaml
 from result_making import calibration, dofs, good_calibration
+from source_code import ROOT
 
 from hand_eye_calib.checks import findings as wording
 from hand_eye_calib.cli.main import main
@@ -30,7 +30,6 @@ from hand_eye_calib.results.calibration import (
 from hand_eye_calib.results.context import AxisProgress, Progress
 from hand_eye_calib.results.records import CorrelatedError, Noise, RateBias
 
-ROOT = Path(__file__).resolve().parents[2]
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 
 
@@ -168,9 +167,7 @@ def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path):
     roll, pitch, yaw = (
         se3.rotation_exp(angle * axis) for angle, axis in zip(rpy, np.eye(3), strict=True)
     )
-    np.testing.assert_allclose(
-        yaw @ pitch @ roll, written.T_parent_child[:3, :3], atol=1e-12
-    )  # as URDF defines rpy
+    assert yaw @ pitch @ roll == pytest.approx(written.T_parent_child[:3, :3], abs=1e-12)
     np.testing.assert_array_equal(xyz, written.T_parent_child[:3, 3])
 
 

@@ -141,9 +141,7 @@ def test_a_compass_heading_is_clockwise_from_north_and_nose_up_is_positive(tmp_p
         compass,
     )
     trajectory, guesses = read(path)
-    np.testing.assert_allclose(
-        trajectory.poses[:, :3, :3], se3.rotation_from_rpy(rpy.T), atol=1e-12
-    )
+    assert trajectory.poses[:, :3, :3] == pytest.approx(se3.rotation_from_rpy(rpy.T), abs=1e-12)
     assert guesses[1:] == [
         ": heading read as clockwise from north; axes of the sensor: x forward, y left, z up"
     ]

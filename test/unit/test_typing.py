@@ -4,15 +4,14 @@ import ast
 import importlib
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from source_code import ROOT
 
 import hand_eye_calib as hec
 
 pytest.importorskip("mypy", reason="mypy is not installed")
 
-ROOT = Path(__file__).resolve().parents[2]
 
 # A line that says "# wrong" must fail the type check; all others must pass it.
 PROGRAM = """\

@@ -5,12 +5,12 @@
 
 import dataclasses
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from result_making import NAMES, dofs
 from result_making import good_calibration as good
+from source_code import ROOT
 
 from hand_eye_calib.results import verdict as rules
 from hand_eye_calib.results.calibration import (
@@ -22,7 +22,7 @@ from hand_eye_calib.results.context import Together
 from hand_eye_calib.results.records import AxisScatter, Finding, Severity
 from hand_eye_calib.results.verdict import RULES
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "verdict.md"
+PAGE = ROOT / "docs" / "verdict.md"
 TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
 
 

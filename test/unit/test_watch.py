@@ -367,19 +367,6 @@ def test_keys_ask_and_a_reset_takes_two(typed):
     assert typed.session.is_over
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["--web", "high"], "expected PORT or HOST:PORT, got 'high'"),
-        (["--web", "99999"], "expected PORT or HOST:PORT, got '99999'"),
-    ],
-)
-def test_wrong_usage_is_one_line(arguments, text, run):
-    code, _, err = run("watch", *arguments)
-    assert code == 2
-    assert text in err
-
-
 # ------------------------------------------------------------------------ page
 
 
