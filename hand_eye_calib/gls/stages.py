@@ -290,7 +290,7 @@ def outliers(problem: Problem, fit: Fit) -> Fit:
     if changed:
         found = _outliers_found(problem, noise(problem, found), 1)
     if np.mean(found.outliers.spikes) > tuning.most_spikes:
-        # Whole stretches are noisy, not single poses wrong: they count less, and none is left out.
+        # Whole stretches are noisy, no single pose is wrong: all get less weight, none is left out.
         none = Outliers(found.outliers.jumps, np.zeros_like(found.outliers.spikes))
         found = replace(found, outliers=none, poses=problem.streams, has_heavy_tails=True)
     return found
