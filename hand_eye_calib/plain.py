@@ -7,9 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeAlias, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+# A mapping of JSON or YAML: names to values that any program reads.
+Document: TypeAlias = dict[str, Any]
 
 # No number of a file is as large: the products of some are still finite.
 _LARGEST = 1e50
@@ -36,15 +39,18 @@ def plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def from_plain(kind: Any, value: Any) -> Any:
+def from_plain(kind: Any, value: Any, **names: type) -> Any:
     """A value of a type from what :func:`plain` made of it. Keys that a dataclass does not have are
     ignored; a float that is None is infinite.
 
     Parameters
     ----------
     kind : type
-        A dataclass, an enum, float, int, bool, str; tuple, Mapping or union of such.
+        A dataclass, an enum, float, int, bool, str; tuple, Mapping or union of such; arrays stay
+        as they are.
     value : plain data
+    **names
+        Types that the module of a dataclass imports for type checkers alone.
 
     Raises
     ------
@@ -62,13 +68,15 @@ def from_plain(kind: Any, value: Any) -> Any:
         fitting = fitting or [each for each in wanted if isinstance(value, each)]
         return from_plain((fitting or wanted)[0], value)
     if is_dataclass(kind):
-        return _record(kind, _of_type(Mapping, value))
+        return _record(kind, _of_type(Mapping, value), names)
     if isinstance(get_origin(kind), type) and issubclass(get_origin(kind), Mapping):
         return {key: from_plain(args[1], each) for key, each in _of_type(Mapping, value).items()}
     if get_origin(kind) is tuple:
         if isinstance(value, str):
             raise TypeError("a list is a text")
         return tuple(from_plain(args[0], each) for each in _of_type(Sequence, value))
+    if get_origin(kind) is np.ndarray:
+        return _of_type(np.ndarray, value)
     if kind is float:
         return _number(value)
     if issubclass(kind, Enum):
@@ -83,12 +91,15 @@ def from_plain(kind: Any, value: Any) -> Any:
 _hints = cache(get_type_hints)
 
 
-def _record(kind: Any, value: Mapping[str, Any]) -> Any:
-    hints = _hints(kind)
+def _record(kind: Any, value: Mapping[str, Any], names: Mapping[str, type]) -> Any:
+    hints = get_type_hints(kind, localns=names) if names else _hints(kind)
     given = {}
     for each in fields(kind):
         if each.name in value:
-            given[each.name] = from_plain(hints[each.name], value[each.name])
+            try:
+                given[each.name] = from_plain(hints[each.name], value[each.name])
+            except TypeError as error:
+                raise TypeError(f"{each.name}: {error}") from None
         elif each.default is MISSING and each.default_factory is MISSING:
             raise KeyError(each.name)
     return kind(**given)

@@ -3,7 +3,7 @@
 import argparse
 import shlex
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,7 @@ from hand_eye_calib.text import listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
+    from hand_eye_calib.results.document import Notation
 
 _WIDTH = 100
 
@@ -186,7 +187,7 @@ def next_steps(
 
 
 def transform_lines(
-    transform: Mapping[str, Any], out_of_reach: Sequence[str] = (), with_quaternion: bool = False
+    transform: "Notation", out_of_reach: Sequence[str] = (), with_quaternion: bool = False
 ) -> Iterator[str]:
     """A row for each axis: the translation along it and an angle, with one standard deviation."""
     numbers, columns = printed_numbers(transform, out_of_reach), []
@@ -197,7 +198,7 @@ def transform_lines(
     for metres, degrees in zip(*columns, strict=True):
         yield f"  {metres:<30}  {degrees}".rstrip()
     if with_quaternion:
-        quat, words = transform["quat_xyzw"], ["unknown"]
-        if quat is not None:
+        words = ["unknown"]
+        if (quat := transform.quat_xyzw) is not None:
             words = [f"{name} {value:.6f}" for name, value in zip("xyzw", quat, strict=True)]
         yield f"  quaternion {' '.join(words)}"

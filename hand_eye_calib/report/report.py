@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from hand_eye_calib import text
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.config import CalibratorConfig
@@ -26,17 +27,6 @@ from hand_eye_calib.results.document import printed_numbers, summary, transforms
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.rig.calibrate import RigCalibration
-from hand_eye_calib.text import (
-    amount,
-    angle,
-    capital,
-    change,
-    counted,
-    duration,
-    fixed,
-    length,
-    listing,
-)
 from hand_eye_calib.version import package_version
 
 Plain = Mapping[str, Any]
@@ -82,11 +72,11 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": fixed, "printable": printable}
-    environment.globals |= dict(amount=amount, change=change, counted=counted)
+    environment.filters |= {"number": text.fixed, "printable": printable}
+    environment.globals |= dict(amount=text.amount, change=text.change, counted=text.counted)
     environment.globals["axis_names"] = _AXIS_NAMES
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
-    return environment.get_template(template).render(**values, marks=MARKS, said=capital(said))
+    return environment.get_template(template).render(**values, marks=MARKS, said=text.capital(said))
 
 
 def render(
@@ -123,12 +113,12 @@ def render(
         child=child,
         rotating=child if evidence and evidence.has_positions_of_parent else parent,
         kind="Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose",
-        directions=[document[key] for key in ("T_parent_child", "T_child_parent")],
+        directions=[*transforms_of(calibration).values()][:2],
         numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
         axes=list(_axes(calibration)),
         advice=advice,
         command=command,
-        unknown=listing(by_hand),
+        unknown=text.listing(by_hand),
         target=_targets(calibration),
         reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
@@ -173,16 +163,22 @@ def _at_distance(calibration: Calibration) -> str:
     child = printable(calibration.child_frame)
     return (
         f"An object {LOOK.distance_m:.0f} m from {child} is misplaced by up to "
-        f"{length(float(np.sqrt(max(errors))))} (one standard deviation, constant odometry "
+        f"{text.length(float(np.sqrt(max(errors))))} (one standard deviation, constant odometry "
         "errors included)."
     )
 
 
 def _targets(calibration: Calibration) -> str:
     """Target of x, y and z, of the rotations, and of the axes that have their own."""
-    single = [f"{axis} {amount(axis, value)}" for axis, value in calibration.target_axes.items()]
-    return listing(
-        [length(calibration.target_translation), angle(calibration.target_rotation), *single]
+    single = [
+        f"{axis} {text.amount(axis, value)}" for axis, value in calibration.target_axes.items()
+    ]
+    return text.listing(
+        [
+            text.length(calibration.target_translation),
+            text.angle(calibration.target_rotation),
+            *single,
+        ]
     )
 
 
@@ -195,7 +191,7 @@ def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
             yield {
                 "name": dof.name,
                 "title": _AXIS_NAMES[dof.name],
-                "sigma": amount(dof.name, total),
+                "sigma": text.amount(dof.name, total),
                 "verdict": dof.verdict.value,
                 "words": _WORDS["unobservable" if is_bad else dof.verdict.value],
                 "bar": _bar(total / target_of(dof.name, calibration)),
@@ -222,7 +218,7 @@ def _data(
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     rows, kind = summary(calibration), "stops"
     if evidence:
-        kind = f"synchronised pose pairs over {duration(evidence.times_s[-1])}"
+        kind = f"synchronised pose pairs over {text.duration(evidence.times_s[-1])}"
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True)) if snapshot else {}
     names = [name for name in ("parent", "child") if name in streams or name in inputs]
     return {
@@ -243,10 +239,10 @@ def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, st
     # Of a bag only poses of pairs are at hand, of a long one the newest: they say nothing of gaps.
     ends_ns = [known[name] for name in ("first_stamp_ns", "last_stamp_ns") if known.get(name)]
     if count and ends_ns and (seconds := (ends_ns[-1] - ends_ns[0]) * 1e-9):
-        row |= {"duration": duration(seconds), "rate": f"{(count - 1) / seconds:.1f} Hz"}
+        row |= {"duration": text.duration(seconds), "rate": f"{(count - 1) / seconds:.1f} Hz"}
     if stream is not None and len(stream) >= max(2, count or 0):
         whole, count = summarise(stream), len(stream)
         row |= {"gap": f"{whole.longest_interval_s:.2f} s", "rate": f"{whole.rate_hz:.1f} Hz"}
-        row |= {"duration": duration(whole.duration_s)}
-        row |= {"path": "-" if whole.path_m is None else length(whole.path_m)}
+        row |= {"duration": text.duration(whole.duration_s)}
+        row |= {"path": "-" if whole.path_m is None else text.length(whole.path_m)}
     return row if count is None else row | {"poses": f"{count:,}"}

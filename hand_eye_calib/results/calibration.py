@@ -5,14 +5,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent
-from hand_eye_calib.results.document import UNKNOWN_M, document_of, transform_arguments, values_of
+from hand_eye_calib.plain import Document
+from hand_eye_calib.results import document
 from hand_eye_calib.results.records import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
@@ -30,7 +31,7 @@ def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
     without pandas.
     """
     pandas = required("pandas", "a table", "hand_eye_calib[notebook]")
-    return cast("pd.DataFrame", pandas.DataFrame(rows).set_index(index))
+    return pandas.DataFrame(rows).set_index(index)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,39 +91,42 @@ class Calibration(Result):
         """The result with the roles of both sensors exchanged: the pose of the parent sensor in the
         child sensor's frame. What was compared with it is left out.
         """
-        T, Z, turn = self.T_parent_child, self.T_world_world, self.T_child_parent[:3, :3]
+        T, Z, of_Z = self.T_parent_child, self.T_world_world, self.cov_world_world
         covariance = inverse_covariance(T, self.covariance)
-        sigmas = sigmas_in_parent(turn, covariance)
+        sigmas = sigmas_in_parent(self.T_child_parent[:3, :3], covariance)
         if self.unobservable():
-            sigmas[sigmas > UNKNOWN_M] = np.inf
+            sigmas[sigmas > document.UNKNOWN_M] = np.inf
         known = (DofVerdict.UNOBSERVABLE, DofVerdict.OBSERVED)
         observability = tuple(
             DofObservability(axis, known[bool(np.isfinite(sigma))], sigma)
             for axis, sigma in zip(AXES, sigmas.tolist(), strict=True)
         )
-        other_direction = ("cross_check", "comparison", "motion_residuals", "recording")
-        exchanged: dict[str, Any] = dict.fromkeys((*other_direction, "T_base_parent")) | {
-            "T_parent_child": self.T_child_parent,
-            "T_method": None if self.T_method is None else se3.inverse(self.T_method),
-            "covariance": covariance,
-            "floor": inverse_covariance(T, self.floor),
-            "observability": observability,
-            "parent_frame": self.child_frame,
-            "child_frame": self.parent_frame,
-            "parent_world_frame": self.child_world_frame,
-            "child_world_frame": self.parent_world_frame,
-            "time_offset_s": 0.0 - self.time_offset_s,
-            "scale": 1.0 / self.scale,
-            "scale_sigma": self.scale_sigma / self.scale**2,
-        }
-        if Z is not None and self.cov_world_world is not None:
-            cov_world_world = inverse_covariance(Z, self.cov_world_world)
-            exchanged |= {"T_world_world": se3.inverse(Z), "cov_world_world": cov_world_world}
-        return replace(self, **exchanged)
+        return replace(
+            self,
+            T_parent_child=self.T_child_parent,
+            T_method=None if self.T_method is None else se3.inverse(self.T_method),
+            T_world_world=None if Z is None else se3.inverse(Z),
+            cov_world_world=None if Z is None or of_Z is None else inverse_covariance(Z, of_Z),
+            T_base_parent=None,
+            covariance=covariance,
+            floor=inverse_covariance(T, self.floor),
+            observability=observability,
+            parent_frame=self.child_frame,
+            child_frame=self.parent_frame,
+            parent_world_frame=self.child_world_frame,
+            child_world_frame=self.parent_world_frame,
+            time_offset_s=0.0 - self.time_offset_s,
+            scale=1.0 / self.scale,
+            scale_sigma=self.scale_sigma / self.scale**2,
+            motion_residuals=None,
+            cross_check=None,
+            comparison=None,
+            recording=None,
+        )
 
     def save(self, directory: str | Path) -> Path:
         """Write ``extrinsic.yaml`` and the files for robots; see :func:`hand_eye_calib.save`."""
-        return cast(Path, upstairs("io.results", "save_result")(self, directory))
+        return upstairs("io.results", "save_result")(self, directory)
 
     def plot(self) -> Any:
         """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
@@ -139,14 +143,14 @@ class Calibration(Result):
         self.residuals()
         path = Path(path, "report.html") if Path(path).is_dir() else Path(path)
         page = upstairs("report.report", "render")(self, self.recording)
-        return cast(Path, upstairs("io.results", "save_text")(path, page))
+        return upstairs("io.results", "save_text")(path, page)
 
     def static_transform_command(self) -> str:
         """Shell command that publishes the child's pose as a static transform, in the frame that it
         is mounted on; empty if the verdict is DO NOT USE. For an axis that the motion does not
         determine it has a word that static_transform_publisher refuses.
         """
-        told = transform_arguments(self, 9)
+        told = document.transform_arguments(self, 9)
         command = f"ros2 run tf2_ros static_transform_publisher {shlex.join(told)}"
         return command if told else ""
 
@@ -200,12 +204,12 @@ class Calibration(Result):
         """The verdict with its gravest reason, or with what is known, in one line."""
         return headline(self, self.reasons)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Document:
         """Everything but the residuals as plain numbers, strings, lists and mappings, ready for
         JSON or YAML. None for what is infinite, and for each printed number of an axis that is
         not known; only a ``matrix`` has a number there, so that it can be read back.
         """
-        return document_of(self)
+        return document.document_of(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -217,4 +221,4 @@ class Calibration(Result):
             If ``data`` is no calibration, is of another version or lacks something; the message
             says what.
         """
-        return cls(**values_of(cls, data))
+        return document.result_from(cls, data)

@@ -2,9 +2,9 @@
 programs read.
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import MISSING
-from typing import Any, cast, get_type_hints
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_rpy, sigmas_translation
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
-from hand_eye_calib.plain import from_plain, plain
+from hand_eye_calib.plain import Document, from_plain, plain
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
@@ -35,11 +35,33 @@ UNKNOWN_M = 0.9
 # An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
 _SHARED = 0.02
 
+_OfResult = TypeVar("_OfResult", bound=Result)
 
-def document_of(result: Result) -> dict[str, Any]:
+
+@dataclass(frozen=True, kw_only=True)
+class Notation:
+    """A transform in the notations that people and programs use: ``maps`` names source and target.
+
+    Each printed number, m and deg, has a standard deviation without and with the common-mode
+    uncertainty. What is unknown is NaN, with an infinite one; an unknown rotation has no
+    quaternion.
+    """
+
+    maps: str
+    translation: FloatArray
+    sigma_translation: FloatArray
+    sigma_total_translation: FloatArray
+    quat_xyzw: FloatArray | None
+    rpy_deg: FloatArray
+    sigma_rpy_deg: FloatArray
+    sigma_total_rpy_deg: FloatArray
+    matrix: FloatArray
+
+
+def document_of(result: Result) -> Document:
     """The document of a result; see ``Calibration.to_dict``."""
     parent, child, found = result.parent_frame, result.child_frame, reasons(result)
-    document: dict[str, Any] = {
+    document: Document = {
         "verdict": verdict_of(found),
         "headline": headline(result, found),
         "reasons": found,
@@ -51,7 +73,7 @@ def document_of(result: Result) -> dict[str, Any]:
         "covariance": _matrix_of("error xi in T_parent_child @ exp(xi)", child, result.covariance)
         | {"order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]},
         "observability": [
-            vars(dof) | {"sigma_total": total, "frame": parent}
+            plain(dof) | {"sigma_total": total, "frame": parent}
             for dof, total in zip(result.observability, result.sigmas_with_floor, strict=True)
         ],
     }
@@ -64,35 +86,32 @@ def document_of(result: Result) -> dict[str, Any]:
     of = "errors of a whole recording, the same in every part; not in the covariance"
     document["floor"] = _matrix_of(of, child, result.floor)
     document["sigma_total"] = dict(zip(AXES, result.sigmas_with_floor, strict=True))
-    for name in result.__dataclass_fields__:
+    for name in (each.name for each in fields(result)):
         if name not in (*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, *document):
             document[name] = getattr(result, name)
-    return cast(dict[str, Any], plain(document))
+    return plain(document)
 
 
-def transforms_of(result: Result) -> dict[str, dict[str, Any]]:
-    """The transforms of a result by their names, each with source and target frame, in the
-    notations that people and programs use, and with the standard deviation of each number that is
-    printed, without and with the common-mode uncertainty; infinite, and no number, for what is
-    unknown.
-    """
+def transforms_of(result: Result) -> dict[str, Notation]:
+    """The transforms of a result by their names."""
     T, parent, child = result.T_parent_child, result.parent_frame, result.child_frame
     own = result.covariance, result.floor
     exchanged = [inverse_covariance(T, each) for each in own]
     known_m, hidden = result.sigmas[:3], {*result.unobservable()}
     # Where the rotation is out of reach, the axes of both sensors are the same by convention.
     of_inverse_m = known_m if {*ROTATIONS} <= {*result.out_of_reach} else None
-    found: dict[str, Any] = {
-        "T_parent_child": (T, child, parent, own, known_m),
-        "T_child_parent": (result.T_child_parent, parent, child, exchanged, of_inverse_m),
-    }
+    rows: list[tuple[str, FloatArray, str, str, Sequence[FloatArray], FloatArray | None]] = [
+        ("T_parent_child", T, child, parent, own, known_m),
+        ("T_child_parent", result.T_child_parent, parent, child, exchanged, of_inverse_m),
+    ]
     if result.T_base_child is not None:
-        found["T_base_child"] = (result.T_base_child, child, result.base_frame, own, None)
+        rows.append(("T_base_child", result.T_base_child, child, result.base_frame, own, None))
     if result.T_world_world is not None and result.cov_world_world is not None:
         worlds = result.child_world_frame, result.parent_world_frame
         of_worlds = result.cov_world_world, np.zeros((6, 6))
-        found["T_world_world"] = (result.T_world_world, *worlds, of_worlds, None)
-    for name, (T, source, target, covariances, sigmas_m) in found.items():
+        rows.append(("T_world_world", result.T_world_world, *worlds, of_worlds, None))
+    found = {}
+    for name, T, source, target, covariances, sigmas_m in rows:
         sigmas, of_floor = (sigmas_rpy(T, each) for each in covariances)
         along, floor_m = (sigmas_translation(T, each) for each in covariances)
         if sigmas_m is None:
@@ -101,21 +120,21 @@ def transforms_of(result: Result) -> dict[str, dict[str, Any]]:
         is_turn_known = not {*ROTATIONS} & hidden
         # Near gimbal lock roll and yaw have no standard deviation and are known.
         known = np.isfinite(sigmas) | is_turn_known
-        found[name] = {
-            "maps": f"coordinates of {source} into {target}",
-            "translation": np.where(np.isfinite(sigmas_m), T[:3, 3], np.nan),
-            "sigma_translation": sigmas_m,
-            "sigma_total_translation": np.hypot(sigmas_m, floor_m),
-            "quat_xyzw": se3.to_quat_xyzw(T) if is_turn_known else None,
-            "rpy_deg": np.degrees(np.where(known, se3.rotation_to_rpy(T[:3, :3]), np.nan)),
-            "sigma_rpy_deg": np.degrees(sigmas),
-            "sigma_total_rpy_deg": np.degrees(np.hypot(sigmas, of_floor)),
-            "matrix": T,
-        }
+        found[name] = Notation(
+            maps=f"coordinates of {source} into {target}",
+            translation=np.where(np.isfinite(sigmas_m), T[:3, 3], np.nan),
+            sigma_translation=sigmas_m,
+            sigma_total_translation=np.hypot(sigmas_m, floor_m),
+            quat_xyzw=se3.to_quat_xyzw(T) if is_turn_known else None,
+            rpy_deg=np.degrees(np.where(known, se3.rotation_to_rpy(T[:3, :3]), np.nan)),
+            sigma_rpy_deg=np.degrees(sigmas),
+            sigma_total_rpy_deg=np.degrees(np.hypot(sigmas, of_floor)),
+            matrix=T,
+        )
     return found
 
 
-def _matrix_of(of: str, frame: str, matrix: FloatArray) -> dict[str, Any]:
+def _matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
     """A covariance of a document, and what it is of."""
     return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
 
@@ -144,25 +163,24 @@ def summary(result: Result) -> dict[str, str]:
 
 
 def printed_numbers(
-    transform: Mapping[str, Any], out_of_reach: Collection[str], sign: str = "+/-"
+    transform: Notation, out_of_reach: Collection[str], sign: str = "+/-"
 ) -> dict[str, str]:
-    """The printed numbers of a transform of a document by axis: x, y, z (m), roll, pitch and yaw
-    (deg), each with its standard deviation, the common-mode uncertainty included. Axes that are out
-    of reach of the streams stand together.
+    """The printed numbers of a transform by axis: x, y, z (m), roll, pitch and yaw (deg), each with
+    its standard deviation, the common-mode uncertainty included. Axes that are out of reach of the
+    streams stand together.
     """
     found = {}
     for axes, values, sigmas, unit in (
-        (TRANSLATIONS, "translation", "sigma_total_translation", "m"),
-        (ROTATIONS, "rpy_deg", "sigma_total_rpy_deg", "deg"),
+        (TRANSLATIONS, transform.translation, transform.sigma_total_translation, "m"),
+        (ROTATIONS, transform.rpy_deg, transform.sigma_total_rpy_deg, "deg"),
     ):
         if {*axes} & {*out_of_reach}:
             found[listing(axes)] = "not estimated"
             continue
-        for axis, value, sigma in zip(axes, transform[values], transform[sigmas], strict=True):
-            known = [each for each in (value, sigma) if each is not None and np.isfinite(each)]
-            if not known:
+        for axis, value, sigma in zip(axes, values.tolist(), sigmas.tolist(), strict=True):
+            if not np.isfinite(value):
                 found[axis] = "unknown"
-            elif len(known) < 2:  # near gimbal lock
+            elif not np.isfinite(sigma):  # near gimbal lock
                 found[axis] = f"{fixed(value, 2)} {unit}"
             else:
                 text = with_sigma(value, sigma, 3 if unit == "m" else 2).replace("+/-", sign)
@@ -228,9 +246,9 @@ def usable_angles(result: Result) -> dict[str, float | str]:
 # -------------------------------------------------------------------------- reading
 
 
-def values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a calibration from its document, which may have been changed by hand, or damaged;
-    an InputError that says what is wrong.
+def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
+    """A calibration from its document, which may have been changed by hand, or damaged; an
+    InputError that says what is wrong.
     """
     found = {name: data.get(name) if isinstance(data, Mapping) else None for name in _FORMAT}
     if found != _FORMAT:
@@ -239,7 +257,7 @@ def values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
             f"found format {found['format']}, version {found['version']}"
         )
     try:
-        return _values_of(of, data)
+        return _result_from(of, data)
     except KeyError as error:
         raise InputError(f"the calibration has no {error}: restore or repeat it") from None
     except (TypeError, ValueError) as error:
@@ -248,33 +266,27 @@ def values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
         ) from None
 
 
-def _values_of(of: type[Result], data: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a calibration; a KeyError, TypeError or ValueError for what was not written so."""
-    from hand_eye_calib.results import context
+def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
+    """The same; a KeyError, TypeError or ValueError for what was not written so."""
+    from hand_eye_calib.results.context import Comparison, Progress, Together
 
     readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), _transform_of)
     readers |= dict.fromkeys(_COVARIANCES, _covariance_of)
-    values: dict[str, Any] = {n: read(data[n]) for n, read in readers.items() if n in data}
-    if "T_base_child" in values:
-        T_child_parent = se3.inverse(values["T_parent_child"])
-        values["T_base_parent"] = values.pop("T_base_child") @ T_child_parent
-    hints = get_type_hints(of, localns=vars(context))
-    for name, each in of.__dataclass_fields__.items():
-        if name in data and name not in (*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES):
-            try:
-                values[name] = from_plain(hints[name], data[name])
-            except TypeError as error:
-                raise TypeError(f"{name}: {error}") from None
-        elif name not in values and each.default is each.default_factory is MISSING:
-            raise KeyError(name)
-    if tuple(dof.name for dof in values["observability"]) != AXES:
+    arrays = {name: read(data[name]) for name, read in readers.items() if name in data}
+    if "T_base_child" in arrays:
+        T_child_parent = se3.inverse(arrays["T_parent_child"])
+        arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
+    known = {name: each for name, each in data.items() if name not in _NOT_IN_FILES}
+    types = {each.__name__: each for each in (Comparison, Progress, Together)}
+    result: _OfResult = from_plain(of, known | arrays, **types)
+    if tuple(dof.name for dof in result.observability) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
     for name in ("contradictions", "target_axes", "cross_check"):
-        if not {*(values.get(name) or {})} <= {*AXES}:
+        if not {*(getattr(result, name) or {})} <= {*AXES}:
             raise ValueError(f"{name} has other axes than {', '.join(AXES)}")
-    if values["method"] not in METHODS:
-        raise ValueError(f"method {values['method']} is not known")
-    return values
+    if result.method not in METHODS:
+        raise ValueError(f"method {result.method} is not known")
+    return result
 
 
 def _transform_of(data: Mapping[str, Any]) -> FloatArray:

@@ -11,18 +11,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent, sigmas_rpy
-from hand_eye_calib.results.records import (
-    AXES,
-    ClockRate,
-    CrossCheck,
-    DofObservability,
-    DofVerdict,
-    Finding,
-    Noise,
-    RateBias,
-    Residuals,
-    SolveStatus,
-)
+from hand_eye_calib.results import records
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -131,7 +120,7 @@ class Result:
 
     T_parent_child: FloatArray
     T_method: FloatArray | None = None
-    status: SolveStatus
+    status: records.SolveStatus
     objective: float
     proved_global: str = "not tried"
     method: str
@@ -141,15 +130,15 @@ class Result:
     reference_reason: str = ""
     time_offset_s: float = 0.0
     time_offset_sigma_s: float = 0.0
-    clock_rate: ClockRate | None = None
+    clock_rate: records.ClockRate | None = None
     scale: float = 1.0
     scale_sigma: float = 0.0
-    rate_bias: RateBias | None = None
+    rate_bias: records.RateBias | None = None
     T_world_world: FloatArray | None = None
     cov_world_world: FloatArray | None = None
 
     covariance: FloatArray
-    observability: tuple[DofObservability, ...]
+    observability: tuple[records.DofObservability, ...]
     floor: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     contradictions: Mapping[str, float] = field(default_factory=dict)
 
@@ -158,12 +147,12 @@ class Result:
     n_pairs: int
     n_inliers: int
     stamp_ns: int = 0
-    motion_residuals: Residuals | None = field(default=None, repr=False, compare=False)
+    motion_residuals: records.Residuals | None = field(default=None, repr=False, compare=False)
 
-    noise: Noise | None = None
+    noise: records.Noise | None = None
 
-    findings: tuple[Finding, ...] = ()
-    cross_check: CrossCheck | None = None
+    findings: tuple[records.Finding, ...] = ()
+    cross_check: records.CrossCheck | None = None
     warnings: tuple[str, ...] = ()
     recording: object = field(default=None, repr=False, compare=False)
 
@@ -260,7 +249,7 @@ class Result:
         """(6,) array: :attr:`sigmas` and the common-mode uncertainty together."""
         return np.hypot(self.sigmas, self.sigmas_of_floor)
 
-    def residuals(self) -> Residuals:
+    def residuals(self) -> records.Residuals:
         """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.
 
         Raises
@@ -276,11 +265,15 @@ class Result:
 
     def unobservable(self) -> list[str]:
         """Names of the degrees of freedom that the motion does not determine."""
-        return [dof.name for dof in self.observability if dof.verdict is DofVerdict.UNOBSERVABLE]
+        return [
+            dof.name for dof in self.observability if dof.verdict is records.DofVerdict.UNOBSERVABLE
+        ]
 
     @property
     def out_of_reach(self) -> tuple[str, ...]:
         """Axes that streams of this kind say nothing about, and no prior either."""
-        silent = {"rotations": AXES[:3], "positions": AXES[3:]}.get(self.measured, ())
+        silent = {"rotations": records.AXES[:3], "positions": records.AXES[3:]}.get(
+            self.measured, ()
+        )
         unknown = self.unobservable()
         return tuple(axis for axis in silent if axis in unknown)

@@ -15,13 +15,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.options import (
-    HILLY_DRIVE,
-    PUBLISHED_DRIVE,
-    REALISTIC,
-    DriveConfig,
-    NoiseConfig,
-)
+from hand_eye_calib.simulation import options
 
 # Start of the published drives, heading along x; in units of the surface's arguments.
 _START = np.array([0.0, 0.5])
@@ -33,7 +27,7 @@ _LEAD_S, _FIRST_HOLD_S = 0.1, 0.4
 # axis (m^2).
 _LARGEST_OFFSET_M, _JUMP_VARIANCE = 0.5, 0.02
 
-_NO_NOISE = NoiseConfig()
+_NO_NOISE = options.NoiseConfig()
 
 
 @dataclass(frozen=True)
@@ -61,9 +55,9 @@ def simulate(
     *,
     drive: Literal["hilly", "published"] = "hilly",
     poses: int = 600,
-    gaussian: float = REALISTIC.gaussian,
-    outliers: float = REALISTIC.outliers,
-    drift: float = REALISTIC.drift,
+    gaussian: float = options.REALISTIC.gaussian,
+    outliers: float = options.REALISTIC.outliers,
+    drift: float = options.REALISTIC.drift,
 ) -> SimulatedDrive:
     """Simulate two sensors on one vehicle with a known extrinsic.
 
@@ -94,16 +88,16 @@ def simulate(
     >>> drive.parent
     Trajectory(100 poses over 9.900 s, sensor_frame='lidar', world_frame='lidar_odom')
     """
-    config = HILLY_DRIVE if drive == "hilly" else PUBLISHED_DRIVE
+    config = options.HILLY_DRIVE if drive == "hilly" else options.PUBLISHED_DRIVE
     config = replace(config, poses=poses, parent_frame="lidar", child_frame="camera")
-    noise = replace(REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift)
+    noise = replace(options.REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift)
     return simulate_drive(seed, config, noise)
 
 
 def simulate_drive(
     seed: int | Sequence[int],
-    config: DriveConfig = PUBLISHED_DRIVE,
-    noise: NoiseConfig = _NO_NOISE,
+    config: options.DriveConfig = options.PUBLISHED_DRIVE,
+    noise: options.NoiseConfig = _NO_NOISE,
 ) -> SimulatedDrive:
     """Simulate one drive: of one seed the same, with any noise, and with the same noise."""
     motion_rng, extrinsic_rng, noise_rng = np.random.default_rng(seed).spawn(3)
@@ -133,7 +127,7 @@ def simulate_drive(
 
 
 def _ground_track(
-    config: DriveConfig, rng: np.random.Generator, times_s: FloatArray
+    config: options.DriveConfig, rng: np.random.Generator, times_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Positions (N, 2) and headings (N,) along circular arcs, exact at any time since the start;
     each yaw rate lasts for its hold time.
@@ -163,7 +157,7 @@ def _arc(
 
 
 def _poses_on_terrain(
-    config: DriveConfig, positions: FloatArray, headings: FloatArray
+    config: options.DriveConfig, positions: FloatArray, headings: FloatArray
 ) -> FloatArray:
     """Poses (N, 4, 4) of the vehicle on the ground at positions (N, 2) with headings (N,)."""
     x, y = positions.T
@@ -183,7 +177,7 @@ def _poses_on_terrain(
     return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 
-def surface(config: DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
+def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
     """Height (N,) of the ground, m, and its slopes (N,) along x and y, at places (N,), m.
 
     Its height and scale are metres per unit of :func:`_peaks` and of its arguments; arguments
@@ -219,7 +213,7 @@ def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]
 
 
 def add_noise(
-    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: NoiseConfig, rng: np.random.Generator
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """The trajectories (N, 4, 4) and (M, 4, 4) of both sensors with Gaussian noise, then drift
     (child only), then jumps. Each kind of noise draws from a stream of its own: a change of one
@@ -236,7 +230,7 @@ def add_noise(
 
 
 def _with_gaussian(
-    Ts_world_sensor: FloatArray, noise: NoiseConfig, rng: np.random.Generator
+    Ts_world_sensor: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
 ) -> FloatArray:
     """Poses (N, 4, 4) with an independent error each, in the frame of the sensor."""
     shape = len(Ts_world_sensor), 3

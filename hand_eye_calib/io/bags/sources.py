@@ -20,14 +20,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, located, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
-from hand_eye_calib.io.bags.messages import (
-    MALFORMED,
-    MessageReader,
-    PoseTable,
-    Run,
-    ns_of,
-    pose_row,
-)
+from hand_eye_calib.io.bags import messages
 from hand_eye_calib.io.bags.scans import ScanOdometry, scan_of
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
@@ -38,7 +31,7 @@ Source = str | TfSource
 # A delay against the bag's time (s) is of a wrong stamp if it is so much farther from both
 # neighbours than these are from each other and than the usual step: computers delay for less.
 _JUMP_S = 0.5
-_NOTHING = PoseTable.of([], np.empty((0, 7)))
+_NOTHING = messages.PoseTable.of([], np.empty((0, 7)))
 _NOT_FINITE = {"nan", "inf", "-inf"}
 
 
@@ -58,11 +51,11 @@ class Reading(ABC):
         self.notes: list[str] = []
 
     @abstractmethod
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         """Take the next messages of one of the topics; an InputError if they cannot be used."""
 
     @abstractmethod
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         """The poses of all messages; an InputError if there can be none."""
 
 
@@ -71,20 +64,20 @@ class TopicReading(Reading):
 
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
-        self._reader = MessageReader(message_type, measures)
+        self._reader = messages.MessageReader(message_type, measures)
         self._tables = [_NOTHING]
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         try:
             columns, keep = self._reader.columns(run.messages, run.kind.is_ros1)
         except InputError:
             raise
-        except MALFORMED as error:
+        except messages.MALFORMED as error:
             raise run.unreadable(error) from error
         self._tables.append(columns.recorded(self.stream, run.bag_ns)[keep])
 
-    def table(self) -> PoseTable:
-        table = PoseTable.joined(self._tables)
+    def table(self) -> messages.PoseTable:
+        table = messages.PoseTable.joined(self._tables)
         is_right, (name,) = are_believable(table.stamps_ns, table.bag_ns), self.topics
         if not is_right.all():
             self.notes.append(
@@ -123,12 +116,12 @@ class JoinedReading(Reading):
         super().__init__(parts[0].stream, *(topic for part in parts for topic in part.topics))
         self._parts = parts
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         for part in self._parts:
             if run.kind.topic in part.topics:
                 part.take(run)
 
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         fixes, turning = (part.table() for part in self._parts)
         self.notes += [note for part in self._parts for note in part.notes]
         if not len(fixes) or len(turning) < 2:
@@ -139,7 +132,7 @@ class JoinedReading(Reading):
         fixes = fixes[(fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)]
         quats_xyzw = se3.to_quat_xyzw(orientations.at(fixes.stamps_ns))
         poses, frame = np.c_[fixes.poses[:, :3], quats_xyzw], orientations.sensor_frame
-        table = PoseTable.of(fixes.stamps_ns, poses, "", frame)
+        table = messages.PoseTable.of(fixes.stamps_ns, poses, "", frame)
         return table.recorded(self.stream, fixes.bag_ns)
 
 
@@ -148,24 +141,24 @@ class PathReading(Reading):
     poses of its newest message. Its stamps count as bag times.
     """
 
-    _newest: Run | None = None
+    _newest: messages.Run | None = None
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         self._newest = run._replace(messages=run.messages[-1:])
 
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         if self._newest is None:
             return _NOTHING
         (path,) = self._newest.decoded()
-        rows = [pose_row(each.pose.position, each.pose.orientation) for each in path.poses]
-        stamps_ns = [ns_of(each.header.stamp) for each in path.poses]
+        rows = [messages.pose_row(each.pose.position, each.pose.orientation) for each in path.poses]
+        stamps_ns = [messages.ns_of(each.header.stamp) for each in path.poses]
         if len(rows) > 1 and not any(stamps_ns):
             raise InputError(
                 f"the poses of path {self.topics[0]} have no stamps: all are zero; use the "
                 "odometry that the path was made from"
             )
         frame = printable(path.header.frame_id)
-        table = PoseTable.of(stamps_ns, np.reshape(rows, (-1, 7)), frame)
+        table = messages.PoseTable.of(stamps_ns, np.reshape(rows, (-1, 7)), frame)
         return table.recorded(self.stream, stamps_ns)
 
 
@@ -176,16 +169,18 @@ class ScanReading(Reading):
         self._lidar, self._topic = ScanOdometry(topic, bag, files), topic
         super().__init__(stream, *([] if self._lidar.kept else [topic]))
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
             self._lidar.add(scan_of(message), bag_ns)
 
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         poses, stamps_ns, bag_ns, frame, n_failed = self._lidar.odometry().values()
         lost = f", {n_failed} of which could not be registered" if n_failed else ""
         place = f"it is kept in {self._lidar.place}"
         self.notes.append(f"{self._topic}: odometry from {len(poses)} scans{lost}; {place}")
-        return PoseTable.of(stamps_ns, poses, "scans", str(frame)).recorded(self.stream, bag_ns)
+        return messages.PoseTable.of(stamps_ns, poses, "scans", str(frame)).recorded(
+            self.stream, bag_ns
+        )
 
 
 class ImageReading(Reading):
@@ -196,20 +191,20 @@ class ImageReading(Reading):
         self._finder, self._frame = TargetFinder(target, camera), ""
         self._stamps_ns, self._bag_ns = list[int](), list[int]()
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
             with located(self.topics[0]):
                 is_seen = self._finder.look(grey_of(message))
             if is_seen:
-                self._stamps_ns.append(ns_of(message.header.stamp) or 0)
+                self._stamps_ns.append(messages.ns_of(message.header.stamp) or 0)
                 self._bag_ns.append(bag_ns)
                 self._frame = printable(message.header.frame_id)
 
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         found = self._finder.found()
         self.notes.append(f"{self.topics[0]}: {found}")
         poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
-        table = PoseTable.of(self._stamps_ns, poses, "target", self._frame)
+        table = messages.PoseTable.of(self._stamps_ns, poses, "target", self._frame)
         return table.recorded(self.stream, self._bag_ns)
 
 
@@ -236,7 +231,7 @@ class FieldReading(Reading):
         if self.measures == "rates":
             raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         rows = [[self._cell(each, path) for path in self._paths] for each in run.decoded()]
         # As of an estimator that has not started.
         is_known = [_NOT_FINITE.isdisjoint(row) for row in rows]
@@ -253,10 +248,10 @@ class FieldReading(Reading):
             raise InputError(
                 f"{self.topics[0]}: a message has no {'.'.join(path)}; name other fields"
             ) from None
-        stamp_ns = ns_of(value)
+        stamp_ns = messages.ns_of(value)
         return str(value) if stamp_ns is None else f"{Decimal(stamp_ns).scaleb(-9):f}"
 
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         table = self._table
         if not table.stamps:
             topic = self.topics[0]
@@ -266,7 +261,7 @@ class FieldReading(Reading):
             table.guess(f"{self._n_left_out} messages with values that are not finite left out")
         are_twists = table.measures == "twists"
         poses = _integrated(stamps_ns, table.values()) if are_twists else np.c_[poses_of(table)]
-        return PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
+        return messages.PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
@@ -285,19 +280,19 @@ class TransformReading(Reading):
         self._source = source
         self._found: list[tuple[Any, ...]] = []
 
-    def take(self, run: Run) -> None:
+    def take(self, run: messages.Run) -> None:
         for bag_ns, transform in run.transforms():
             poses = self._source.edges_at(transform, False)
             self._found += ((bag_ns, *pose) for pose in poses)
 
-    def table(self) -> PoseTable:
+    def table(self) -> messages.PoseTable:
         frames = self._source.source
         if not self._found:
             raise InputError(f"{frames}: {self._source.describe_missing()}")
         bag_ns, stamps_ns, rows = zip(*self._found, strict=True)
         moving = {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
         poses = se3.to_rows(self._source.composed(moving))
-        return PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
+        return messages.PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
 
 
 def is_static(topic: str) -> bool:
