@@ -34,7 +34,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
-from hand_eye_calib.results.records import AXES
+from hand_eye_calib.results.records import AXES, AxisDifference
 from hand_eye_calib.stats import (
     CHI2,
     LARGEST_OF_SIX,
@@ -94,37 +94,22 @@ class Change(str, Enum):
 
 @dataclass(frozen=True)
 class Moved:
-    """Which axes differ between two estimates of an extrinsic, and by how much.
-
-    Attributes
-    ----------
-    values : (6,) array
-        Differences along (m) and about (rad) the axes of the parent sensor's frame.
-    sigmas : (6,) array
-        Their standard deviations; infinite if one of both does not know the axis.
-    visible : (6,) array
-        Changes of this size would have been seen nine times out of ten.
-    verdicts : tuple of Change
-        Per axis.
-    verdict : Change
+    """By axis how two estimates of an extrinsic differ, along and about the axes of the parent
+    sensor's frame, and the verdict on all axes together.
     """
 
-    values: FloatArray
-    sigmas: FloatArray
-    visible: FloatArray
-    verdicts: tuple[Change, ...]
+    axes: dict[str, AxisDifference]
     verdict: Change
 
-    def axes(self, change: Change) -> list[str]:
-        """Names of the axes with this verdict."""
-        return [axis for axis, found in zip(AXES, self.verdicts, strict=True) if found is change]
+    def _those(self, change: Change) -> list[str]:
+        return [axis for axis, found in self.axes.items() if found.verdict == change]
 
     @property
     def sentence(self) -> str:
         """The verdict in one line, with what it rests on."""
         if self.verdict is Change.MOVED:
             return f"moved: {self.what}"
-        same, unknown = self.axes(Change.SAME), self.axes(Change.CANNOT_TELL)
+        same, unknown = self._those(Change.SAME), self._those(Change.CANNOT_TELL)
         if not unknown:
             return f"same: {self._power(same)}"
         told = f"cannot tell about {listing(unknown)}"
@@ -133,22 +118,20 @@ class Moved:
     @property
     def what(self) -> str:
         """The axes that have moved; the two that differ most if none has on its own."""
-        ratios = np.abs(self.values) / self.sigmas
-        most = [AXES[axis] for axis in np.argsort(-ratios)[:2] if ratios[axis] > 0]
+        ratios = {axis: abs(each.difference) / each.sigma for axis, each in self.axes.items()}
+        most = sorted(filter(ratios.get, AXES), key=lambda axis: -ratios[axis])[:2]
         told = [
-            f"{axis} by {amount(axis, float(value))} +/- {amount(axis, float(sigma))}"
-            for axis in self.axes(Change.MOVED) or most
-            for value, sigma in [(self.values[AXES.index(axis)], self.sigmas[AXES.index(axis)])]
+            f"{axis} by {amount(axis, one.difference)} +/- {amount(axis, one.sigma)}"
+            for axis, one in ((axis, self.axes[axis]) for axis in self._those(Change.MOVED) or most)
         ]
         return listing(told) or "by what the axes show together, none of them alone"
 
     def _power(self, axes: Sequence[str]) -> str:
         told = []
         for names in (AXES[:3], AXES[3:]):
-            known = [axis for axis in names if axis in axes]
-            if known:
-                worst = max(known, key=lambda axis: float(self.visible[AXES.index(axis)]))
-                told.append(amount(worst, float(self.visible[AXES.index(worst)])))
+            if known := [axis for axis in names if axis in axes]:
+                worst = max(known, key=lambda axis: self.axes[axis].visible)
+                told.append(amount(worst, self.axes[worst].visible))
         return f"a change of {' or '.join(told)} would have been seen"
 
 
@@ -169,12 +152,14 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
     chi2 = float(values @ np.linalg.solve(covariance, values))
     sigmas = np.where(sigmas > UNKNOWN_FROM, np.inf, sigmas)
     visible = (LARGEST_OF_SIX + NINE_TIMES_OUT_OF_TEN) * sigmas
-    verdicts = tuple(
+    verdicts = [
         Change.MOVED if ratio > LARGEST_OF_SIX else Change.SAME if seen else Change.CANNOT_TELL
         for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
-    )
-    verdict = Change.MOVED if chi2 > CHI2[0.001][6] else Change.of_all(verdicts)
-    return Moved(values, sigmas, visible, verdicts, verdict)
+    ]
+    columns = (each.tolist() for each in (values, sigmas, visible))
+    rows = zip(*columns, (each.value for each in verdicts), strict=True)
+    axes = {axis: AxisDifference(*row) for axis, row in zip(AXES, rows, strict=True)}
+    return Moved(axes, Change.MOVED if chi2 > CHI2[0.001][6] else Change.of_all(verdicts))
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:

@@ -5,14 +5,15 @@ process that writes them for a session of the node.
 import os
 import pickle
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.options import fail, note, waiting_for
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.io.results import save_text
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def write_report(
     directory: Path,
     calibration: Calibration,
     snapshot: "Snapshot | None",
-    inputs: Mapping[str, Any],
+    inputs: Document,
 ) -> None:
     """Write the report of a result, of the poses and options that gave it, and of where the data
     came from in plain values.

@@ -431,13 +431,14 @@ class MountWatch:
             text = "the mount has not moved"
             text += f"; {unwatched} cannot be watched here" if unwatched else ""
         told = np.where(visible < UNKNOWN_FROM, visible, np.nan)
+        shift = alarm.shift.axes if alarm else {}
         return MountState(
             level=Level.ERROR if alarm else Level.OK,
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift=by_axis(alarm.shift.values) if alarm else {},
-            shift_sigma=by_axis(alarm.shift.sigmas) if alarm else {},
+            shift={axis: each.difference for axis, each in shift.items()},
+            shift_sigma={axis: each.sigma for axis, each in shift.items()},
             visible_10min=by_axis(told),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,

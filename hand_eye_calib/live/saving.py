@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.engine.snapshot import Snapshot
@@ -17,6 +16,7 @@ from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.solving import start
 from hand_eye_calib.live.state import SavedState
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import listing
 
@@ -31,7 +31,7 @@ class SessionResult:
 
     calibration: Calibration
     snapshot: Snapshot
-    inputs: Mapping[str, Any]
+    inputs: Document
     with_report: bool = True
     others: Mapping[str, Snapshot] = field(default_factory=dict)
 

@@ -12,13 +12,12 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from hand_eye_calib.errors import printable
+from hand_eye_calib.plain import Document
 from hand_eye_calib.report.figures import BAD, GRID, INK, LOOK, PARENT, Drawn, as_drawn, page_style
 from hand_eye_calib.report.report import TONES, page
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import axes_in_words, counted, listing, with_sigma
-
-Plain = Mapping[str, Any]
 
 _AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 _GRAVITY = ("bad", "warn", "good")
@@ -26,7 +25,7 @@ _GRAVITY = ("bad", "warn", "good")
 
 def render_batch(
     title: str,
-    rows: Sequence[Plain],
+    rows: Sequence[Document],
     vehicles: Mapping[str, Calibration],
     with_report: Collection[str],
 ) -> str:
@@ -82,8 +81,8 @@ def _trend(result: Calibration, number: int) -> Drawn:
         if np.isfinite(band):
             panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
         for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
-            look: dict[str, Any] = {"fmt": fmt, "color": colour, "ms": 3.2, "elinewidth": 0.8}
-            panel.errorbar(at[group], values[group], sigmas[group], **look)
+            shown = at[group], values[group], sigmas[group]
+            panel.errorbar(*shown, fmt=fmt, color=colour, ms=3.2, elinewidth=0.8)
     locator = AutoDateLocator(minticks=2, maxticks=4)
     panels[0].xaxis.set_major_locator(locator)
     panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
@@ -96,14 +95,14 @@ def _trend(result: Calibration, number: int) -> Drawn:
     return as_drawn(figure, f"vehicle-{number}", title, said)
 
 
-def _values(row: Plain) -> list[str]:
+def _values(row: Document) -> list[str]:
     return [
         with_sigma(row[f"{name}_{unit}"], row[f"sigma_{name}_{unit}"], 3 if unit == "m" else 2)
         for name, unit in _AXES.items()
     ]
 
 
-def _cells(row: Plain, is_linked: bool) -> list[Any]:
+def _cells(row: Document, is_linked: bool) -> list[Any]:
     """What the table shows of a recording: name, vehicle, verdict, start, whether it has a report,
     and the values, each with its standard deviation after a space, or why there are none.
     """

@@ -24,6 +24,7 @@ from matplotlib.patches import Ellipse
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.engine.evidence import Evidence, StreamView
 from hand_eye_calib.errors import printable
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import Residuals
 from hand_eye_calib.text import amount, angle, length, listing, share
@@ -65,7 +66,7 @@ LOOK = Look()
 
 _INK = ("text.color", "axes.labelcolor", "axes.titlecolor", "xtick.labelcolor", "ytick.labelcolor")
 _SMALL = ("xtick.labelsize", "ytick.labelsize", "legend.fontsize")
-_STYLE: dict[str, Any] = {
+_STYLE: Document = {
     **dict.fromkeys(_INK, INK),
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
     **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
@@ -236,9 +237,9 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
     labels = [name + ", through the result" * (n == through) for n, name in enumerate(names)]
     paths = ((evidence.parent, PARENT, 3.2), (evidence.child, CHILD, 1.1))
     for (points, colour, width), label in zip(paths, labels, strict=True):
-        look: dict[str, Any] = {"color": colour, "lw": width}
-        plane.plot(points[shown, first], points[shown, second], label=plain_label(label), **look)
-        side.plot(evidence.times_s[shown] * factor, points[shown, across], **look)
+        in_plane = points[shown, first], points[shown, second]
+        plane.plot(*in_plane, label=plain_label(label), color=colour, lw=width)
+        side.plot(evidence.times_s[shown] * factor, points[shown, across], color=colour, lw=width)
     plane.plot(*evidence.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
     axes = [f"{axis} (m)" for axis in "xyz"]
     is_level = across == 2
@@ -303,10 +304,9 @@ def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: 
     dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
     dots = dots[_downsample(len(dots))]
     crosses = crosses[np.argsort(-values[crosses])[: LOOK.points]]
-    used: dict[str, Any] = dict(color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
-    rejected: dict[str, Any] = dict(color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
-    panel.plot(times[dots], values[dots], "o", **used)
-    panel.plot(times[crosses], values[crosses], "x", **rejected)
+    used, rejected = (times[dots], values[dots], "o"), (times[crosses], values[crosses], "x")
+    panel.plot(*used, color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
+    panel.plot(*rejected, color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
     panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
     panel.yaxis.set_label_coords(-0.06, 0.5)
     if values.max() > 15 * np.median(values):  # the largest would hide the others

@@ -2,12 +2,12 @@
 a rig, where its sensors are.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
@@ -21,6 +21,7 @@ from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.plain import Document
 from hand_eye_calib.report.figures import LOOK, figure_of_views, figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
@@ -28,8 +29,6 @@ from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.rig.calibrate import RigCalibration
 from hand_eye_calib.version import package_version
-
-Plain = Mapping[str, Any]
 
 MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
 TONES = {
@@ -82,7 +81,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
 def render(
     calibration: Calibration,
     snapshot: Snapshot | None,
-    inputs: Plain | None = None,
+    inputs: Document | None = None,
 ) -> str:
     """The report as HTML, of a result and the poses and options that gave it (none for stops);
     ``inputs`` say in plain values where the data came from.
@@ -146,7 +145,7 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
     )
 
 
-def _named(frame: str, known: Plain) -> str:
+def _named(frame: str, known: Document) -> str:
     """The name of a sensor: its frame, or where its poses came from if they name none."""
     source = str(known.get("topic") or Path(str(known.get("file", ""))).stem)
     return source if frame in _NAMELESS and source else frame
@@ -182,20 +181,31 @@ def _targets(calibration: Calibration) -> str:
     )
 
 
-def _axes(calibration: Calibration) -> Iterable[dict[str, Any]]:
+class AxisRow(NamedTuple):
+    """A row of the table of uncertainties: ``bar`` is its length in per cent."""
+
+    name: str
+    title: str
+    sigma: str
+    verdict: str
+    words: str
+    bar: float
+
+
+def _axes(calibration: Calibration) -> Iterable[AxisRow]:
     """Rows of the table of uncertainties, along and about the parent's axes."""
     totals = calibration.sigmas_with_floor.tolist()
     is_bad = calibration.verdict is Verdict.DO_NOT_USE
     for dof, total in zip(calibration.observability, totals, strict=True):
         if dof.name not in calibration.out_of_reach:
-            yield {
-                "name": dof.name,
-                "title": _AXIS_NAMES[dof.name],
-                "sigma": text.amount(dof.name, total),
-                "verdict": dof.verdict.value,
-                "words": _WORDS["unobservable" if is_bad else dof.verdict.value],
-                "bar": _bar(total / target_of(dof.name, calibration)),
-            }
+            yield AxisRow(
+                dof.name,
+                _AXIS_NAMES[dof.name],
+                text.amount(dof.name, total),
+                dof.verdict.value,
+                _WORDS["unobservable" if is_bad else dof.verdict.value],
+                _bar(total / target_of(dof.name, calibration)),
+            )
 
 
 def _bar(ratio: float) -> float:
@@ -209,8 +219,8 @@ def _bar(ratio: float) -> float:
 
 
 def _data(
-    calibration: Calibration, snapshot: Snapshot | None, evidence: Evidence | None, inputs: Plain
-) -> dict[str, Any]:
+    calibration: Calibration, snapshot: Snapshot | None, evidence: Evidence | None, inputs: Document
+) -> Document:
     """What the result comes from, for the template."""
     options = snapshot.config.to_options() if snapshot else {}
     usual = CalibratorConfig().to_options()
@@ -230,7 +240,7 @@ def _data(
     }
 
 
-def _stream(name: str, inputs: Plain, stream: Trajectory | None) -> dict[str, str]:
+def _stream(name: str, inputs: Document, stream: Trajectory | None) -> dict[str, str]:
     """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
     known = inputs.get(name, {})
     count = known.get("messages", known.get("poses"))

@@ -6,6 +6,8 @@ All are plain values under names, as in :mod:`hand_eye_calib.results.records`.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from hand_eye_calib.results.records import AxisDifference
+
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
@@ -90,18 +92,6 @@ class Progress:
     limiting_axis: str = ""
     will_not_get_there: bool = False
     axes: Mapping[str, AxisProgress] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AxisDifference:
-    """Difference on one axis, m or rad, its standard deviation, and the change that would have been
-    seen nine times out of ten.
-    """
-
-    difference: float
-    sigma: float
-    visible: float
-    verdict: str
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import synchronise
+from hand_eye_calib.plain import Document, plain
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.stats import CHI2
 from hand_eye_calib.text import angle, length, listing
@@ -257,14 +258,14 @@ class RigCalibration:
         in_first = np.sum([_moved(*each) for each in answers], axis=0)
         return np.asarray(to_second @ in_first @ to_second.T)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Document:
         """Everything in plain values."""
         return {
             "format": "hand_eye_calib/rig",
             "version": 1,
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
-            "closures": [vars(each) | {"closes": each.closes} for each in self.closures],
+            "closures": [plain(each) | {"closes": each.closes} for each in self.closures],
             "calibrations": {each.child_frame: each.to_dict() for each in self.calibrations},
         }
 

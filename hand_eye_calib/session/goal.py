@@ -107,11 +107,9 @@ class Goal:
         is_done = self.best is not None
         stuck = not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _STEPS_S[-2]
         left_s = self._told(left_s)
-        sentence = self._sentence(
-            calibration, seen, faults, AXES[worst], left_s[worst], bool(stuck)
-        )
+        known = self._ended(calibration, faults)
         self.progress = Progress(
-            sentence=sentence,
+            sentence=known or _way_on(AXES[worst], left_s[worst], bool(stuck), seen),
             done=is_done and not faults,
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
@@ -152,28 +150,26 @@ class Goal:
             for axis, sigma, target, seconds in columns
         }
 
-    def _sentence(
-        self,
-        calibration: Calibration,
-        seen: Excitation,
-        faults: Sequence[str],
-        axis: str,
-        left_s: float,
-        stuck: bool,
-    ) -> str:
+    def _ended(self, calibration: Calibration, faults: Sequence[str]) -> str:
+        """What to do if more motion would not help, or is not needed; empty if it is."""
         if faults:
             return f"Stop: the streams are faulty: {faults[0]}."
         if calibration.status.failure:
             return f"No usable result: {calibration.status.failure}."
         if self.best is not None:
             return f"Done: {what_is_known(self.best)}. Stop and save."
-        motion, called = helpful_motion([axis], seen), axes_in_words([axis])
-        if stuck:
-            return f"This motion will not determine {called} well enough: {motion}."
-        if not np.isfinite(left_s):
-            return f"{called} is not determined yet: {motion}."
-        left = duration(max(left_s, _STEPS_S[1]))
-        return f"Go on for about {left}: {called} takes longest, {motion}."
+        return ""
+
+
+def _way_on(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
+    """Which motion helps most, for the axis that takes longest."""
+    motion, called = helpful_motion([axis], seen), axes_in_words([axis])
+    if is_stuck:
+        return f"This motion will not determine {called} well enough: {motion}."
+    if not np.isfinite(left_s):
+        return f"{called} is not determined yet: {motion}."
+    left = duration(max(left_s, _STEPS_S[1]))
+    return f"Go on for about {left}: {called} takes longest, {motion}."
 
 
 def _least_motion_s(calibration: Calibration) -> float:

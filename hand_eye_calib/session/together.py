@@ -18,14 +18,9 @@ from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
 from hand_eye_calib.geometry.se3 import Extrinsic, deviation, turned, xyz_rpy
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame
-from hand_eye_calib.results.context import (
-    AxisDifference,
-    Comparison,
-    Difference,
-    Recorded,
-    Together,
-)
+from hand_eye_calib.results.context import Comparison, Difference, Recorded, Together
 from hand_eye_calib.results.records import AXES, DofVerdict, SolveStatus
 from hand_eye_calib.results.verdict import target_of
 from hand_eye_calib.session.agreement import Agreement, agreement_of, unknown_directions
@@ -139,10 +134,10 @@ def _named(names: Sequence[str] | None) -> Iterator[str]:
     return iter(names) if names is not None else map(str, count(1))
 
 
-def row_of_result(calibration: Mapping[str, Any]) -> dict[str, Any]:
+def row_of_result(calibration: Document) -> Document:
     """The row of a result, from what its ``to_dict`` gave; what is not known is None."""
     transform = calibration["T_parent_child"]
-    row: dict[str, Any] = {name: calibration[name] for name in _TAKEN}
+    row = {name: calibration[name] for name in _TAKEN}
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
     columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
     values = [*transform["translation"], *transform["rpy_deg"]]
@@ -355,17 +350,12 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     values = deviation(two.T_parent_child, one.T_parent_child)
     limits = SEEN_TARGETS * np.array([target_of(axis, two) for axis in AXES])
     found = moved(values, covariance + scatter, limits)
-    columns = (found.values.tolist(), found.sigmas.tolist(), found.visible.tolist())
-    rows = zip(*columns, (each.value for each in found.verdicts), strict=True)
     return Difference(
         first=first_name,
         second=second_name,
         verdict=found.verdict.value,
         sentence=found.sentence,
-        axes={
-            axis: AxisDifference(difference=value, sigma=sigma, visible=visible, verdict=verdict)
-            for axis, (value, sigma, visible, verdict) in zip(AXES, rows, strict=True)
-        },
+        axes=found.axes,
     )
 
 

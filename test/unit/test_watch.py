@@ -29,13 +29,8 @@ from hand_eye_calib.live.state import (
     SavedState,
 )
 from hand_eye_calib.plain import from_plain, plain
-from hand_eye_calib.results.context import (
-    AxisDifference,
-    AxisProgress,
-    Comparison,
-    Difference,
-    Progress,
-)
+from hand_eye_calib.results.context import AxisProgress, Comparison, Difference, Progress
+from hand_eye_calib.results.records import AxisDifference
 from hand_eye_calib.watch import terminal
 from hand_eye_calib.watch.board import AXES, Board, Tone
 from hand_eye_calib.watch.web import WebServer, fragment
