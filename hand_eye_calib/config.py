@@ -103,8 +103,9 @@ _INVERT = _both(
 )
 _QUATERNION = _both(
     "xyzw",
-    "Order in which the {}'s quaternions were written: wxyz puts right what was read as x y z w.",
-    choices=("xyzw", "wxyz"),
+    "Order in which the {}'s quaternions were written: wxyz puts right what was read as x y z w, "
+    "yzwx values x y z w under names w x y z.",
+    choices=("xyzw", "wxyz", "yzwx"),
 )
 _KIND = _both(
     "odometry",

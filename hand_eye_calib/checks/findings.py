@@ -111,6 +111,11 @@ _ROWS = {
         "{whose} quaternions seem to be written w x y z and read as x y z w",
         "write them as x y z w",
     ),
+    "quaternion_names": _Row(
+        "{whose} quaternions seem to be written x y z w, under names that say w x y z",
+        "put the names of the columns in the order of their values",
+        code="quaternion_order",
+    ),
     "inverse_orientation": _Row(
         "{whose} orientations seem to be inverted (of the world in the sensor), while the "
         "positions are those of the sensor in its world",
@@ -320,6 +325,7 @@ def finding(
 # mistakes are undone.
 CONVENTIONS = {
     "quaternion_order": ("quaternion", "wxyz"),
+    "quaternion_names": ("quaternion", "yzwx"),
     "inverse": ("invert", "poses"),
     "inverse_orientation": ("invert", "orientations"),
 }

@@ -206,6 +206,7 @@ _WAYS: list[_Way] = [
     ("inverse_orientation",),
     ("quaternion_order",),
     ("quaternion_order", "inverse"),
+    ("quaternion_names",),
 ]
 _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child in _WAYS]
 _PLAIN = _ALL_WAYS[0]

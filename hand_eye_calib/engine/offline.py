@@ -23,7 +23,7 @@ MethodName: TypeAlias = Literal[
 _Measures: TypeAlias = Literal["auto", "poses", "positions", "rotations", "rates"]
 _Invert: TypeAlias = Literal["none", "poses", "orientations"]
 _Kind: TypeAlias = Literal["odometry", "exact"]
-_Order: TypeAlias = Literal["xyzw", "wxyz"]
+_Order: TypeAlias = Literal["xyzw", "wxyz", "yzwx"]
 
 
 def calibrate(

@@ -325,10 +325,10 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
 def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
     """Poses (N, 4, 4) that were written in another convention than they were read in: ``invert``
     ("none", "poses" or "orientations") says what was of the world in the sensor, ``quaternion``
-    ("xyzw" or "wxyz") the order of quaternions that were read as x y z w.
+    ("xyzw", "wxyz" or "yzwx") the order of quaternions that were read as x y z w.
     """
-    if quaternion == "wxyz":
-        quats = np.roll(to_quat_xyzw(Ts), -1, axis=-1)
+    if quaternion != "xyzw":
+        quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
         Ts = from_quat_xyzw(Ts[..., :3, 3], quats)
     if invert == "poses":
         return inverse(Ts)

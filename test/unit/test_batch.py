@@ -226,7 +226,7 @@ def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
 # ---- rows
 
 
-def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path):
+def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path, monkeypatch):
     more = ("--vehicle", "truck", "--no-report", "--jobs", "1")
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
     rows = list(csv.DictReader((tmp_path / "1" / "rows.csv").read_text().splitlines()))
@@ -238,6 +238,9 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path
     assert not any(row[4] for row in rows_of(page))
     assert "The 3 recordings agree within their standard deviations" in page
     assert (tmp_path / "1" / "vehicles" / "truck" / "extrinsic.yaml").exists()
+    monkeypatch.setattr(batch_run, "together", lambda results: 1 / 0)  # is not called again
+    assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
+    assert (tmp_path / "1" / "index.html").read_text(encoding="utf-8") == page
 
 
 @pytest.mark.parametrize("name", [" =cmd()", "＝1+1", "a;=cmd()"])

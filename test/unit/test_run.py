@@ -64,14 +64,14 @@ def test_both_streams_in_millimetres_are_never_used(streams):
 def written_otherwise(trajectory, convention):
     """As another program writes it: what the option of that name puts right."""
     poses = se3.put_right(trajectory.poses, convention.get("invert", "none"))
-    if "quaternion" in convention:
-        quats = np.roll(se3.to_quat_xyzw(poses), 1, axis=1)
+    if order := convention.get("quaternion"):
+        quats = np.roll(se3.to_quat_xyzw(poses), order.index("x"), axis=1)
         poses = se3.from_quat_xyzw(poses[:, :3, 3], quats)
     return replace(trajectory, poses=poses)
 
 
 REPAIRS = [{"invert": "poses"}, {"invert": "orientations"}, {"quaternion": "wxyz"}]
-REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}]
+REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}, {"quaternion": "yzwx"}]
 
 
 @pytest.mark.parametrize("convention", REPAIRS, ids=str)

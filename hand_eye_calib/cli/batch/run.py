@@ -4,6 +4,7 @@ already, what is left, and what all results say.
 
 import argparse
 import csv
+import hashlib
 import io
 import json
 import os
@@ -37,10 +38,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
     with waiting_for(f"looking for {title}"):
         groups = [[bag] for pattern in arguments.batch for bag in matching(pattern)]
     done = _all_done(groups, arguments.vehicle or "", arguments)
-    vehicles = _vehicles(done)
+    vehicles = _vehicles(done, arguments.out)
     if arguments.out:
-        for name, each in vehicles.items():
-            save_result(each, arguments.out / work.VEHICLES / name)
         _write_rows_and_page(arguments.out, title, done, vehicles, work.INDEX)
     if arguments.json:
         document = {
@@ -147,19 +146,30 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     save_text(path, text.getvalue())
 
 
-def _vehicles(done: Sequence[Outcome]) -> dict[str, Calibration]:
-    """What the recordings of each vehicle say together."""
+def _vehicles(done: Sequence[Outcome], directory: Path | None) -> dict[str, Calibration]:
+    """What the recordings of each vehicle say together; what an earlier run said in the directory,
+    if the results of all of them are the same.
+    """
     groups: dict[str, list[Outcome]] = {}
     for one in done:
         if one.row["vehicle"] and one.row["verdict"]:
             groups.setdefault(one.row["vehicle"], []).append(one)
     found: dict[str, Calibration] = {}
     for vehicle, group in sorted(groups.items()):
+        if len(group) == 1:
+            continue
+        of_all = hashlib.sha256("\n".join(one.text for one in group).encode()).hexdigest()
+        task = Task(name=f"{work.VEHICLES}/{vehicle}", bags=(), options={"results": of_all})
+        if directory and (earlier := stored(task, directory)):
+            found[vehicle] = earlier.calibration
+            continue
         try:
-            if len(group) > 1:
-                found[vehicle] = together({one.row["name"]: one.calibration for one in group})
+            found[vehicle] = together({one.row["name"]: one.calibration for one in group})
         except InputError as error:
             note(f"{vehicle} has no common result: {error}")
+            continue
+        if directory:
+            _store(task, Outcome.of(task, None, found[vehicle]), directory)
     return found
 
 
