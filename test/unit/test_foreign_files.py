@@ -164,6 +164,11 @@ ROT = "Stamp [ns],Pos_X [m],Pos_Y,Pos_Z,rot_w,rot_x,rot_y,rot_z\n"
 OKVIS = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n"
 ULOG2CSV = "timestamp,position[0],position[1],position[2],q[0],q[1],q[2],q[3]\n"
 ARM = "t,x_ft,y_ft,z_ft,rotvec_x,rotvec_y,rotvec_z\n"
+ARIA = "graph_uid,tracking_timestamp_us,utc_timestamp_ns," + ",".join(
+    f"{name}_world_device" for name in POSE.strip().split(",")
+)
+HEADER = f"__time,/odom/header/stamp,{POSE}".replace(",t", ",/odom/pose/pose/position/")
+TCP = " ".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))])
 UNITS = "Device Time,Easting,Northing,H-Ell,qw,qx,qy,qz\n(ns),(mm),(mm),(mm),,,,\n"
 GNSS_POSES = (
     "# frame_id (timestamp in ns), translation (t_x, t_y, t_z), rotation (q_x, q_y, q_z, q_w)"
@@ -185,6 +190,9 @@ FORMATS = {
     "csv_mm_ms": (of_rows(WITH_UNITS.format("ms", "mm"), STAMPS // 10**6, P * 1e3, WXYZ), ""),
     "csv_cm_us": (of_rows(WITH_UNITS.format("us", "cm"), STAMPS // 10**3, P * 1e2, WXYZ), ""),
     "rotation_vectors_and_feet": (of_rows(ARM, SECONDS, P / 0.3048, VECTORS), "read in rad"),
+    "universal_robots": (of_rows(f"{TCP}\n", SECONDS, P, VECTORS, separator=" "), "read in rad"),
+    "aria": (of_rows(f"{ARIA}\n", ["ea72"] * N, STAMPS // 1000, STAMPS + 9, P, Q), ""),
+    "stamp_of_the_header": (of_rows(HEADER, SECONDS + 0.1, SECONDS, P, Q), ""),
     "ulog2csv": (of_rows(ULOG2CSV, STAMPS // 1000, P, WXYZ), ""),
     "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
     "euroc_names": (of_rows(EUROC, STAMPS, P, WXYZ), "looks like format csv"),

@@ -56,10 +56,11 @@ _OF_POSITION = "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
 # Last parts of column names, lower case, words joined by underscores; exports of bags have whole
 # paths such as .pose.pose.position.x.
 _ALIASES = {
-    "t": "t ts time timestamp timestamps stamp gpstime header_stamp",
-    "x": _OF_POSITION.format("x") + "easting position0",
-    "y": _OF_POSITION.format("y") + "northing position1",
-    "z": _OF_POSITION.format("z") + "altitude position2",
+    "header": "header_stamp",
+    "t": "t ts time timestamp timestamps stamp gpstime tracking_timestamp",
+    "x": _OF_POSITION.format("x") + "easting pos_east position0 actual_tcp_pose_0",
+    "y": _OF_POSITION.format("y") + "northing pos_north position1 actual_tcp_pose_1",
+    "z": _OF_POSITION.format("z") + "altitude pos_up position2 actual_tcp_pose_2",
     "lat": "lat latitude",
     "lon": "lon long lng longitude",
     "height": "height ht h_ell ellipsoid_height ellipsoidal_height altitude alt elevation ele",
@@ -67,8 +68,8 @@ _ALIASES = {
     "pitch": "pitch pitch_angle",
     "yaw": "yaw yaw_angle theta",
     "heading": "heading true_heading platform_heading hdg azimuth",
-    "secs": "header_stamp_secs header_stamp_sec stamp_secs stamp_sec secs sec",
-    "nsecs": "header_stamp_nsecs header_stamp_nanosec stamp_nsecs stamp_nanosec nsecs nanosec nsec",
+    "secs": "stamp_secs stamp_sec secs sec",
+    "nsecs": "stamp_nsecs stamp_nanosec stamp_nsec nsecs nanosec nsec",
     "image": "image",
     **{
         f"{kind}{axis}": " ".join(f"{name}{axis}" for name in names.split())
@@ -76,7 +77,7 @@ _ALIASES = {
         for axis in "xyzw"
     },
     **{name: f"{name} quat_{name}" for name in (*SCALAR_FIRST, *UNNAMED)},
-    **{name: name for name in ROTATION_VECTOR},
+    **{name: f"{name} actual_tcp_pose_{k}" for k, name in enumerate(ROTATION_VECTOR, 3)},
     **{name: f"{name} t{int(name[1:]) - 11:02d}" for name in MATRIX},
 }
 # Names, after each other, of some part of an orientation or of a position, known or not.
@@ -137,7 +138,8 @@ class Table:
         self.expected = self.expected or f"{len(self.names)} columns: {listed}"
         self.measures, measured = _measured(found, self.names, self.measures)
         # The stamp of the message's header rather than the time of its arrival.
-        stamp = ("secs", "nsecs") if {"secs", "nsecs"} <= found.keys() else ("t",) * ("t" in found)
+        ways = (("secs", "nsecs"), ("header",), ("t",), ())
+        stamp = next(way for way in ways if {*way} <= found.keys())
         if missing := [name for name in measured if name not in found]:
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among {listed}; name all columns "
@@ -254,11 +256,11 @@ def _split(name: str) -> tuple[str, str]:
     """
     # An element such as q[0], and frames as in p_RS_R_x.
     name = re.sub(r"\[(\d)\]$", r"\1", name.strip().lower())
-    name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_", r"\1_", name)
+    name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name)
     words = re.findall("[a-z0-9°]+", re.sub(r"\[.*?\]|\(.*?\)", "", name))
     if in_brackets := re.search(r"[\[(]\s*([^\])]*?)\s*(?:\^?-1)?\s*[\])]$", name):
         return "_".join(words), _UNITS.get(re.sub(r"[\s/_]+", "/", in_brackets[1]), "")
-    is_time = re.match("(t|time.*|stamp.*)$", words[0] if words else "") is not None
+    is_time = any(re.fullmatch("t|time.*|stamp.*", word) for word in words)
     for count in (2, 1):
         unit = _UNITS.get("/".join(words[-count:]), "")
         if len(words) > count and unit and (unit in STAMP_UNITS) == is_time:
