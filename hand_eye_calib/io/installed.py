@@ -62,7 +62,12 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     if path.suffix in _DESCRIPTIONS:
         find = read_urdf(path).pose
     elif path.suffix in _DOCUMENTS:
-        document = _document(path)
+        document = read_yaml(path, _EXPECTED)
+        if isinstance(document, str) and "EKF2_" in document:
+            raise InputError(
+                f"{path}: parameters of PX4 have a position and no rotation; give six numbers "
+                'instead, "X Y Z ROLL PITCH YAW"'
+            )
         if isinstance(document, Mapping) and document.get("format") == _FORMAT:
             return partial(_of_result, load_result(path), path)
         find = partial(_find, document)
@@ -101,17 +106,6 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
 
 
 # ---- files of other programs
-
-
-def _document(path: Path) -> Any:
-    """What a file has, in plain values."""
-    document = read_yaml(path, _EXPECTED)
-    if isinstance(document, str) and "EKF2_" in document:
-        raise InputError(
-            f"{path}: parameters of PX4 have a position and no rotation; give six numbers instead, "
-            '"X Y Z ROLL PITCH YAW"'
-        )
-    return document
 
 
 def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:

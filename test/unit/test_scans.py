@@ -122,8 +122,14 @@ def test_two_lidars_from_their_points(tmp_path, capsys):
     assert np.linalg.norm(off[:3]) < 0.02
     assert np.degrees(np.linalg.norm(off[3:])) < 0.2
     assert (result.parent_frame, result.child_frame) == ("front", "rear")
-    # The second time, what is kept is read.
+    # A pose is that of the middle of its scan.
     kept = tmp_path / "drive.front.odometry.npz"
+    found, middle_s = np.load(kept), (np.arange(count) + 0.5 - 0.5 / COLUMNS) / RATE
+    np.testing.assert_allclose(found["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
+    poses = se3.from_quat_xyzw(found["poses"][:, :3], found["poses"][:, 3:])
+    turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, body.poses(middle_s))]
+    assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.02
+    # The second time, what is kept is read.
     before = kept.stat().st_mtime_ns
     with PoseBag(bag) as opened:
         assert len(opened.poses("/front", "/rear")) == 140

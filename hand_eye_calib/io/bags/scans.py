@@ -5,6 +5,9 @@ Each scan is registered against a map of the scans before it, by their local pla
 ICP), whose voxels hold the mean plane of their points. Registration of points to points, as of
 KISS-ICP, drags along the rings of a lidar that has 16 of them: they look the same on flat ground
 whatever the pitch, and pitch and roll are not followed.
+
+A pose is that of the middle of its scan. With a constant motion over the scan, vibration at 1.3 Hz
+is followed 7 % too far at its end, 2 % too little in its middle.
 """
 
 from collections.abc import Sequence
@@ -36,21 +39,23 @@ class Tuning:
     # Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
     nearest_m: float = 1.0
     farthest_m: float = 80.0
+    # Points of a scan that are used, evenly drawn: more take longer and change nothing.
+    most_points: int = 10_000
     # Size of a voxel as a share of the median range, within limits (m).
     voxel_share: float = 0.03
     least_voxel_m: float = 0.1
     most_voxel_m: float = 0.4
     # Of two registrations, of which the first corrects distortion: voxels that a scan is thinned
     # to, and over how many points are matched.
-    thinned_voxels: tuple[float, ...] = (2.0, 1.0)
+    thinned_voxels: tuple[float, ...] = (3.0, 1.0)
     match_voxels: tuple[float, ...] = (6.0, 2.0)
     # Points that a local plane is fitted to.
     n_neighbours: int = 12
     # Size of a voxel of the map, in those of scans, and for how many scans it is kept unseen.
     map_voxels: float = 2.0
     n_unseen: int = 100
-    # Parts of a scan whose points have the same correction for motion.
-    n_parts: int = 40
+    # Parts of a scan whose points have the same correction for motion, with one in the middle.
+    n_parts: int = 41
     # A registration with a smaller share of matched points counts as failed.
     least_matched: float = 0.3
 
@@ -61,8 +66,8 @@ _KEPT = ("poses", "stamps_ns", "bag_ns", "frame", "n_failed")
 
 
 class Scan(NamedTuple):
-    """Points (N, 3) of one turn of a lidar, m, in its own frame; their times (N,) from 0 to 1, the
-    last one's; and the stamp of the last.
+    """Points (N, 3) of one turn of a lidar, m, in its own frame; their times (N,), from 0 of the
+    first to 1 of the last; and the stamp of the middle.
     """
 
     points: FloatArray
@@ -75,44 +80,43 @@ def scan_of(message: Any) -> Scan:
     """Points and times of a PointCloud2 message; an InputError if it has no x, y and z, or is
     damaged. Without times of its points, a scan counts as taken at once.
     """
-    offsets = {each.name: (each.offset, each.datatype) for each in message.fields}
-    if not {*"xyz"} <= offsets.keys():
-        raise InputError(f"points have no x, y, z, but {', '.join(offsets)}")
-    n_bytes = message.height * message.width * message.point_step
-    order, data = ">" if message.is_bigendian else "<", np.asarray(message.data, dtype=np.uint8)
-
-    def column(name: str) -> FloatArray:
-        offset, kind = offsets[name]
-        part = data[:n_bytes].reshape(-1, message.point_step)[:, offset:]
-        form = np.dtype(order + _DATATYPES[kind])
-        return np.ascontiguousarray(part[:, : form.itemsize]).view(form)[:, 0].astype(float)
-
+    names = [field.name for field in message.fields]
+    if not {*"xyz"} <= {*names}:
+        raise InputError(f"points have no x, y, z, but {', '.join(names)}")
+    order, size = "<>"[message.is_bigendian], message.point_step
     try:
-        points = np.stack([column(axis) for axis in "xyz"], axis=-1)
-        of_time = next((name for name in _TIMES if name in offsets), None)
-        times = column(of_time) if of_time else np.zeros(len(points))
+        kinds = [order + _DATATYPES[field.datatype] for field in message.fields]
+        places = [field.offset for field in message.fields]
+        form = np.dtype({"names": names, "formats": kinds, "offsets": places, "itemsize": size})
+        data = np.asarray(message.data, dtype=np.uint8)[: message.height * message.width * size]
+        rows = data.view(form)
     except (ValueError, IndexError, TypeError) as error:
         raise InputError(f"a scan of points is damaged ({error}); record it again") from error
-    ranges = np.linalg.norm(points, axis=1)
-    is_used = (ranges > _TUNING.nearest_m) & (ranges < _TUNING.farthest_m)  # nor if not finite
-    points, times = points[is_used], times[is_used]
+    points = np.stack([rows[axis] for axis in "xyz"], axis=-1)
+    with np.errstate(over="ignore"):
+        ranges = np.linalg.norm(points, axis=1)
+    used = np.flatnonzero((ranges > _TUNING.nearest_m) & (ranges < _TUNING.farthest_m))
+    if len(used) > _TUNING.most_points:
+        used = used[np.linspace(0, len(used) - 1, _TUNING.most_points).astype(int)]
+    of_time = next((rows[name] for name in _TIMES if name in names), np.zeros(len(rows)))
+    points, times = points[used].astype(float), of_time[used].astype(float)
     span, header_ns = np.ptp(times) if len(times) else 0.0, ns_of(message.header.stamp) or 0
     units_s = [unit_ns * 1e-9 for unit_ns in STAMP_UNITS.values()]
     unit_s = max((unit for unit in units_s if span * unit <= _TUNING.longest_s), default=0.0)
     frame = printable(message.header.frame_id)
     if not span * unit_s:
-        return Scan(points, np.ones(len(times)), header_ns, frame)
+        return Scan(points, np.full(len(times), 0.5), header_ns, frame)
     # Times may be relative to the stamp of the header, or absolute.
-    last_s = float(times.max() * unit_s)
-    stamp_ns = round(last_s * 1e9) + header_ns * (last_s <= _TUNING.longest_s)
+    middle_s = float(times.max() - span / 2) * unit_s
+    stamp_ns = round(middle_s * 1e9) + header_ns * (middle_s <= _TUNING.longest_s)
     return Scan(points, (times - times.min()) / span, stamp_ns, frame)
 
 
 class ScanOdometry:
     """Registers the scans on a topic of a bag one after the other; what is found is kept beside the
     bag for the next time, in ``place``. ``kept`` is what was kept for files of the same sizes and
-    times: poses (N, 7) in the frame of the first scan, each at the end of its scan, stamps and bag
-    times (N,), the lidar's frame, and how many scans could not be registered.
+    times: poses (N, 7) in the frame of the first scan, each of the middle of its scan, stamps and
+    bag times (N,), the lidar's frame, and how many scans could not be registered.
     """
 
     def __init__(self, topic: str, bag: Path, files: Sequence[Path]) -> None:
@@ -122,7 +126,7 @@ class ScanOdometry:
         self.kept: dict[str, Any] = {}
         # The errors are of many kinds: it is not there, cut off, or of an older version.
         with suppress(Exception), np.load(self.place, allow_pickle=False) as kept:
-            if np.array_equal(kept["files"], self._state):
+            if np.array_equal(kept["of_files"], self._state):
                 self.kept = {name: kept[name] for name in _KEPT}
                 return
         self._gicp = required(
@@ -149,11 +153,10 @@ class ScanOdometry:
                     "registered; use the odometry of a lidar SLAM"
                 )
             Ts, *times = (np.array(each) for each in zip(*self._found, strict=True))
-            rows, about = se3.to_rows(Ts), (self._frame, self._n_failed)
-            found = rows, *times, *map(np.array, about)
+            found = se3.to_rows(Ts), *times, np.array(self._frame), np.array(self._n_failed)
             self.kept = dict(zip(_KEPT, found, strict=True))
             with suppress(OSError):  # the folder may be read-only
-                np.savez(self.place, files=self._state, **self.kept)
+                np.savez(self.place, of_files=self._state, **self.kept)
         return self.kept
 
     def _register(self, scan: Scan) -> None:
@@ -198,9 +201,8 @@ class ScanOdometry:
 
 
 def _without_motion(scan: Scan, step: FloatArray) -> FloatArray:
-    """Points (N, 3) as if the whole scan was taken at its end, after a constant motion ``step``."""
-    before_end = (np.arange(_TUNING.n_parts) + 0.5) / _TUNING.n_parts - 1.0
-    Ts = se3.exp(np.outer(before_end, se3.log(step)))
+    """Points (N, 3) as if the whole scan was taken in its middle, in a constant motion ``step``."""
+    since_middle = (np.arange(_TUNING.n_parts) + 0.5) / _TUNING.n_parts - 0.5
+    Ts = se3.exp(np.outer(since_middle, se3.log(step)))
     part = np.minimum((scan.phases * _TUNING.n_parts).astype(int), _TUNING.n_parts - 1)
-    turned = np.einsum("nij,nj->ni", Ts[part, :3, :3], scan.points)
-    return np.asarray(np.where(scan.phases[:, None] < 1.0, turned + Ts[part, :3, 3], scan.points))
+    return np.asarray(np.einsum("nij,nj->ni", Ts[part, :3, :3], scan.points) + Ts[part, :3, 3])
