@@ -9,15 +9,9 @@ from collections.abc import Collection
 from dataclasses import InitVar, dataclass
 from typing import Any, NamedTuple, Self
 
+from hand_eye_calib import text
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.option import OptionSet, option
-from hand_eye_calib.text import (
-    AXIS_UNITS,
-    parse_prior,
-    parse_reference,
-    parse_targets,
-    split_frames,
-)
 
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 # As of results/layouts.yaml.
@@ -80,7 +74,7 @@ _TF_SOURCE = _both(
     "Take the poses of the {0} sensor from /tf and /tf_static instead of {0}_odom: "
     "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
     read_only=True,
-    parse=split_frames,
+    parse=text.split_frames,
 )
 _TYPE = _both(
     "auto",
@@ -117,14 +111,14 @@ _KIND = _both(
 
 
 def _prior(axis: str) -> Any:
-    unit = AXIS_UNITS[axis]
+    unit = text.AXIS_UNITS[axis]
     example = "1.85+/-0.02 or 185cm+/-2cm" if unit == "m" else "-90deg+/-2deg"
     return option(
         "",
         f"Prior on {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, "
         f"such as {example}. Empty for none.",
         unit=unit,
-        parse=parse_prior,
+        parse=text.parse_prior,
     )
 
 
@@ -165,7 +159,7 @@ class CalibratorConfig(OptionSet):
         "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
         "it), C<n> (each with the first of its segment of n), or auto (the one with the "
         "estimate nearest to adaptive's).",
-        parse=lambda name, text: text == "auto" or parse_reference(name, text),
+        parse=lambda name, value: value == "auto" or text.parse_reference(name, value),
     )
     backend: str = option(
         "fast",
@@ -252,12 +246,6 @@ class CalibratorConfig(OptionSet):
     prior_roll: str = _prior("roll")
     prior_pitch: str = _prior("pitch")
     prior_yaw: str = _prior("yaw")
-    prior_transform: str = option(
-        "",
-        "Prior on the whole pose: X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION, such as "
-        "0.4 0 1.85 0 0 -90deg+/-0.05 5deg. Empty for none.",
-        parse=parse_prior,
-    )
     target_translation: float = option(
         0.02,
         "Standard deviation along each axis that is good enough; the verdict and the stop rule use "
@@ -276,7 +264,7 @@ class CalibratorConfig(OptionSet):
         "",
         "Targets of single axes in place of target.translation and target.rotation, such as z=10cm "
         "yaw=0.5deg. Empty for none.",
-        parse=parse_targets,
+        parse=text.parse_targets,
     )
     parent_frame: str = option(
         "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
@@ -327,18 +315,16 @@ class CalibratorConfig(OptionSet):
     @property
     def targets(self) -> tuple[float, ...]:
         """Targets of x, y, z (m), roll, pitch and yaw (rad)."""
-        single = parse_targets("target.axes", self.target_axes)
+        single = text.parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
-        return tuple(single.get(axis, of_unit[unit]) for axis, unit in AXIS_UNITS.items())
+        return tuple(single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items())
 
     def prior(self) -> dict[str, tuple[float, float]]:
-        """The prior: axis name to (value, standard deviation), in m and rad; an option of a single
-        axis overrides ``prior.transform``.
-        """
-        known: dict[str, tuple[float, float]] = {}
-        for name in ("transform", *AXIS_UNITS):
-            known |= parse_prior(f"prior.{name}", getattr(self, f"prior_{name}"))
-        return known
+        """The prior: axis name to (value, standard deviation), in m and rad."""
+        told = {axis: getattr(self, f"prior_{axis}") for axis in text.AXIS_UNITS}
+        return {
+            axis: text.parse_prior(f"prior.{axis}", each) for axis, each in told.items() if each
+        }
 
 
 MOST_OTHERS = 7  # further child sensors of the node

@@ -145,8 +145,7 @@ _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad
 _LARGEST_QUANTITY = 1e6
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
-# pitch, yaw (rad): value and standard deviation, or both as the text of the option
-# ``prior.<axis>``. "transform" takes the text of ``prior.transform``.
+# pitch, yaw (rad): value and standard deviation, or both as the text of the option ``prior.AXIS``.
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
@@ -160,35 +159,19 @@ def shown_value(value: object) -> str:
     return shortened(repr(value))
 
 
-def parse_prior(name: str, text: str) -> dict[str, tuple[float, float]]:
-    """Values and standard deviations of the axes that a prior option gives: axis name to
-    (value, sigma), in m or rad; empty for an empty text.
-
-    Parameters
-    ----------
-    name : str
-        prior.x ... prior.yaw or prior.transform.
-    text : str
-        ``VALUE+/-SIGMA`` for an axis; ``X Y Z ROLL PITCH YAW +/- SIGMA_TRANSLATION SIGMA_ROTATION``
-        for the transform. Metres and radians, or with units (m, cm, mm, rad, deg).
+def parse_prior(name: str, text: str) -> tuple[float, float]:
+    """Value and standard deviation, in m or rad, of the option ``prior.AXIS``: ``VALUE+/-SIGMA`` in
+    metres or radians, or with units (m, cm, mm, rad, deg).
 
     Raises
     ------
     ConfigError
         If the text has another form, an unknown unit or a standard deviation of 0.
     """
-    if not text:
-        return {}
-    before, _, after = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
-    sigmas = after.split()
+    value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
     axes, form = [name.removeprefix("prior.")], "VALUE+/-SIGMA, with its standard deviation"
-    if axes == ["transform"]:
-        axes, form = [*AXIS_UNITS], "X Y Z ROLL PITCH YAW+/-SIGMA_TRANSLATION SIGMA_ROTATION"
-        sigmas = sigmas[:1] * 3 + sigmas[1:] * 3 if len(sigmas) == 2 else sigmas
-    known = _quantities(name, axes, before.split(), form)
-    return dict(
-        zip(axes, zip(known, _quantities(name, axes, sigmas, form, 0.0), strict=True), strict=True)
-    )
+    (known,) = _quantities(name, axes, value.split(), form)
+    return known, _quantities(name, axes, sigma.split(), form, 0.0)[0]
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:

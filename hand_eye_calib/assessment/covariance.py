@@ -26,13 +26,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment.excitation import (
-    HIDDEN_SHARE,
-    MIN_SHARE,
-    ROUNDING_ANGLE,
-    LeverArms,
-    weighted_products,
-)
+from hand_eye_calib.assessment import excitation
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
@@ -112,7 +106,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         solution.rotation_variance,
         # Rotations below the noise of single poses cannot be told from none.
         # Otherwise they can, and the tilt of the axis is stated: half as much is enough.
-        MIN_SHARE if solution.is_noise_dominated else MIN_SHARE / 2,
+        excitation.MIN_SHARE if solution.is_noise_dominated else excitation.MIN_SHARE / 2,
     )
     unseen = basis([*solution.unseen.T, *hidden])
     return combined(solution.T_parent_child, covariance, None, unseen)
@@ -179,7 +173,7 @@ def noise_driven(
     T_parent_child: FloatArray,
     jumps: BoolArray,
     rotation_variance: Callable[[int], FloatArray],
-    least_share: float = MIN_SHARE,
+    least_share: float = excitation.MIN_SHARE,
 ) -> list[FloatArray]:
     """Directions (6,) of translation that the rotations do not reveal over any baseline.
 
@@ -205,7 +199,9 @@ def noise_driven(
         weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
         if not weights.any():
             weights[:] = 1.0
-        lever_arms = LeverArms.of((motions - np.eye(3)) @ T_parent_child[:3, :3], weights)
+        lever_arms = excitation.LeverArms.of(
+            (motions - np.eye(3)) @ T_parent_child[:3, :3], weights
+        )
         noise = rotation_variance(baseline) * np.eye(3)
         found.append(lever_arms.hidden_directions(noise, least_share).T)
     return [np.r_[direction, np.zeros(3)] for direction in min(found, key=len)]
@@ -231,7 +227,7 @@ def combined(
     covariance, rotation = known @ model @ known + scaled @ scaled.T, T_parent_child[:3, :3]
     sigmas = sigmas_in_parent(rotation, covariance)
     shares = ((np.kron(np.eye(2), rotation) @ unknown) ** 2).sum(axis=1)
-    sigmas = np.where(shares > HIDDEN_SHARE, np.inf, sigmas)
+    sigmas = np.where(shares > excitation.HIDDEN_SHARE, np.inf, sigmas)
     return Assessment(covariance, tuple(map(judged, AXES, sigmas.tolist())))
 
 
@@ -276,18 +272,18 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
     translation_b, moved = pairs.Ts_childi_childj[:, :3, 3], rotation_a - np.eye(3)
     jacobian_t = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
-    information_t = weighted_products(weights, jacobian_t)
+    information_t = excitation.weighted_products(weights, jacobian_t)
     jacobian_r = np.swapaxes(rotation_b, 1, 2) - np.eye(3)
     information_r = np.zeros((6, 6))
-    information_r[3:, 3:] = weighted_products(weights, jacobian_r)
+    information_r[3:, 3:] = excitation.weighted_products(weights, jacobian_r)
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
-    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * ROUNDING_ANGLE**2)
+    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * excitation.ROUNDING_ANGLE**2)
     inverse = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)) @ vectors.T
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 
-    hidden = LeverArms.of(moved @ rotation, weights).hidden_directions(cov_r).T
+    hidden = excitation.LeverArms.of(moved @ rotation, weights).hidden_directions(cov_r).T
     of_lever_arm = [np.r_[direction, np.zeros(3)] for direction in hidden]
     return covariance, basis([*of_lever_arm, *vectors[:, ~seen].T])
 
@@ -416,10 +412,10 @@ def floor_of_pairs(
     residuals = pairs.residuals(T_parent_child)[0][:, :, None]
     push = (translation_b @ rotation.T)[:, :, None]
     jacobian = [moved @ rotation, rotation @ se3.skew(translation_b), push, residuals]
-    products = weighted_products(weights, np.concatenate(jacobian, axis=2))
+    products = excitation.weighted_products(weights, np.concatenate(jacobian, axis=2))
     information, pushed = products[:6, :6].copy(), products[:6, 6]
     turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
-    information[3:, 3:] += 2 * weighted_products(weights, turned)
+    information[3:, 3:] += 2 * excitation.weighted_products(weights, turned)
     by_scale = np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ pushed
     of_scale = max(float(products[6, 6] - pushed @ by_scale), 1e-30)
     overlap = float(np.mean(pairs.j - pairs.i)) if len(pairs) else 1.0

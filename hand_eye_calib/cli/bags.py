@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from hand_eye_calib.cli.options import STREAMS, note, waiting_for, with_progress
+from hand_eye_calib.cli.options import OPTION_FIELDS, STREAMS, note, waiting_for, with_progress
 from hand_eye_calib.cli.reading import Recording
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
@@ -187,7 +187,10 @@ def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
         session = journal.about["parent"]
-        config = CalibratorConfig.from_options({**session.get("options", {}), **options})
+        # Options of an earlier version that were empty, and are no longer there, say nothing.
+        before = {**session.get("options", {})}
+        before = {name: each for name, each in before.items() if each or name in OPTION_FIELDS}
+        config = CalibratorConfig.from_options(before | {**options})
         names = [each.name for each in dataclasses.fields(config)]
         given = [name for name in names if name in session.get("given", ())]
         given += CalibratorConfig.from_options(options).given

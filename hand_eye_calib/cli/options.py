@@ -18,24 +18,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hand_eye_calib.config import (
-    PAIR_BY,
-    STAMP_UNITS,
-    TRAJECTORY_FORMATS,
-    CalibratorConfig,
-    NodeConfig,
-)
+from hand_eye_calib import config
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.option import check_value, did_you_mean, option_name
 
 _Item = TypeVar("_Item")
 
 STREAMS = ("parent", "child")
-OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(CalibratorConfig)}
+OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(config.CalibratorConfig)}
 
 Options = dict[str, Any]
 
-_NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(NodeConfig)}
+_NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(config.NodeConfig)}
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NODES = ("calibrator", "**", "*", "")
 _OF_ROS = "ros__parameters"
@@ -48,7 +42,7 @@ _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child
 # How a trajectory file is read. By name, what argparse needs.
 FILE_OPTIONS: dict[str, dict[str, Any]] = {
     "format": {
-        "choices": TRAJECTORY_FORMATS,
+        "choices": config.TRAJECTORY_FORMATS,
         "help": "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; "
         "csv: columns by the names in the header, or with --columns: positions as x y z or lat lon "
         "height, orientations as quaternion, roll pitch yaw or heading. Default: what the file "
@@ -65,7 +59,7 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
         "help": "stamps of the poses of a kitti file, one per line",
     },
     "stamp_unit": {
-        "choices": tuple(STAMP_UNITS),
+        "choices": tuple(config.STAMP_UNITS),
         "help": "unit of the stamps. Default: recognised from their size",
     },
 }
@@ -238,8 +232,8 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         f"is one of {_AXES}; may be repeated"
     )
     add("--prior", metavar=metavar, action="append", type=_prior, default=[], help=prior)
-    config = "YAML file with these options by name, or a ROS parameter file"
-    add("--config", metavar="FILE", type=Path, help=config)
+    file = "YAML file with these options by name, or a ROS parameter file"
+    add("--config", metavar="FILE", type=Path, help=file)
 
 
 @argument_type
@@ -353,7 +347,7 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         "time: by the stamps; row: poses without stamps, in their order; name: poses of images of "
         "the same name. For both files"
     )
-    group.add_argument("--pair-by", choices=PAIR_BY, default=PAIR_BY[0], help=pair_by)
+    group.add_argument("--pair-by", choices=config.PAIR_BY, default=config.PAIR_BY[0], help=pair_by)
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:

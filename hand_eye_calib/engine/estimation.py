@@ -18,15 +18,7 @@ import numpy as np
 from hand_eye_calib.alignment.similarity import SimilarityFit, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import (
-    Assessment,
-    assess,
-    assess_adaptive,
-    common_mode_floor,
-    floor_of_pairs,
-    usual_speed,
-    without_axes,
-)
+from hand_eye_calib.assessment import covariance
 from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
 from hand_eye_calib.assessment.prior import Fused, fuse, widened
 from hand_eye_calib.config import METHODS, CalibratorConfig, require_backend
@@ -65,7 +57,7 @@ class Solved:
     """
 
     solution: Solution | AdaptiveSolution
-    assessment: Assessment
+    assessment: covariance.Assessment
     method: str
     reference: str
     pairs: MotionPairs
@@ -87,7 +79,9 @@ class Solved:
         says.
         """
         T_method, config = self.solution.T_parent_child, self.config
-        fused = fuse(T_method, without_axes(self.assessment, T_method, unseen), config.prior())
+        fused = fuse(
+            T_method, covariance.without_axes(self.assessment, T_method, unseen), config.prior()
+        )
         offset_s, offset_sigma_s = float(config.time_offset), 0.0
         if offset := self.time_offset:
             offset_s, offset_sigma_s = offset.seconds, offset.sigma_s
@@ -232,11 +226,11 @@ def solve_poses(
 def _floor(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
     """Common-mode floor (6, 6) of the errors of the sensors that are odometries."""
     found, odometries = solved.solution, [config.parent_kind, config.child_kind].count("odometry")
-    speed_m_s = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
+    speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
     if isinstance(found, AdaptiveSolution):
-        return odometries / 2 * common_mode_floor(speed_m_s)
+        return odometries / 2 * covariance.common_mode_floor(speed_m_s)
     T = found.T_parent_child
-    return odometries / 2 * floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
+    return odometries / 2 * covariance.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
 
 
 def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:
@@ -287,7 +281,7 @@ def _of_model(
     )
     return Solved(
         solution=solution,
-        assessment=assess_adaptive(pose_pairs, solution),
+        assessment=covariance.assess_adaptive(pose_pairs, solution),
         method="adaptive",
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
@@ -322,7 +316,7 @@ def _solve_pairs(
     found = method.solve(pairs)
     return Solved(
         solution=found,
-        assessment=assess(
+        assessment=covariance.assess(
             pairs, found, lambda without: method.solve_without(pairs, found, without)
         ),
         method=method.name,

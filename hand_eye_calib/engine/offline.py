@@ -139,8 +139,8 @@ def prior_fields(prior: Prior) -> dict[str, str]:
     """
     fields = {}
     for axis, known in prior.items():
-        if axis not in (*AXIS_UNITS, "transform"):
-            raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)} or transform; got {axis!r}")
+        if axis not in AXIS_UNITS:
+            raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)}; got {axis!r}")
         if not isinstance(known, str):
             try:
                 value, sigma = map(float, known)

@@ -22,13 +22,8 @@ from hand_eye_calib.engine.estimation import calibration_of, residuals_of
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator as adaptive_estimator
+from hand_eye_calib.gls import increments
 from hand_eye_calib.gls import positions as of_positions
-from hand_eye_calib.gls.increments import (
-    RATE,
-    SYSTEMATIC_OF_RATES,
-    SYSTEMATIC_OF_ROTATIONS,
-    without_rate_bias,
-)
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.records import RateBias, Residuals
@@ -198,12 +193,12 @@ def _rotation(
     """
     solve = partial(adaptive_estimator.solve, stamps_ns, Ts_pw_p, is_clock_free=True)
     if not has_rates:
-        return solve(Ts_cw_c, SYSTEMATIC_OF_ROTATIONS), Ts_cw_c
-    first = solve(Ts_cw_c, SYSTEMATIC_OF_RATES, quick=True)
-    Ts_cw_c = without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
-    solution = solve(Ts_cw_c, SYSTEMATIC_OF_RATES)
+        return solve(Ts_cw_c, increments.SYSTEMATIC_OF_ROTATIONS), Ts_cw_c
+    first = solve(Ts_cw_c, increments.SYSTEMATIC_OF_RATES, quick=True)
+    Ts_cw_c = increments.without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
+    solution = solve(Ts_cw_c, increments.SYSTEMATIC_OF_RATES)
     parameters = solution.parameters.copy()
-    parameters[RATE] += first.parameters[RATE]
+    parameters[increments.RATE] += first.parameters[increments.RATE]
     return replace(solution, parameters=parameters), Ts_cw_c
 
 

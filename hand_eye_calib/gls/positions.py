@@ -24,20 +24,8 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls import reml
+from hand_eye_calib.gls import increments, reml
 from hand_eye_calib.gls.estimator import ModelSolution, parts_of
-from hand_eye_calib.gls.increments import (
-    BIAS,
-    N_SYSTEMATIC,
-    SCALE,
-    TIME,
-    Course,
-    Linearisation,
-    Streams,
-    course_of,
-    linearise,
-    summed,
-)
 from hand_eye_calib.gls.noise_model import (
     N_FAST,
     ROTATION,
@@ -59,8 +47,8 @@ from hand_eye_calib.text import angle, length
 
 # A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
 # acceleration (s^2). It is not solved with those in the model.
-RESPONSE = N_SYSTEMATIC
-_SHARED = [SCALE, *BIAS, TIME]
+RESPONSE = increments.N_SYSTEMATIC
+_SHARED = [increments.SCALE, *increments.BIAS, increments.TIME]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +118,7 @@ def solve(
     lever_arm, scale, rotations = _start(Ts_pw_p, positions, with_scale)
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     Ts = se3.from_rotation_translation(rotations, scale * positions)
-    state = _State.first(Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
+    state = _State.first(increments.Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
     for number in range(TUNING.rounds):
         if number in TUNING.fits:
             state = state.fitted(("body", "world") if number == TUNING.fits[0] else ())
@@ -158,7 +146,7 @@ class _State:
     """
 
     positions: FloatArray
-    streams: Streams
+    streams: increments.Streams
     X: FloatArray
     sigmas: FloatArray
     parameters: FloatArray
@@ -169,7 +157,7 @@ class _State:
     worse: BoolArray
 
     @classmethod
-    def first(cls, streams: Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
+    def first(cls, streams: increments.Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
         """Where it begins."""
         stamps_s, n, sigmas = streams.stamps_s, len(streams) - 1, np.array(TUNING.of_positions)
         sigmas[3] = TUNING.any_scale if with_scale else sigmas[3]
@@ -201,24 +189,26 @@ class _State:
         return self.outliers.spikes | self.worse
 
     @property
-    def course(self) -> Course:
+    def course(self) -> increments.Course:
         """Of the sensor with poses, at the lever arm: free of the noise of the positions, but in
         their world.
         """
         streams = self.streams
-        course = course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
+        course = increments.course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
         back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
         worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
         return replace(
             course,
-            path=summed(se3.times(worlds, np.diff(course.path, axis=0))),
-            along=summed(worlds @ np.diff(course.along, axis=0)),
+            path=increments.summed(se3.times(worlds, np.diff(course.path, axis=0))),
+            along=increments.summed(worlds @ np.diff(course.along, axis=0)),
         )
 
-    def linearised(self) -> Linearisation:
+    def linearised(self) -> increments.Linearisation:
         """Increments between poses, with the columns of the lever arm and of the parameters."""
         course, moving = self.course, _accelerations(self.streams, self.X)
-        found = linearise(self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED)
+        found = increments.linearise(
+            self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED
+        )
         answering = se3.times(found.adjoints, moving[:-1]) - moving[1:]
         columns = np.insert(found.columns, -1, answering, axis=2)
         return replace(found, columns=np.delete(columns, [3, 4, 5], axis=2))
@@ -362,7 +352,7 @@ def _solved(products: FloatArray) -> FloatArray:
     return products[..., rows, :][..., rows]
 
 
-def _accelerations(streams: Streams, X: FloatArray) -> FloatArray:
+def _accelerations(streams: increments.Streams, X: FloatArray) -> FloatArray:
     """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes, from steps on
     either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
     """

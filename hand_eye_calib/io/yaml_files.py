@@ -43,8 +43,7 @@ class _Loader(_Base):
                 line = key.start_mark.line + 1
                 raise ValueError(f"the key {name[:40]!r} appears twice, line {line}")
             seen.add(name)
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        return mapping
+        return super().construct_mapping(node, deep)
 
 
 def read_yaml(path: str | Path, expected: str = "YAML") -> Any:

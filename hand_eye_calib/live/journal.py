@@ -11,14 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.io.journal import (
-    About,
-    Journal,
-    JournalWriter,
-    count_poses,
-    has_session,
-    keep_aside,
-)
+from hand_eye_calib.io import journal
 from hand_eye_calib.live.log import NodeLog
 
 # How often what came in is handed to the disk: what a crash can cost.
@@ -81,16 +74,17 @@ class SessionJournal:
     def __init__(
         self,
         directory: Path,
-        about: Callable[[], About],
+        about: Callable[[], journal.About],
         log: NodeLog,
-        resumed: Journal | None = None,
+        resumed: journal.Journal | None = None,
     ) -> None:
         self.directory, self.error, self._log = directory, "", log
         self._lock = lock_directory(directory.parent)
         self._about = about
         self.poses: list[_Pose] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
-        self._writer: JournalWriter | None = None  # in the thread; None while it cannot be written
+        # In the thread; None while it cannot be written.
+        self._writer: journal.JournalWriter | None = None
         self._jobs.put(partial(self._open, about(), resumed))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
@@ -138,16 +132,16 @@ class SessionJournal:
                 what = str(error) if isinstance(error, OSError) else repr(error)
                 self._give_up(getattr(error, "strerror", None) or what)
 
-    def _open(self, about: About, resumed: Journal | None = None) -> None:
-        if resumed is None and has_session(self.directory):
-            poses = count_poses(self.directory)
+    def _open(self, about: journal.About, resumed: journal.Journal | None = None) -> None:
+        if resumed is None and journal.has_session(self.directory):
+            poses = journal.count_poses(self.directory)
             if poses != 0:  # not the empty one of a node that was started in vain
                 what = "" if poses is None else f" ({poses} poses)"
-                aside = keep_aside(self.directory)
+                aside = journal.keep_aside(self.directory)
                 self._log.info(f"the session before this one{what} is kept in {aside}")
-        self._writer = JournalWriter(self.directory, about, resumed=resumed)
+        self._writer = journal.JournalWriter(self.directory, about, resumed=resumed)
 
-    def _write(self, poses: list[_Pose], about: About) -> None:
+    def _write(self, poses: list[_Pose], about: journal.About) -> None:
         if self._writer is not None:
             for pose in poses:
                 self._writer.add_pose(*pose)

@@ -19,18 +19,8 @@ from datetime import datetime
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.assessment import moved
 from hand_eye_calib.assessment.covariance import floor_of_pairs
-from hand_eye_calib.assessment.moved import (
-    UNKNOWN_FROM,
-    Moved,
-    log_ratio,
-    most_likely,
-    moved,
-    noise_covariance,
-    residuals_and_jacobians,
-    shift_covariance,
-    squared_shift,
-)
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import Extrinsic, sigmas_in_parent
@@ -98,7 +88,9 @@ _SECOND_NS = 1_000_000_000
 
 # What a knock may be: a translation, a rotation, both. A knock that only turns the sensor shows
 # sooner against the second.
-_KNOCKS = np.array([shift_covariance(radians=1e-6), shift_covariance(1e-6), shift_covariance()])
+_KNOCKS = np.array(
+    [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
+)
 
 # Of the session that is watched, poses are paired soon, and few are kept.
 LIMITS = BufferLimits(
@@ -114,7 +106,7 @@ class Alarm:
 
     since_ns: int
     raised_ns: int
-    shift: Moved
+    shift: moved.Moved
     log_ratio: float
 
     def __str__(self) -> str:
@@ -221,16 +213,16 @@ class MountMonitor:
         child = np.concatenate([each.Ts_childi_childj for _, each in learned])
         index = np.arange(len(parent))
         pairs = MotionPairs(parent, child, index, index + 1)
-        residuals, jacobians = residuals_and_jacobians(pairs, self._installed)
+        residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)
         self.is_learning = False
-        self._noise, _ = noise_covariance(residuals)
+        self._noise, _ = moved.noise_covariance(residuals)
         for _ in range(2):
             H, S, _ = _information(residuals, jacobians, self._noise)
-            shift = most_likely(H, S, TUNING.ridge)
-            self._noise, _ = noise_covariance(residuals + jacobians @ shift)
+            shift = moved.most_likely(H, S, TUNING.ridge)
+            self._noise, _ = moved.noise_covariance(residuals + jacobians @ shift)
         speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
         floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed, speed_m_s)
-        floor += shift_covariance(1e-3, 1e-4)  # never singular
+        floor += moved.shift_covariance(1e-3, 1e-4)  # never singular
         self._covariance = self._covariance + floor
         self._wander = TUNING.wander**2 * floor
         for second_ns, each in learned:
@@ -238,12 +230,12 @@ class MountMonitor:
 
     def _take(self, stamp_ns: int, motions: MotionPairs) -> None:
         """Add the information of a second whatever the scale in it, and follow the noise."""
-        residuals, jacobians = residuals_and_jacobians(motions, self._installed)
+        residuals, jacobians = moved.residuals_and_jacobians(motions, self._installed)
         by_scale = np.zeros((len(motions), 6, 1))  # of its logarithm
         by_scale[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
         jacobians = np.concatenate([jacobians, by_scale], axis=2)
         if self.seconds % TUNING.long_run_every_s == 0 and len(self._S) >= TUNING.learning_s:
-            self._centre = most_likely(self._H.sum(axis=0), self._S.sum(axis=0), TUNING.ridge)
+            self._centre = moved.most_likely(self._H.sum(axis=0), self._S.sum(axis=0), TUNING.ridge)
         shift = np.append(self._centre, 0.0)
         H, S, scatter = _information(residuals, jacobians, self._noise, shift)
         share = H[:6, 6] / (H[6, 6] + self.long_run / TUNING.scale_sigma**2)
@@ -267,17 +259,17 @@ class MountMonitor:
         if len(self._S) < _LAGS[0]:
             return
         lags, H, S = self._sums()
-        ratios = log_ratio(H, S, _KNOCKS[:, None]).max(axis=0)
+        ratios = moved.log_ratio(H, S, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
         if ratios[best] < (self.alarm.log_ratio if self.alarm else TUNING.threshold):
             return
-        covariance = np.linalg.inv(H[best] + np.linalg.inv(shift_covariance(1.0, 1.0)))
+        covariance = np.linalg.inv(H[best] + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
         to_parent = np.kron(np.eye(2), self._installed[:3, :3])
         since_ns, raised_ns = int(self._stamps_ns[lags[best] - 1]), int(self._stamps_ns[0])
         self.alarm = Alarm(
             since_ns=self.alarm.since_ns if self.alarm else since_ns,
             raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
-            shift=moved(
+            shift=moved.moved(
                 to_parent @ covariance @ S[best], to_parent @ covariance @ to_parent.T, np.zeros(6)
             ),
             log_ratio=float(ratios[best]),
@@ -313,7 +305,7 @@ class MountMonitor:
         seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
         H[:3, :3] -= self._motions_per_s * seeming
         H *= seconds / self.long_run
-        scale = np.sqrt(np.diag(shift_covariance(100.0, np.pi)))
+        scale = np.sqrt(np.diag(moved.shift_covariance(100.0, np.pi)))
         values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
         root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
         covariance = root @ root.T + before
@@ -359,7 +351,7 @@ def _long_run_variance(H: FloatArray, S: FloatArray, known: float) -> float:
     largest over windows of several lengths, each about the answer of all; what is known while there
     are too few.
     """
-    answer = most_likely(H.sum(axis=0), S.sum(axis=0), TUNING.ridge)
+    answer = moved.most_likely(H.sum(axis=0), S.sum(axis=0), TUNING.ridge)
     found = []
     for length in TUNING.windows_s:
         n_windows = len(S) // length
@@ -368,7 +360,7 @@ def _long_run_variance(H: FloatArray, S: FloatArray, known: float) -> float:
         newest = n_windows * length
         of_windows = H[:newest].reshape(n_windows, length, 6, 6).sum(axis=1)
         scores = S[:newest].reshape(n_windows, length, 6).sum(axis=1) - of_windows @ answer
-        squared = squared_shift(of_windows, scores, TUNING.ridge)
+        squared = moved.squared_shift(of_windows, scores, TUNING.ridge)
         seen = np.minimum(squared, TUNING.most_of_typical * np.median(squared)).sum() / 6
         found.append(
             (seen + TUNING.assumed_windows * TUNING.assumed) / (n_windows + TUNING.assumed_windows)
@@ -430,7 +422,7 @@ class MountWatch:
             unwatched = axes_in_words([AXES[index] for index in np.flatnonzero(hidden)])
             text = "the mount has not moved"
             text += f"; {unwatched} cannot be watched here" if unwatched else ""
-        told = np.where(visible < UNKNOWN_FROM, visible, np.nan)
+        told = np.where(visible < moved.UNKNOWN_FROM, visible, np.nan)
         shift = alarm.shift.axes if alarm else {}
         return MountState(
             level=Level.ERROR if alarm else Level.OK,

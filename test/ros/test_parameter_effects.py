@@ -66,7 +66,6 @@ CHANGES = {
     "target.axes": ("yaw=1e-5", {}),
     **{f"prior.{each}": ("1+/-0.001", {}) for each in "xyz"},
     **{f"prior.{each}": ("10deg+/-0.01deg", {}) for each in ("roll", "pitch", "yaw")},
-    "prior.transform": ("1 1 1 0.1 0.1 0.1+/-0.001 0.001", {}),
 }
 
 

@@ -42,7 +42,6 @@ from hand_eye_calib.io.results import load_result
 from hand_eye_calib.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.solvers.registry import Method
-from hand_eye_calib.text import parse_prior
 
 DNL = Method("dnl")
 
@@ -318,7 +317,7 @@ class TestOption:
         ],
     )
     def test_values_with_units(self, name, text, prior):
-        parsed = parse_prior(name, text)
+        parsed = CalibratorConfig(**{name.replace(".", "_"): text}).prior()
         assert list(parsed) == list(prior)
         for axis, pair in prior.items():
             assert parsed[axis] == pytest.approx(pair)
@@ -334,7 +333,6 @@ class TestOption:
             ("prior_x", "1e999+/-1", r"at most 1e\+06 m; got '1e999'"),
             ("prior_x", "1+/-1e200", r"at most 1e\+06 m; got '1e200'"),
             ("prior_yaw", "1+/-1e999", r"at most 1e\+06 rad; got '1e999'"),
-            ("prior_transform", "1 2 3+/-0.1", "X Y Z ROLL PITCH YAW"),
         ],
     )
     def test_what_does_not_say_enough_is_refused(self, name, text, message):
@@ -355,16 +353,6 @@ class TestFlatGround:
         assert any(
             "z of the child sensor: mostly from the prior" in warning for warning in result.warnings
         )
-
-    def test_whole_nominal_transform(self):
-        result = calibrate(
-            *flat_drive(),
-            reference="B10",
-            prior={"transform": "0.6 -0.3 1.85 0 0 168.5deg+/-0.1 10deg"},
-        )
-        assert result.status is SolveStatus.OK
-        assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.01)
-        assert sigmas(result)["z"] == pytest.approx(0.1, rel=0.1)
 
     @pytest.mark.parametrize("method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"])
     def test_every_method_takes_it(self, method):

@@ -71,7 +71,8 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
 
 
 def test_what_was_set_in_a_session_counts_as_set_in_its_replay(tmp_path):
-    write_session(tmp_path, {"time_offset": 0.0, "scale": "none"}, "time_offset")
+    of_old = {"prior.transform": ""}  # an option that is no longer there
+    write_session(tmp_path, of_old | {"time_offset": 0.0, "scale": "none"}, "time_offset")
     config = read_journal_of(tmp_path, {"reference": "B5"}).snapshot.config
     assert config.given == {"time_offset", "reference"}
 

@@ -29,7 +29,7 @@ from hand_eye_calib.solvers.all_pairs import pair_costs
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.text import AXIS_UNITS
 
-PRIOR_FIELDS = {f"prior_{axis}" for axis in (*AXIS_UNITS, "transform")}
+PRIOR_FIELDS = {f"prior_{axis}" for axis in AXIS_UNITS}
 
 
 def streams(n_poses=40):
@@ -118,7 +118,7 @@ class TestPrior:
     @pytest.mark.parametrize(
         ("prior", "message"),
         [
-            ({"height": (1.85, 0.02)}, "prior takes x, y, z, roll, pitch, yaw or transform; got"),
+            ({"height": (1.85, 0.02)}, "prior takes x, y, z, roll, pitch, yaw; got"),
             ({"z": 1.85}, r"prior z must be \(value, standard deviation\) or a text; got 1.85"),
             ({"z": (1.85, 0.02, 3)}, r"prior z must be \(value, standard deviation\)"),
             ({"z": (1.85, float("nan"))}, "prior.z must be numbers in m"),

@@ -27,6 +27,7 @@ from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, required
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.files import limit_memory
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import told_apart
@@ -34,7 +35,7 @@ from hand_eye_calib.text import told_apart
 STATE, TABLE, INDEX, VEHICLES = "batch.jsonl", "rows.csv", "index.html", "vehicles"
 _BAGS = (".bag", ".mcap", ".db3")
 
-Row = dict[str, Any]
+Row = Document
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,10 +192,9 @@ class Outcome(NamedTuple):
         return Calibration.from_dict(json.loads(self.text)["calibration"])
 
     @property
-    def inputs(self) -> dict[str, Any]:
+    def inputs(self) -> Document:
         """Where the data came from."""
-        found: dict[str, Any] = json.loads(self.text)["inputs"]
-        return found
+        return json.loads(self.text)["inputs"]
 
     @property
     def verdict(self) -> str:
