@@ -81,8 +81,10 @@ def _trend(result: Calibration, number: int) -> Drawn:
         if np.isfinite(band):
             panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
         for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
-            shown = at[group], values[group], sigmas[group]
-            panel.errorbar(*shown, fmt=fmt, color=colour, ms=3.2, elinewidth=0.8)
+            # One line with gaps: a path for each bar would be most of the page.
+            ends = np.stack([values - sigmas, values + sigmas, np.full(len(at), np.nan)], axis=1)
+            panel.plot(np.repeat(at[group], 3), ends[group].ravel(), color=colour, lw=0.8)
+            panel.plot(at[group], values[group], fmt, color=colour, ms=3.2)
     locator = AutoDateLocator(minticks=2, maxticks=4)
     panels[0].xaxis.set_major_locator(locator)
     panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))

@@ -250,6 +250,13 @@ def _few_inliers(result: Result) -> Iterator[_Found]:
         yield text, "find out why the odometry jumps, and record again", (), {}
 
 
+# What helps against the floor.
+_OF_FLOOR = (
+    "set the target that you need; if a stream has no such errors, such as motion capture, give "
+    "parent_kind or child_kind exact"
+)
+
+
 def _worse_than_target(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
     if rough:
@@ -258,7 +265,12 @@ def _worse_than_target(result: Result) -> Iterator[_Found]:
         targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
         more = "more rotation about other axes" if {*names} & {*TRANSLATIONS} else "more rotation"
         text = f"standard deviations above the target of {targets}: {told}"
-        yield text, f"record longer, with {more}", names, {}
+        floors = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
+        left = [f"{each.name} {amount(each.name, of)}" for each, of in floors if of > each.target]
+        advice = [f"record longer, with {more}"] if len(left) < len(rough) else []
+        if left:
+            advice.append(f"constant odometry errors alone leave {listing(left)}: {_OF_FLOOR}")
+        yield text, "; ".join(advice), names, {}
 
 
 def _floor(result: Result) -> Iterator[_Found]:
@@ -273,11 +285,7 @@ def _floor(result: Result) -> Iterator[_Found]:
             "constant odometry errors, which no recording can show, limit the knowledge of "
             f"{listing(told)}: more than the target of {targets}"
         )
-        advice = (
-            "set the target that you need; if a stream has no such errors, such as motion capture, "
-            "give parent_kind or child_kind exact"
-        )
-        yield text, advice, names, {}
+        yield text, _OF_FLOOR, names, {}
 
 
 _OF_RECORDINGS = {

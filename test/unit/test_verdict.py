@@ -116,6 +116,16 @@ def test_sentences_name_axes_values_and_targets(rule, sentence):
     assert reason.sentence == sentence
 
 
+@pytest.mark.parametrize(("more", "begins"), [({}, ""), ({"y": 0.04}, "record longer, with more ")])
+def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(more, begins):
+    (reason,) = good(**CASES["floor"], observability=observed(x=0.04, **more)).reasons
+    assert reason.rule == "target"
+    assert reason.what_to_do.startswith(
+        begins or "constant odometry errors alone leave x 3 cm: set"
+    )
+    assert "alone leave x 3 cm: set the target" in reason.what_to_do
+
+
 def test_axes_that_cannot_be_determined_are_named_together():
     result = good(observability=observed(z=np.inf, roll=np.inf, yaw=np.inf))
     sentence = "z and the rotations about x and z cannot be determined from this motion"
