@@ -15,6 +15,8 @@ def printable(text: str) -> str:
     r"""Escape control characters, such as ``\x1b`` and line ends: a name out of a file must not
     change what a terminal or a log shows.
     """
+    if text.isprintable():
+        return text
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode()
         for letter in text

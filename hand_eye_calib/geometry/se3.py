@@ -382,7 +382,8 @@ def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     ``T_parent_child @ exp(xi)`` moves the child's origin by ``R rho``, to first order, and rotates
     the child by ``R phi`` about the parent's axes through that origin. There is no lever arm.
     """
-    both = np.kron(np.eye(2), rotation)
+    both = np.zeros((*np.shape(rotation)[:-2], 6, 6))
+    both[..., :3, :3] = both[..., 3:, 3:] = rotation
     return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
 
 

@@ -299,8 +299,8 @@ class SolveCycle:
         return "; ".join((text, *said, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
-        if calibration.measured != "poses":
-            return calibration  # which has its own
+        if calibration.measured != "poses" or calibration.findings == self.checks.findings:
+            return calibration  # of other streams it has its own
         return replace(calibration, findings=self.checks.findings)
 
     def _report(self, failure: Failure) -> str:

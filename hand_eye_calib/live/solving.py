@@ -25,6 +25,7 @@ from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.run import check, review, with_options
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.live.state import GRACE_S
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 
@@ -37,9 +38,6 @@ _NICENESS = 3
 
 # A job that has taken this long (s) hangs: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
-
-# A process that was killed is waited for so long (s).
-_LAST_BREATH_S = 1.0
 
 NO_MOTION = excitation(PosePairs.empty())
 
@@ -207,7 +205,7 @@ class SolvingProcess:
         self._is_stopping = True
         self._thread.join(timeout_s)
         self._process.kill()
-        self._thread.join(_LAST_BREATH_S)  # its pipe has ended
+        self._thread.join(GRACE_S)  # its pipe has ended
         self._process.communicate()
 
     def _start(self) -> None:
@@ -235,7 +233,7 @@ class SolvingProcess:
     def _restart(self, hangs: bool) -> Failure:
         """Start the process again, which has died or was killed; returns how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_LAST_BREATH_S)
+            self._process.wait(GRACE_S)
         self._process.kill()
         self._process.communicate()
         code = self._process.returncode

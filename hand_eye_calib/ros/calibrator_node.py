@@ -14,6 +14,7 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -85,12 +86,26 @@ class CalibratorNode(Node):
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
-        hooks = self._answered.trigger, self._robot.complete, self._publish
+        hooks = self._answered.trigger, self._robot.complete, self._publish_result
         self._cycle = SolveCycle(self._session, self._log, *hooks, config.targets)
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
         self._discover()
         self._say_start()
+
+    # Without rclpy's warnings about QoS, which the inputs give themselves: each of them costs as
+    # much as a message at every turn of the executor.
+    def create_publisher(self, *args: Any, **more: Any) -> Any:
+        events = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(*args, event_callbacks=events, **more)
+
+    def create_subscription(self, *args: Any, **more: Any) -> Any:
+        events = SubscriptionEventCallbacks(use_default_callbacks=False)
+        return super().create_subscription(*args, event_callbacks=events, **more)
+
+    def take_messages(self) -> bool:
+        """Take the messages that wait at the inputs; whether there were any."""
+        return max(each.take_waiting() for each in self._inputs)
 
     def stop(self, timeout_s: float) -> bool:
         """End the solving process and save the newest result; False if that was wanted and could
@@ -186,6 +201,10 @@ class CalibratorNode(Node):
         clock_ns = self.get_clock().now().nanoseconds
         self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
         self._cycle.tell_who_waits()
+
+    def _publish_result(self) -> None:
+        self.take_messages()  # those that have waited for what was done with the result
+        self._publish()
 
     def _why_not_broadcast(self) -> str:
         result, progress = self._cycle.result, self._cycle.goal.progress

@@ -26,9 +26,6 @@ _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELI
 
 _, *_TYPES = POSE_TYPES  # without auto
 
-# Messages taken in one callback beyond the first; services and timers have their turn then.
-_MOST_AT_ONCE = 50
-
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
 Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
@@ -88,10 +85,10 @@ class TopicInput(PoseInput):
     def _subscribe(self, type_name: str) -> None:
         measures = self.measures_as(type_name)
         self._session.set_measures(self.name, measures)
-        read = MessageReader(type_name, measures, self._session.origin(self.name))
+        self._read = MessageReader(type_name, measures, self._session.origin(self.name))
         # rclpy looks at the signature: with two arguments it passes the info as well, which its
         # annotations do not know.
-        callback: Any = partial(self._hear, read)
+        callback: Any = partial(self._receive, self._read)
         try:
             self._subscription = self._node.create_subscription(
                 message_class(type_name),
@@ -109,10 +106,12 @@ class TopicInput(PoseInput):
             ) from error
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
-    def _hear(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
-        """Take a message, and those that wait: the callback of the subscription."""
-        for each in ((data, info), *waiting_messages(self._subscription)):
-            self._receive(read, *each)
+    def take_waiting(self) -> bool:
+        """Take the messages that wait; whether there were any."""
+        before = self._arrived
+        for each in waiting_messages(self._subscription):
+            self._receive(self._read, *each)
+        return self._arrived > before
 
     def _receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
         # With several publishers, or none any more, the numbers of lost messages are not known.
@@ -149,27 +148,29 @@ class TfInput(PoseInput):
         """Say what is missing; to be called often."""
         self.problem = self._stream.describe_missing()
 
+    def take_waiting(self) -> bool:
+        """Take the messages that wait; whether there were any."""
+        before = self._arrived
+        for topic, subscription in self._subscriptions.items():
+            for message, _ in waiting_messages(subscription):
+                self._hear(topic, message)
+        return self._arrived > before
+
     def _hear(self, topic: str, message: Any) -> None:
-        waiting = (queued for queued, _ in waiting_messages(self._subscriptions.get(topic)))
-        for each in (message, *waiting):
-            for transform in map(from_transform, each.transforms):
-                try:
-                    for pose in self._stream.add(transform, topic == STATIC_TOPIC):
-                        self.accept(pose.stamp_ns, partial(PoseFields, *pose))
-                except InputError as error:
-                    self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
+        for transform in map(from_transform, message.transforms):
+            try:
+                for pose in self._stream.add(transform, topic == STATIC_TOPIC):
+                    self.accept(pose.stamp_ns, partial(PoseFields, *pose))
+            except InputError as error:
+                self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
 
 
 def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Messages that wait in a subscription's queue, each with its info.
-
-    To be taken in the callback: the executor needs several times as long for a message as the
-    callback, and on a slow computer falls behind.
-    """
+    """Messages that wait in a subscription's queue, each with its info."""
     if subscription is None:
         return
     with subscription.handle:
-        for _ in range(_MOST_AT_ONCE):
+        for _ in range(subscription.qos_profile.depth):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return

@@ -108,8 +108,9 @@ class Goal:
         stuck = not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _STEPS_S[-2]
         left_s = self._told(left_s)
         known = self._ended(calibration, faults)
+        behind = AXES[worst] if stuck or ratios[worst] > 1.0 else ""
         self.progress = Progress(
-            sentence=known or _way_on(AXES[worst], left_s[worst], bool(stuck), seen),
+            sentence=known or _way_on(behind, left_s[worst], bool(stuck), seen),
             done=is_done and not faults,
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
@@ -162,13 +163,15 @@ class Goal:
 
 
 def _way_on(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
-    """Which motion helps most, for the axis that takes longest."""
+    """Which motion helps most, for the axis that takes longest; there may be none."""
+    left = duration(np.clip(left_s, _STEPS_S[1], _STEPS_S[-2]))
+    if not axis:
+        return f"Go on for about {left}: every axis is good enough if the next results agree."
     motion, called = helpful_motion([axis], seen), axes_in_words([axis])
     if is_stuck:
         return f"This motion will not determine {called} well enough: {motion}."
     if not np.isfinite(left_s):
         return f"{called} is not determined yet: {motion}."
-    left = duration(max(left_s, _STEPS_S[1]))
     return f"Go on for about {left}: {called} takes longest, {motion}."
 
 
