@@ -17,8 +17,6 @@ Document: TypeAlias = dict[str, Any]
 # No number of a file is as large: the products of some are still finite.
 _LARGEST = 1e50
 
-_AS_THEY_ARE = (str, bool, int, types.NoneType)
-
 
 def plain(value: Any) -> Any:
     """A value with all that it holds as mappings, lists, texts, bools and numbers.
@@ -26,8 +24,6 @@ def plain(value: Any) -> Any:
     A dataclass becomes a mapping of its fields, numbers and arrays of NumPy those of Python, an
     enum its value without spaces. Infinity and NaN, which JSON does not have, become None.
     """
-    if type(value) in _AS_THEY_ARE:
-        return value
     if isinstance(value, Enum):
         value = value.value.replace(" ", "_") if isinstance(value.value, str) else value.value
     if is_dataclass(value) and not isinstance(value, type):

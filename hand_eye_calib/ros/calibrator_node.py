@@ -7,7 +7,7 @@ nothing here needs a lock.
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import partial, partialmethod
 from itertools import chain, cycle
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,13 @@ class CalibratorNode(Node):
     ConfigError
         If a parameter given at the start is unusable.
     """
+
+    # Without rclpy's warnings about QoS, which the inputs give themselves: each costs as much as a
+    # message at every turn of the executor.
+    _quiet = PublisherEventCallbacks(use_default_callbacks=False)
+    create_publisher = partialmethod(Node.create_publisher, event_callbacks=_quiet)
+    _deaf = SubscriptionEventCallbacks(use_default_callbacks=False)
+    create_subscription = partialmethod(Node.create_subscription, event_callbacks=_deaf)
 
     def __init__(self) -> None:
         try:
@@ -92,16 +99,6 @@ class CalibratorNode(Node):
         self._serve()
         self._discover()
         self._say_start()
-
-    # Without rclpy's warnings about QoS, which the inputs give themselves: each of them costs as
-    # much as a message at every turn of the executor.
-    def create_publisher(self, *args: Any, **more: Any) -> Any:
-        events = PublisherEventCallbacks(use_default_callbacks=False)
-        return super().create_publisher(*args, event_callbacks=events, **more)
-
-    def create_subscription(self, *args: Any, **more: Any) -> Any:
-        events = SubscriptionEventCallbacks(use_default_callbacks=False)
-        return super().create_subscription(*args, event_callbacks=events, **more)
 
     def take_messages(self) -> bool:
         """Take the messages that wait at the inputs; whether there were any."""
