@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any, TypeAlias, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 # A mapping of JSON or YAML: names to values that any program reads.
 Document: TypeAlias = dict[str, Any]
@@ -75,7 +76,7 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
         if isinstance(value, str):
             raise TypeError("a list is a text")
         return tuple(from_plain(args[0], each) for each in _of_type(Sequence, value))
-    if get_origin(kind) is np.ndarray:
+    if get_origin(kind) in (np.ndarray, NDArray):  # which is an alias from NumPy 2.5 on
         return _of_type(np.ndarray, value)
     if kind is float:
         return _number(value)
