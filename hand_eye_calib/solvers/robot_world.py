@@ -25,9 +25,9 @@ _TAILS = 12.0
 # are normal) under heavy tails of so many degrees of freedom, which few outliers do not widen.
 _OUTLIER, _OUTLIER_TAILS = 36.0, 3.0
 
-# Rounds of weights, levels and a Gauss-Newton step, of the fit that finds the outliers and of that
-# without them; steps below this many standard deviations end them.
-_ROUGH_ROUNDS, _ROUNDS, _SMALL_STEP = 8, 60, 1e-4
+# Rounds of weights, levels and a Gauss-Newton step; steps below this many standard deviations end
+# them.
+_ROUNDS, _SMALL_STEP = 60, 1e-2
 
 # Starts from so many stops each: two in three are clean with a tenth of outliers.
 _STARTS, _START_STOPS = 12, 5
@@ -42,9 +42,13 @@ _UNDETERMINED = 8.0
 # Standard deviation that stands for "not determined" in the covariance (m, rad).
 _UNKNOWN = 1e3
 
-# Errors of stops that follow each other may last: the sums of the scores over so many parts of the
-# recording show it.
-_PARTS = 6
+# Errors of stops that follow each other may last: over changes of the view (rad), beside a white
+# share of their variance; the first row is of errors that do not last. Within the smallest range
+# stops count as one where outliers are looked for, as an arm that rests gives many.
+_LASTING = np.array([(0.03, 1.0), *((0.03 * 2.5**k, 0.1) for k in range(6))])
+
+# So many stops at once are looked at.
+_AT_ONCE = 300
 
 
 @dataclass(frozen=True)
@@ -157,15 +161,17 @@ def solve(stops: Stops) -> RobotWorld:
             f"{len(stops)} stops are too few: at least {MIN_STOPS} of each sensor, with rotations "
             "about two axes, are necessary; 15 or more are better"
         )
-    starts, fits = _starts(stops, counts), []
+    starts, alone, fits = _starts(stops, counts), _alone(stops), []
     for in_world in (False, True):
-        rough = _fit(stops, *starts, in_world, _OUTLIER_TAILS, _ROUGH_ROUNDS)
+        rough = _fit(stops, starts, in_world, _OUTLIER_TAILS, alone)
         kept, weights = rough.weights > 0.0, np.zeros(len(stops))
-        Xs, Zs = rough.Ts_parent_child, rough.Ts_world_world
-        fit = _fit(stops[kept], Xs, Zs, in_world, _TAILS, _ROUNDS)
+        begin = rough.Ts_parent_child, rough.Ts_world_world
+        fit = _fit(stops[kept], begin, in_world, _TAILS, alone[kept])
         weights[kept] = fit.weights
-        fits.append(replace(fit, weights=weights))
-    return max(fits, key=_likelihood)
+        fits.append((replace(fit, weights=weights), in_world))
+    best, in_world = max(fits, key=lambda each: _likelihood(each[0]))
+    kept = best.weights > 0.0
+    return replace(best, covariance=_lasting(stops[kept], best, in_world, alone[kept]))
 
 
 def _likelihood(fit: RobotWorld) -> float:
@@ -272,32 +278,93 @@ def _information(rows: FloatArray, columns: IntArray, n_values: int) -> FloatArr
     return whole.reshape(n_values, n_values)
 
 
-def _lasting(gradients: FloatArray, columns: IntArray, information: FloatArray) -> float:
-    """Factor on the covariance, at least 1, for errors that last from stop to stop."""
-    n, n_values = len(columns), len(information)
-    parts = np.array_split(np.arange(n), min(_PARTS, n))
-    sums = [np.bincount(columns[k].ravel(), gradients[k].ravel(), n_values) for k in parts]
-    inverse = np.linalg.pinv(information, hermitian=True)
-    spread = float(np.einsum("ki,ij,kj->", sums, inverse, sums))
-    return max(1.0, spread / (n_values * (1.0 - 1.0 / len(parts))))
+def _path_rad(stops: Stops) -> FloatArray:
+    """How far the view changed up to each stop (N,): rotations, and ways over a usual distance."""
+    A = stops.Ts_world_parent
+    distances_m = np.linalg.norm(stops.Ts_world_child[:, :3, 3], axis=1)
+    steps = np.linalg.norm(se3.log(se3.inverse(A[:-1]) @ A[1:]).reshape(-1, 2, 3), axis=2)
+    usual_m = np.median(distances_m) + steps[:, 0].sum() / len(A) + np.finfo(float).tiny
+    return np.cumsum(np.r_[0.0, steps @ [1.0 / usual_m, 1.0]])
+
+
+def _alone(stops: Stops) -> FloatArray:
+    """Weights (N,) of 1 on average: stops that follow each other at one place count as one."""
+    path_rad = _path_rad(stops)
+    first, end = (
+        np.searchsorted(path_rad, path_rad + x) for x in (-_LASTING[0, 0], _LASTING[0, 0])
+    )
+    alone = 1.0 / np.maximum(end - first, 1)
+    return np.asarray(alone / alone.mean())
+
+
+def _kernels(path_rad: FloatArray) -> FloatArray:
+    """Correlations (K, N, N) of the errors of stops in their order, for each row of _LASTING."""
+    ranges_rad, white = _LASTING.T[:, :, None, None]
+    apart = np.abs(np.subtract.outer(path_rad, path_rad)) / ranges_rad
+    return np.asarray(white * np.eye(len(path_rad)) + (1.0 - white) * np.exp(-apart))
+
+
+def _shares(kernels: FloatArray, errors: FloatArray, rows: FloatArray) -> FloatArray:
+    """Probability (K,) of each of the kernels times the variance that it finds, over that of none.
+
+    Restricted likelihood: D. A. Harville, *Maximum likelihood approaches to variance component
+    estimation*, JASA 72, 1977.
+    """
+    n, n_values = len(errors), rows.shape[2]
+    factors = np.linalg.cholesky(kernels)
+    columns = np.concatenate([errors[..., None], rows], axis=2).reshape(n, -1)
+    whitened = np.linalg.solve(factors, columns).reshape(len(kernels), 6 * n, 1 + n_values)
+    # The last of the triangle's rows is what no values explain.
+    triangle = np.linalg.qr(np.roll(whitened, -1, axis=2), mode="r")
+    sizes = np.abs(np.diagonal(triangle, 0, 1, 2)) + np.finfo(float).tiny
+    levels = 2.0 * np.log(sizes[:, -1])
+    logs = -0.5 * (6 * n - n_values) * levels - np.log(sizes[:, :-1] + 1e-9).sum(axis=1)
+    logs -= 6.0 * np.log(np.diagonal(factors, 0, 1, 2)).sum(axis=1)
+    shares = np.exp(logs - logs.max())
+    return np.asarray(shares / shares.sum() * np.exp(levels - levels[0]))
+
+
+def _lasting(stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray) -> FloatArray:
+    """Covariance of a fit, if errors last from stop to stop of a sensor and one of its worlds."""
+    errors, jacobian = _linearise(stops, fit.Ts_parent_child, fit.Ts_world_world, in_world)
+    levels = np.repeat([fit.level_m, fit.level_rad], 3)
+    weights = np.sqrt(fit.weights[fit.weights > 0.0])[:, None]
+    errors, rows = weights * errors / levels, jacobian / levels[:, None]
+    blocks = np.stack([stops.child, len(fit.Ts_parent_child) + stops.world], axis=1)
+    pairs, pair_of, counts = np.unique(blocks, axis=0, return_inverse=True, return_counts=True)
+    most = np.flatnonzero(pair_of.ravel() == np.argmax(counts))[:_AT_ONCE]
+    kernels = _kernels(_path_rad(stops[most]))
+    shares = _shares(kernels, errors[most], weights[most, None] * rows[most])
+    more = np.zeros_like(fit.information)
+    for k, pair in enumerate(pairs):
+        columns = (6 * pair[:, None] + np.arange(6)).ravel()
+        own = np.flatnonzero(pair_of.ravel() == k)
+        for part in np.array_split(own, -(-len(own) // _AT_ONCE)):
+            kernel = np.tensordot(shares, _kernels(_path_rad(stops[part])), 1)
+            kernel = alone[part, None] * kernel * alone[part] - np.diag(alone[part])
+            across = np.swapaxes(rows[part], 0, 1)
+            more[np.ix_(columns, columns)] += np.einsum("kni,knj->ij", across, kernel @ across)
+    more *= (_TAILS + 6.0) / (_TAILS + 8.0)
+    return fit.covariance + fit.covariance @ more @ fit.covariance
 
 
 def _fit(
-    stops: Stops, Xs: FloatArray, Zs: FloatArray, in_world: bool, tails: float, rounds: int
+    stops: Stops, starts: tuple[FloatArray, ...], in_world: bool, tails: float, alone: FloatArray
 ) -> RobotWorld:
     """Weights, levels and Gauss-Newton steps in turn."""
+    Xs, Zs = starts
     n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
     blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
     columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
     # Values that the errors are fitted with make them smaller.
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)
-    weights, converged = np.ones(n), False
-    for _ in range(rounds):
+    weights, converged = alone, False
+    for _ in range(_ROUNDS):
         errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         variances = np.maximum(weights @ squared / n_free, _SMALLEST_VARIANCE)
         distance = squared @ (1.0 / variances)
-        weights = (tails + 6.0) / (tails + distance)
+        weights = alone * (tails + 6.0) / (tails + distance)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
         rows = scale[..., None] * jacobian
         information = _information(rows, columns, n_values)
@@ -312,19 +379,19 @@ def _fit(
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
     # modeling using the t distribution*, JASA 84, 1989, section 4.
     share = (tails + 6.0) / (tails + 8.0)
-    rows = np.sqrt(share * np.repeat(1.0 / variances, 3))[:, None] * jacobian
+    scale = np.sqrt(share * alone[:, None] * np.repeat(1.0 / variances, 3))
+    rows = scale[..., None] * jacobian
     fisher = _information(rows, columns, n_values)
     weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), n_values // 6) / _UNKNOWN**2)
-    log_likelihood = (
-        -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * np.log1p(distance / tails).sum()
+    log_likelihood = -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * alone @ np.log1p(
+        distance / tails
     )
-    covariance = np.linalg.inv(fisher + weak) * _lasting(gradients, columns, information)
     return RobotWorld(
         Ts_parent_child=Xs,
         Ts_world_world=Zs,
-        covariance=np.asarray(covariance, dtype=float),
+        covariance=np.asarray(np.linalg.inv(fisher + weak), dtype=float),
         information=fisher,
-        weights=np.where(distance < _OUTLIER, np.minimum(weights, 1.0), 0.0),
+        weights=np.where(distance < _OUTLIER, np.minimum(weights / alone, 1.0), 0.0),
         level_m=float(np.sqrt(variances[0])),
         level_rad=float(np.sqrt(variances[1])),
         objective=-float(log_likelihood),
