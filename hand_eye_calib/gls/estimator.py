@@ -30,7 +30,6 @@ from hand_eye_calib.gls.increments import (
 from hand_eye_calib.gls.noise_model import (
     JITTER,
     N_FAST,
-    PARTS,
     ROTATION,
     TRANSLATION,
     WALK_ROTATION,
@@ -354,7 +353,7 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     unseen = np.zeros(6)
     for process, level in zip(fit.model.slow, fit.levels[N_FAST::2], strict=True):
         if process.kind == "body":
-            unseen[PARTS[process.part]] += problem.tuning.unseen_share * np.exp(level)
+            unseen[:3] += problem.tuning.unseen_share * np.exp(level)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     final = fit.moved(normal.step, columns)
     is_there = fit.sigmas > problem.tuning.none

@@ -173,7 +173,7 @@ def test_errors_that_last_are_found_and_told_apart(kind):
     squared, kinds = [], []
     for seed in range(4):
         parent, child = noisy_drive(seed, n_poses=600, white=(0.001, 0.001))
-        errors = lasting(100 + seed, 600, [0.01, 0.01], 20)
+        errors = lasting(100 + seed, 600, [0.02, 0.002], 20)
         if kind == "world":
             back = np.swapaxes(parent[:, :3, :3], 1, 2)
             errors = np.concatenate(
@@ -184,13 +184,16 @@ def test_errors_that_last_are_found_and_told_apart(kind):
             child = child @ se3.exp(errors)
         solution = estimator.solve(stamps(600), parent, child)
         strongest = max(
-            (slow for slow in solution.noise.lasting if slow.part == "rotation"),
+            (slow for slow in solution.noise.lasting if slow.part == "translation"),
             key=lambda slow: slow.sigma,
         )
         kinds.append(strongest.kind)
-        assert strongest.sigma == pytest.approx(0.01, rel=0.5)
+        assert strongest.sigma == pytest.approx(0.02, rel=0.5)
         assert strongest.tau_s == pytest.approx(2.0, rel=0.8)
-        squared.append(squared_distance(solution))
+        # Rotations fixed to the body are no process: the scatter of the tenths has to state them.
+        found = assess_adaptive(PosePairs(stamps(600), parent, child), solution)
+        stated = replace(solution, cov_parent_child_in_child=found.cov_parent_child_in_child)
+        squared.append(squared_distance(stated))
     assert kinds.count(kind) >= 3
     assert 2.0 < np.median(squared) < 12.0
 
@@ -204,7 +207,8 @@ def test_flicker_is_stated_beyond_what_was_found():
         estimator.solve(stamps(500), parent, child, tuning=replace(TUNING, unseen_share=share))
         for share in (TUNING.unseen_share, 0.0)
     )
-    longer = np.sqrt(np.diag(stated.cov_parent_child_in_child - found.cov_parent_child_in_child))
+    longer = stated.cov_parent_child_in_child - found.cov_parent_child_in_child
+    longer = np.sqrt(np.diag(longer)[:3])
     assert (longer > 0.2e-3).all()
     assert (longer < 4e-3).all()
 
@@ -354,16 +358,17 @@ def mixture(number):
     return PosePairs(drive.parent.stamps_ns, *streams), drive.T_parent_child
 
 
-@pytest.mark.parametrize("number", [0, 2])
-def test_a_drift_that_a_mount_askew_nearly_explains_is_found(number):
+def test_a_drift_that_a_mount_askew_nearly_explains_is_found():
     # With a drift along all axes the standard deviations of X would grow to 5.8 and 3.3 times those
     # without.
-    poses, truth = mixture(number)
-    solution = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c)
-    assert "bias" in solution.systematic
-    covariance = assess_adaptive(poses, solution).cov_parent_child_in_child
-    xi = se3.log(se3.inverse(solution.T_parent_child) @ truth)
-    assert xi @ np.linalg.solve(covariance, xi) < 16.8  # chi-square (6), once in a hundred
+    found = []
+    for poses, truth in map(mixture, range(6)):
+        solution = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c)
+        found.append("bias" in solution.systematic)
+        covariance = assess_adaptive(poses, solution).cov_parent_child_in_child
+        xi = se3.log(se3.inverse(solution.T_parent_child) @ truth)
+        assert xi @ np.linalg.solve(covariance, xi) < 16.8  # chi-square (6), once in a hundred
+    assert sum(found) >= 5
 
 
 def test_on_a_road_no_bias_is_assumed_that_a_mount_askew_looks_like():
