@@ -7,7 +7,8 @@ curvature is the average of observed and expected information (Gilmour, Thompson
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,8 +18,7 @@ from hand_eye_calib.gls.state_space import WHITE, Markov, Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
 
 
-@dataclass(frozen=True)
-class Prior:
+class Prior(NamedTuple):
     """What is known of the log levels beforehand: means, precisions and bounds, (m,) each."""
 
     mean: FloatArray
@@ -31,15 +31,29 @@ class Prior:
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
 
-def fit(space: StateSpace, start: FloatArray, prior: Prior) -> tuple[Posterior, FloatArray]:
+# The space, levels and prior of what matters, if not all of it does.
+Rest: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
+
+
+def fit(
+    space: StateSpace,
+    start: FloatArray,
+    prior: Prior,
+    smaller: Callable[[FloatArray, FloatArray], Rest] | None = None,
+) -> tuple[Posterior, FloatArray]:
     """The posterior at the levels of the least loss near a start, by Newton steps within a radius;
-    and the average information (m, m).
+    and the average information (m, m). What ``smaller`` leaves out on the way stays out.
     """
     levels = np.clip(start, prior.lower, prior.upper)
     posterior, radius = Posterior(space, levels), TUNING.first_radius
     loss = posterior.loss + prior.loss(levels)
     for _ in range(TUNING.max_steps):
         gradient, information = derivatives(posterior)
+        if smaller and (rest := smaller(levels, information)):
+            space, levels, prior = rest
+            posterior = Posterior(space, levels)
+            loss = posterior.loss + prior.loss(levels)
+            gradient, information = derivatives(posterior)
         gradient = gradient + prior.precision * (levels - prior.mean)
         curvature = information + np.diag(prior.precision + TUNING.least_curvature)
         gain = 0.0
@@ -99,11 +113,7 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     moments *= space.weights[:, None, None]
     excess = precision - precision @ moments @ precision
     excess[space.weights == 0.0] = 0.0
-    total = excess.sum(axis=0)
-    traces = [
-        float((total * basis[0]).sum() if len(basis) == 1 else (excess * basis).sum())
-        for basis in space.white
-    ]
+    traces = [float((excess * basis).sum()) for basis in space.white]
     along = (excess @ space.twists[:, :, None])[:, :, 0]
     traces.append(float((along * space.twists).sum()))
     moments = walk_covariance(posterior) + walk @ transposed(walk)
@@ -137,9 +147,8 @@ def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) 
     ahead += np.einsum("nij,nij->n", own[1:], own[:-1])
     innovations = here[1:] - 2.0 * phi * ahead + phi**2 * here[:-1]
     size, variance = own.shape[1], process.variance
-    by_variance = 0.5 * (
-        size * len(here) - (here[0] + float((innovations / rest).sum())) / variance
-    )
+    total = here[0] + float((innovations / rest).sum())
+    by_variance = 0.5 * (size * len(here) - total / variance)
     by_phi = (phi * innovations / rest**2 - (ahead - phi * here[:-1]) / rest) / variance
     by_phi -= size * phi / rest
     return np.array([by_variance, float((by_phi * process.slope).sum())])

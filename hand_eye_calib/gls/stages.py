@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 
@@ -297,17 +298,18 @@ def outliers(problem: Problem, fit: Fit) -> Fit:
 
 
 def _outliers_found(problem: Problem, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
-    """Jumps and outlier poses in turn, until none changes; jumps alone where tails have weights."""
+    """Jumps and outlier poses in turn, until few change; jumps alone where tails have weights."""
     for _ in range(rounds):
         if problem.is_noisy(fit):
             posterior = problem.posterior(fit)
             fit = fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
         of_walk, of_white = innovations(problem.posterior(fit), fit.outliers.spikes)
         found = judged(fit.outliers, of_walk, of_white, with_spikes)
-        if not found.differs_by(fit.outliers):
+        if change := found.differs_by(fit.outliers):
+            poses = bridged(problem.streams, fit.T, found.spikes)
+            fit = replace(fit, outliers=found, poses=poses, error=np.zeros_like(fit.error))
+        if change <= TUNING.negligible:
             break
-        poses = bridged(problem.streams, fit.T, found.spikes)
-        fit = replace(fit, outliers=found, poses=poses, error=np.zeros_like(fit.error))
     if with_spikes:
         normal = of_white[~fit.outliers.spikes]
         is_heavy = np.mean(normal**2) > TUNING.heavy_kurtosis * np.mean(normal) ** 2
@@ -337,15 +339,27 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible))
     levels[3:5] = np.maximum(levels[3:5], total + np.log(tuning.audible_walk))
     model, levels = fit.model.with_lasting(LASTING, levels)
-    found, information = reml.fit(problem.space(fit, kept, model), levels, model.prior(levels))
+    prior, faint = model.prior(levels), levels - tuning.faded
+
+    def smaller(levels: FloatArray, information: FloatArray) -> reml.Rest:
+        """Without the processes that make no difference, of those below the faint levels."""
+        nonlocal model, prior, faint
+        matters = np.diag(information)[N_FAST::2] > tuning.least_information
+        matters |= (levels >= faint)[N_FAST::2]
+        if matters.all():
+            return None
+        left = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
+        model = replace(model, slow=tuple(compress(model.slow, matters)))
+        faint, prior = faint[left], reml.Prior(*np.array(prior)[:, left])
+        return problem.space(fit, kept, model), levels[left], prior
+
+    found, information = reml.fit(problem.space(fit, kept, model), levels, prior, smaller)
     before = Posterior(problem.space(fit, kept), fit.levels)
     if before.loss - found.loss < tuning.least_gain:
         return fit
-    # Without the processes that make no difference.
-    matters = np.diag(information)[N_FAST::2] > tuning.least_information
-    slow = tuple(each for each, is_kept in zip(model.slow, matters, strict=True) if is_kept)
-    left = found.levels[np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]]
-    return replace(fit, model=replace(model, slow=slow), levels=left)
+    faint = np.full(len(found.levels), np.inf)
+    rest = smaller(found.levels, information)
+    return replace(fit, model=model, levels=rest[1] if rest else found.levels)
 
 
 def systematic(problem: Problem, fit: Fit) -> Fit:

@@ -208,10 +208,8 @@ class Posterior:
         for process, size in zip(self.markov, space.sizes, strict=True):
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
             prior -= size * of_one
-        of_walk = (
-            kept.sum() * np.linalg.slogdet(self.walk_covariance)[1]
-            + 6 * np.log(space.relative[kept]).sum()
-        )
+        of_walk = 6 * np.log(space.relative[kept]).sum()
+        of_walk += kept.sum() * np.linalg.slogdet(self.walk_covariance)[1]
         self.log_determinant = float(of_walk + self.factor.log_determinant - prior)
         weighed, self.whitened = self.halves(space.columns)
         products = multiplied(space.columns, weighed) - multiplied(self.whitened, self.whitened)

@@ -110,6 +110,8 @@ class Tuning:
     # more. One whose level the data say less about than this makes no difference.
     least_gain: float = 4.0
     least_information: float = 0.3
+    # The search goes on without such a one once its level has fallen by so much.
+    faded: float = 0.2
     # Time constants are between an interval and this share of the recording.
     longest_share: float = 0.25
     # The search begins at this share of the white and walking noise, below which no white noise is
