@@ -191,7 +191,7 @@ def _view(state: NodeState, silent_s: float) -> View:
         bars, by_hand = tuple(_bar(axis, state) for axis in AXES), at.progress.limiting_axis * asks
         view = replace(view, bars=bars, by_hand=by_hand)
     shown = () if is_old else buttons
-    return replace(view, facts=_facts(state), result=tuple(_result(state)), buttons=shown)
+    return replace(view, facts=_facts(state, is_old), result=tuple(_result(state)), buttons=shown)
 
 
 def _result_of(state: NodeState) -> ResultState | None:
@@ -277,20 +277,21 @@ def _sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
-def _facts(state: NodeState) -> str:
-    """How far and how long the sensors have moved, and how old the result is."""
+def _facts(state: NodeState, is_old: bool) -> str:
+    """How far and how long the sensors have moved, and how old the result is, if that is known."""
     seen = state.extrinsic
     if seen is None or not seen.n_poses:
         return ""
     told = [f"{seen.path_m:,.0f} m", f"{duration(seen.motion_s)} of motion"]
-    if seen.result and not state.has_ended:
+    if seen.result and not is_old:
         told.append(f"result {duration(seen.result.age_s)} old")
     return ", ".join(told)
 
 
 def _ago(mount: MountState) -> str:
     if not mount.since_ns or not mount.newest_ns:
-        return f"{duration(mount.seconds_of_motion)} of motion seen"
+        seconds = mount.seconds_of_motion
+        return f"{duration(seconds)} of motion seen" if seconds else ""
     return f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
 
 
@@ -311,6 +312,8 @@ def _bar(axis: str, state: NodeState) -> Bar:
     against = f"± {sigma} of {wanted}"
     if not math.isfinite(known.sigma):
         tone, word, against = Tone.UNKNOWN, "not seen yet", f"wanted: {wanted}"
+    elif at.progress.is_faulty:
+        tone, word = Tone.UNKNOWN, "of faulty streams"
     elif known.seconds_left == 0:
         tone, word = Tone.GOOD, "enough"
     elif known.sigma <= known.target:
@@ -383,6 +386,7 @@ def _result(state: NodeState) -> Iterator[Line]:
         yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
-        yield Line(_TONES[broadcast], "on /tf_static", text)
+        tone = Tone.ACT if state.has_ended else _TONES[broadcast]
+        yield Line(tone, "on /tf_static", "nothing: the node has ended" if state.has_ended else text)
     if state.saved is not None:
         yield Line(Tone.GOOD, "saved", f"{_where(state.saved)}: {state.saved.text}")

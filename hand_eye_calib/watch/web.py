@@ -24,7 +24,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.live.state import REPORT_PERIOD_S
-from hand_eye_calib.text import AXIS_UNITS
+from hand_eye_calib.text import AXIS_UNITS, capital
 from hand_eye_calib.watch.board import Bar, Board, Line, Tone, View
 
 # Requests of the page, beside that of an axis measured by hand.
@@ -256,7 +256,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         "</div>",
     )
     said, _, advice = view.sentence.partition("; ")
-    told = (("advice", advice), ("facts", view.facts))
+    told = (("advice", capital(advice)), ("facts", view.facts))
     more = [f'<p class="{name}">{escape(text)}</p>' for name, text in told if text]
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '

@@ -219,9 +219,13 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         assert view_of(state(comparison=other)).result[2].tone is tone
     for broadcast, tone in ((Broadcast.ON, Tone.GOOD), (Broadcast.REFUSED, Tone.ACT)):
         extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
-        line = view_of(state(extrinsic=extrinsic)).result[2]
-        assert (line.tone, line.name) == (tone, "on /tf_static")
-        assert line.text == f"{broadcast.value}: why"
+        for has_ended, told in ((False, tone), (True, Tone.ACT)):  # who comes later hears nothing
+            line = view_of(replace(state(extrinsic=extrinsic), has_ended=has_ended)).result[2]
+            assert (line.tone, line.name) == (told, "on /tf_static")
+            assert ("nothing" in line.text, f"{broadcast.value}: why" == line.text) == (
+                has_ended,
+                not has_ended,
+            )
 
 
 def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
@@ -248,6 +252,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert "precision" not in fragment(view)
     assert "moved by 1 deg" in drawn(view, 80)
     assert "s solve" not in drawn(view, 80)
+    assert '<p class="advice">Check it, then' in fragment(view)
     assert view_of(mount(level=Level.WARN)).watched[0].text == "not known yet"
 
 
