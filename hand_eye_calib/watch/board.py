@@ -386,7 +386,9 @@ def _result(state: NodeState) -> Iterator[Line]:
         yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
-        tone = Tone.ACT if state.has_ended else _TONES[broadcast]
-        yield Line(tone, "on /tf_static", "nothing: the node has ended" if state.has_ended else text)
+        tone = _TONES[broadcast]
+        if state.has_ended:
+            tone, text = Tone.ACT, "nothing: the node has ended"
+        yield Line(tone, "on /tf_static", text)
     if state.saved is not None:
         yield Line(Tone.GOOD, "saved", f"{_where(state.saved)}: {state.saved.text}")
