@@ -290,8 +290,7 @@ def _facts(state: NodeState, is_old: bool) -> str:
 
 def _ago(mount: MountState) -> str:
     if not mount.since_ns or not mount.newest_ns:
-        seconds = mount.seconds_of_motion
-        return f"{duration(seconds)} of motion seen" if seconds else ""
+        return f"{duration(mount.seconds_of_motion)} of motion seen"
     return f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
 
 
@@ -386,9 +385,8 @@ def _result(state: NodeState) -> Iterator[Line]:
         yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
-        tone = _TONES[broadcast]
-        if state.has_ended:
-            tone, text = Tone.ACT, "nothing: the node has ended"
+        told = (Tone.ACT, "nothing: the node has ended") if state.has_ended else None
+        tone, text = told or (_TONES[broadcast], text)
         yield Line(tone, "on /tf_static", text)
     if state.saved is not None:
         yield Line(Tone.GOOD, "saved", f"{_where(state.saved)}: {state.saved.text}")
