@@ -212,7 +212,6 @@ _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child
 _PLAIN = _ALL_WAYS[0]
 
 
-_INVERSE = [Hypothesis(child=("inverse",)), Hypothesis(parent=("inverse",))]
 # Those that invert both streams besides fit as well, over longer paths.
 _USUAL = [
     *(each for each in _ALL_WAYS[1:] if ("inverse", "both") not in each.mistakes),
@@ -255,8 +254,9 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         except NotEnoughDataError as error:
             too_few = error
             continue
-        # Streams that nearly agree may still be of an arm, one with inverse poses.
-        rivals = _INVERSE if plain.holds else _USUAL
+        # Streams that nearly agree may still be of an arm, one with inverse poses, or of a vehicle
+        # on nearly flat ground, one with quaternions in another order.
+        rivals = [each for each in _USUAL if len(each.mistakes) == 1 or not plain.holds]
         chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
         if chosen is plain and not plain.holds:
             # A body that rotates about one of its sensors: that one's translations are noise.

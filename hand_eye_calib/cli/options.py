@@ -67,9 +67,12 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
 _OF_FILES = (*FILE_OPTIONS, "pair_by")
 _OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for name in _OF_FILES)}
 
-# Names in backticks; and names that are no words of the language, such as max_gap and prior.z,
-# wherever they stand, but not in a path, after dashes or in quotes.
-_NAMES = re.compile(r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._][a-z_]+)+)(?![\w/=-]|\.\w)( VALUE)?")
+# Names in backticks; and names that are no words of the language, such as max_gap and prior.z, or
+# stand before a value, wherever they stand, but not in a path, after dashes or in quotes.
+_NAMES = re.compile(
+    r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._][a-z_]+)+|scale(?= (?:none|auto|estimate\b|\d)))"
+    r"(?![\w/=-]|\.\w)( VALUE)?"
+)
 
 
 # ------------------------------------------------------------ what commands print
