@@ -254,8 +254,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         except NotEnoughDataError as error:
             too_few = error
             continue
-        # Streams that nearly agree may still be of an arm, one with inverse poses, or of a vehicle
-        # on nearly flat ground, one with quaternions in another order.
+        # Streams that nearly agree may have one mistake: an arm's, or one on nearly flat ground.
         rivals = [each for each in _USUAL if len(each.mistakes) == 1 or not plain.holds]
         chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
         if chosen is plain and not plain.holds:

@@ -81,7 +81,6 @@ def _trend(result: Calibration, number: int) -> Drawn:
         if np.isfinite(band):
             panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
         for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
-            # One line with gaps: a path for each bar would be most of the page.
             ends = np.stack([values - sigmas, values + sigmas, np.full(len(at), np.nan)], axis=1)
             panel.plot(np.repeat(at[group], 3), ends[group].ravel(), color=colour, lw=0.8)
             panel.plot(at[group], values[group], fmt, color=colour, ms=3.2)

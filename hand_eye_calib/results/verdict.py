@@ -250,7 +250,6 @@ def _few_inliers(result: Result) -> Iterator[_Found]:
         yield text, "find out why the odometry jumps, and record again", (), {}
 
 
-# What helps against the floor.
 _OF_FLOOR = (
     "set the target that you need; if a stream has no such errors, such as motion capture, give "
     "parent_kind or child_kind exact"

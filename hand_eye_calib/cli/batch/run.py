@@ -147,9 +147,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _vehicles(done: Sequence[Outcome], directory: Path | None) -> dict[str, Calibration]:
-    """What the recordings of each vehicle say together; what an earlier run said in the directory,
-    if the results of all of them are the same.
-    """
+    """What the recordings of each vehicle say together, or said in an earlier run, if the same."""
     groups: dict[str, list[Outcome]] = {}
     for one in done:
         if one.row["vehicle"] and one.row["verdict"]:
