@@ -18,7 +18,8 @@ from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import messages, sources
 from hand_eye_calib.io.bags.messages import PoseTable, Run
-from hand_eye_calib.io.bags.sources import Reading, Source, is_static
+from hand_eye_calib.io.bags.scans import TUNING
+from hand_eye_calib.io.bags.sources import Reading, Source
 from hand_eye_calib.io.bags.storage import open_bags
 from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.target_images import Target, camera_of, read_camera
@@ -124,6 +125,11 @@ class PoseBag:
                 raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
             return usual if wanted == "auto" else wanted
         return messages.measured_as(self._type_of(source), wanted, source)
+
+    def apart_s(self, chosen: Iterable[Source]) -> float:
+        """The time (s) between poses whose errors are of their own: those of scans are alike."""
+        apart_s = min(TUNING.apart_s, self.duration_s / TUNING.least_poses)
+        return apart_s * (messages.POINTS_TYPE in map(self._type_of, chosen))
 
     def check(self, source: Source) -> None:
         """Raise InputError, with the topics that are there, for a topic without poses, and for
@@ -286,7 +292,7 @@ class PoseBag:
         """
         tree, notes = FrameTree("the bag's transforms"), {}
         for run in self._runs(self._of_transforms()):
-            is_fixed = is_static(run.kind.topic)
+            is_fixed = run.kind.topic.endswith("tf_static")
             for _, (_, parent, frame, *values) in run.transforms():
                 try:
                     pose = checked_pose(*values) if is_fixed else None

@@ -276,7 +276,7 @@ class TransformReading(Reading):
     """
 
     def __init__(self, stream: str, source: TfStream, topics: Collection[str]) -> None:
-        super().__init__(stream, *(topic for topic in topics if not is_static(topic)))
+        super().__init__(stream, *(topic for topic in topics if not topic.endswith("tf_static")))
         self._source = source
         self._found: list[tuple[Any, ...]] = []
 
@@ -293,8 +293,3 @@ class TransformReading(Reading):
         moving = {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
         poses = se3.to_rows(self._source.composed(moving))
         return messages.PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
-
-
-def is_static(topic: str) -> bool:
-    """Whether the transforms of a topic are static."""
-    return topic.endswith("tf_static")

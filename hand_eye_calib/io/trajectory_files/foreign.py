@@ -124,10 +124,8 @@ def _of_rtklib(data: bytes, _: str | None) -> _Rows:
     for line in _lines(data):
         cells = line.replace(",", " ").split()
         if cells and not cells[0].startswith("%"):
-            if "/" in cells[0]:
-                stamp = f"{cells[0].replace('/', '-')}T{cells[1]}Z"
-            else:
-                stamp = _of_week(*cells[:2])
+            day = cells[0].replace("/", "-")
+            stamp = f"{day}T{cells[1]}Z" if "-" in day else _of_week(*cells[:2])
             rows.append((stamp, *cells[2:5]))
     return _PLACE, rows, () if re.search(rb"(?m)^%\s+(UTC|JST)\b", data) else [_GPS_TIME]
 

@@ -450,8 +450,7 @@ def _completed(
         if len(cells) == len(names):
             names = [" ".join(each) for each in zip(names, cells, strict=True)]
         number, cells = below, next((_cells(line) for _, line in lines), [""])
-    of_first, found = (named_columns(each or ())[0] for each in ((names or ())[:1], names))
-    if names and not {"t", "header", "secs", *of_first} & found.keys():
+    if names and not {"t", "secs", *named_columns(names[:1])[0]} & named_columns(names)[0].keys():
         names = ["t", *names[1:]] if re.fullmatch(r"\d{10,}(\.\d*)?", cells[0]) else names
     return names, number
 
