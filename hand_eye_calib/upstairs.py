@@ -1,5 +1,5 @@
-"""Functions of rooms above, for the few methods of results that save, draw or read: found by name
-when they are called, so that nothing below imports what lies above.
+"""Functions of rooms above. The few methods of a result that save, draw or read find them by name
+when they are called, so that no room imports one above it.
 """
 
 from importlib import import_module

@@ -43,8 +43,8 @@ def _with(**numbers: object) -> dict[str, Any]:
 VARIANTS: dict[str, dict[str, Any]] = {
     "outliers": {"without": ("outliers", "tails")},
     "heavy tails": {"without": ("tails",)},
-    "errors that last": {"without": ("lasting",)},
-    "turning about a world's origin": _with(decisive_centre=0.0),
+    "time-correlated errors": {"without": ("lasting",)},
+    "rotation about a world's origin": _with(decisive_centre=0.0),
     "systematic errors": {"systematic": ()},
     "bias": {"systematic": ("scale", "time")},
     "scale": {"systematic": ("bias", "time")},

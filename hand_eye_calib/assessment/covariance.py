@@ -5,8 +5,7 @@ Two estimates are made. In each direction the larger one holds:
 - The model's. The adaptive estimator has its own; for other methods it is that of motion pairs with
   independent, equally large errors, propagated through the cost to first order.
 - The delete-a-block jackknife: the spread of the answers without each tenth of the recording. It
-  assumes no noise model and includes errors that last for many pairs, such as drift, which the
-  model misses.
+  assumes no noise model and includes time-correlated errors, such as drift, which the model misses.
 
 Beside the covariance stands the common-mode floor: errors that are the same in every part of a
 recording. A camera whose intrinsics are slightly wrong, or a lidar map that is stretched, gives an

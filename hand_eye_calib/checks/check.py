@@ -300,7 +300,7 @@ def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
 
 
 def unseen(axes: Sequence[str]) -> Finding:
-    """The note that a motion does not show these axes."""
+    """The note that these axes cannot be determined from a motion."""
     options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
     it = "it" if len(axes) == 1 else "them"
     return finding("one_axis", options=options, axes=axes_in_words(axes), it=it)

@@ -71,8 +71,8 @@ _ROWS = {
     ),
     "lengths": _Row(
         "the parent moves at {speed_m_s:.0f} m/s and changes its velocity by "
-        "{acceleration_m_s2:.0f} m/s within a second, as no vehicle does: its lengths can hardly "
-        "be in metres",
+        "{acceleration_m_s2:.0f} m/s within a second, which no vehicle does: its lengths are "
+        "probably not in metres",
         "give the lengths of both streams in metres, those of a file also by the unit in its "
         "header, such as x_mm; if they are millimetres, solve with",
         "such as lengths in millimetres",
@@ -80,9 +80,9 @@ _ROWS = {
     # ------------------------------------------------------------------ of both together
     "unrelated": _Row(
         "{text}",
-        "check that both sensors are on one rigid body, that the streams are those of the sensors, "
-        "of the same recording and in known units, the clocks (time_offset estimate), and of a "
-        "file with angles whether they are of yaw or heading (clockwise from north)",
+        "check that both sensors are on one rigid body, and that both streams are of one recording "
+        "and in known units; if the clocks differ, have the offset estimated (time_offset "
+        "estimate); in a file, call angles that are clockwise from north heading, not yaw",
     ),
     "no_turning": _Row(
         "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
@@ -131,8 +131,8 @@ _ROWS = {
         "the column heading if they are clockwise from north, otherwise yaw",
     ),
     "ambiguous": _Row(
-        "this motion does not tell that from {whose} positions in other axes, (x, y, z) for "
-        "({detail}), which gives another rotation",
+        "this motion fits another explanation as well: {whose} positions are in other axes, "
+        "(x, y, z) for ({detail}). That gives another rotation",
         "look at the result, or rotate about other axes, too (a vehicle: over slopes or kerbs)",
         severity=_WARNING,
     ),
@@ -152,7 +152,7 @@ _ROWS = {
         "add {total_s} s in all to the child's stamps, or have it estimated",
     ),
     "large_time_offset": _Row(
-        "the child's clock is {size_s:.2f} s {direction} the parent's, which nobody has said",
+        "the child's clock is {size_s:.2f} s {direction} the parent's, and no offset was given",
         "check that both streams are of one vehicle; if the clocks differ so much, give "
         "time_offset {total_s} or estimate",
         "a clock of another time scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a "
@@ -177,7 +177,7 @@ _ROWS = {
         severity=_NOTE,
     ),
     "same_frame": _Row(
-        "both streams are of one and the same frame: the extrinsic is the identity, to {size}",
+        "both streams are of the same frame: the extrinsic is the identity within {size}",
         "give the stream of the child sensor itself",
         "such as two topics of one odometry, or odometry of the robot's base that was derived from "
         "the other sensor",
@@ -196,15 +196,15 @@ _ROWS = {
         "a gyroscope or wheel base with a wrong scale, in either stream",
     ),
     "turns": _Row(
-        "the child rotates {times:.2g} times as far as the parent, whenever it does",
-        "correct its orientations: a quaternion has half the angle, angles in a file the unit that "
-        "the header names, such as yaw_deg",
+        "every rotation of the child is {times:.2g} times that of the parent",
+        "correct its orientations: x, y, z of a quaternion are for half the angle; angles in a "
+        "file need their unit in the header, such as yaw_deg",
         "radians read as degrees, or half or twice the angles",
         code="rotation_gain",
     ),
     "late": _Row(
-        "{whose} {part} are {delay_s:.3f} +/- {sigma_s:.3f} s late against its {others}: at this "
-        "speed a shift of {shift_m:.2g} m",
+        "{whose} {part} are {delay_s:.3f} +/- {sigma_s:.3f} s later than its {others}: at this "
+        "speed they are off by {shift_m:.2g} m",
         "use poses from one source, before any filter",
         "positions, or heights of a barometer, from another source or filter than the rest, or "
         "another stream of another body, such as a trailer",
@@ -224,8 +224,8 @@ _ROWS = {
         "on the latitude",
     ),
     "smoothed": _Row(
-        "{whose} {part} are smoothed over about {smoothing_s:.2f} s, which the other's are not: "
-        "poses are displaced by about {shift_m:.2g} m, the translation by that or more",
+        "{whose} {part} are smoothed over about {smoothing_s:.2f} s, the other's are not: this "
+        "displaces poses by about {shift_m:.2g} m, and the translation by as much or more",
         "use the poses before that filter",
         "a low-pass or smoothing filter",
         code="smoothed_{part}",

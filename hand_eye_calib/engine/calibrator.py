@@ -59,9 +59,11 @@ class BufferLimits:
 
 @dataclass(kw_only=True)
 class StreamStatistics:
-    """What a stream has delivered in this session: poses taken; refused, as the stream had a pose
-    with that stamp, or as older ones than those were paired and dropped already; and dropped, as
-    the other stream had none at their time. The range of the stamps taken.
+    """What a stream has delivered in this session, in numbers of poses.
+
+    Taken; refused, because there was a pose with that stamp, or because later poses were paired and
+    dropped already; dropped, because the other stream had no poses at their times. And the range of
+    the stamps that were taken.
     """
 
     received: int = 0

@@ -3,8 +3,8 @@ assess, add the prior, judge; and compare with other answers to the same questio
 
 Those are from other references and from parts of the recording: their scatter about a result is
 compared with what their covariances allow. Other references show what the noise model misses, such
-as errors that last longer than it assumes; both halves of the recording what changes during it.
-Neither shows an error that is constant.
+as errors with longer correlation times than it assumes. Both halves of the recording show what
+changes during it. Neither shows an error that is constant.
 """
 
 import contextlib

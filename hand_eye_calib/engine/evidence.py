@@ -54,9 +54,9 @@ class Evidence:
     Attributes
     ----------
     times_s, parent, child : (N,), (N, 3), (N, 3) arrays
-        Times, s, and paths, m, of the parent sensor in its world, or of the sensor that has
-        positions alone in that of its positions: its own, and from the poses of the other one
-        through the result.
+        Times, s, and two paths, m, of one sensor: as its own stream has it, and from the other
+        stream through the result. It is the parent, in its world; or the sensor that has positions
+        alone, in theirs.
     excitation : Excitation
         How the sensors moved.
     streams : StreamView

@@ -64,8 +64,8 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         solution = of_positions.solve(stamps_ns, poses, positions, with_scale)
     except np.linalg.LinAlgError:
         raise InputError(
-            "no lever arm explains the positions: they may jump, or be of another body; look at "
-            "both paths"
+            "no lever arm fits these positions: they jump, or belong to another body; compare both "
+            "paths"
         ) from None
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
@@ -186,7 +186,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
 def _rotation(
     stamps_ns: IntArray, Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, has_rates: bool
 ) -> tuple[adaptive_estimator.AdaptiveSolution, FloatArray]:
-    """The solution, and the child's poses freed of the bias of the rates.
+    """The solution, and the child's poses without the bias of the rates.
 
     The noise is fitted to increments of up to some seconds. What a bias does to these is linear
     only for what is left of it after a first solve.

@@ -179,8 +179,8 @@ def _of_sensors(
         found = [each for each in found if each[0]]
     if len(found) != 1:
         raise InputError(
-            "has several extrinsics, and none or several of them are named "
-            f"{' or '.join(sorted(frames))}; leave the one that is meant"
+            "it has several extrinsics, and the names of the frames do not say which is meant "
+            f"({' or '.join(sorted(frames))}); delete the others"
         )
     return found[0]
 

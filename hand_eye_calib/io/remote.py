@@ -42,11 +42,12 @@ def expanded(pattern: str) -> list[str]:
 
 @contextmanager
 def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
-    """Paths of the same bags on this machine, and what puts the URLs back into plain values that
-    name the copies; what is remote is copied for as long as the block lasts. Errors raised in the
-    block name the URLs. An InputError if a store cannot be reached, there is no bag, or it would
-    fill more than half of the disk; a MissingDependencyError if what a store needs is not
-    installed.
+    """Copy remote bags to this machine for as long as the block lasts.
+
+    Yields the paths on this machine, and a function that puts the URLs back into plain values that
+    name the copies; errors that are raised in the block name the URLs. An InputError if a store
+    cannot be reached, there is no bag, or it would fill more than half of the disk; a
+    MissingDependencyError if a package that the store needs is not installed.
     """
     if not any(map(is_url, paths)):
         yield [*paths], lambda value: value

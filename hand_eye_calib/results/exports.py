@@ -147,7 +147,7 @@ def export_text(result: Result, name: str, headline: str, is_usable: bool) -> st
     if not is_certain:
         roles = zip((target, source), layout[:2], strict=True)
         said = ", ".join(f"{frame} is the {role}" for frame, role in roles if role)
-        lines.append(f"Assumed, as the names of the frames do not say it: {said}.")
+        lines.append(f"Assumed, because the names of the frames do not say it: {said}.")
     if layout.axes_said:
         lines.append(layout.axes_said % {"target": target, "source": source})
     lines = [printable(" ".join(line.split())) for line in lines]

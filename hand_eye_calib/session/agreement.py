@@ -43,7 +43,7 @@ _SAID = {
     "single": "One recording: nothing to compare with",
     "agree": "{all} agree within their standard deviations",
     "differ": "{both} differ; one more recording shows which is off",
-    "scatter": "{all} scatter {excess} times as much as those of one rig do; none stands out",
+    "scatter": "{all} scatter {excess} times more than those of one rig do; none stands out",
     "one off": "{first} differs from the others: {moves}",
     "moved": "The mount has moved before {first}: {moves}",
 }

@@ -44,7 +44,8 @@ class Goal:
     Parameters
     ----------
     targets : (6,) array-like
-        Of x, y, z (m), roll, pitch and yaw (rad): standard deviation wanted, times 1 / 0.7.
+        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad); the goal is 0.7 of
+        each.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
-"""Several recordings: of one rig, for one result together, or of many, for a row each. And has the
-mount moved? A result against what is installed, or the results of several recordings.
+"""Several recordings: one extrinsic from those of one rig, and a row of a table for each of many.
+Comparison: of a result with what is installed, or of results with each other.
 """
 
 import math
@@ -213,7 +213,7 @@ def require_same_frames(results: Iterable[Calibration]) -> None:
 
 
 def _says_nothing(result: Calibration) -> bool:
-    """Whether a recording says nothing of the mount."""
+    """Whether a result is DO NOT USE for more than axes that are unknown."""
     never = {each.rule for each in result.reasons if each.verdict is Verdict.DO_NOT_USE}
     return bool(never - {"nothing_known"})
 
@@ -324,7 +324,7 @@ def _who_moved(
     names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
     """The results without which the others agree, if there are such, and a sentence."""
-    # Two differ, so that less evidence says which.
+    # That two differ is known: less evidence is enough to say which.
     found = agreement_of_results(results, level=0.05)
     if found.kind in ("one off", "moved"):
         return tuple(names[index] for index in found.apart), f"moved: {found.sentence(names)}"

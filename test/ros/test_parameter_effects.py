@@ -13,20 +13,10 @@ from functools import partial
 
 import numpy as np
 import pytest
+import ros_harness
 import yaml
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from ros_harness import (
-    PATIENCE_S,
-    RELIABLE_INPUTS,
-    T_PARENT_CHILD,
-    NodeProcess,
-    Peer,
-    drive,
-    free_domain,
-    message,
-    values_of,
-)
 from source_code import ROOT
 
 import hand_eye_calib as hec
@@ -36,7 +26,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.journal import has_session
 from hand_eye_calib.option import option_name
 
-QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
+QUIET = ["-p solve_period:=1000.0", *ros_harness.RELIABLE_INPUTS]
 LAX = {"threshold": 1e-9}
 STREAMS = ("parent", "child")
 T_PARENT_REAR = se3.exp(np.array([-1.0, 0.1, 0.3, 0.2, 0.1, 2.5]))
@@ -74,12 +64,12 @@ def fed(tmp_path_factory):
     """A peer of a node that has a noisy drive, the child 30 ms after the parent; and the answer
     with everything at its default but B5.
     """
-    domain = free_domain()
-    node = NodeProcess(
+    domain = ros_harness.free_domain()
+    node = ros_harness.NodeProcess(
         domain, tmp_path_factory.mktemp("effects") / "node.log", [*QUIET, "-p reference:=B5"]
     )
-    peer = Peer(domain)
-    stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
+    peer = ros_harness.Peer(domain)
+    stamps_ns, Ts_pw_p, Ts_cw_c = ros_harness.drive(200)
     noise = se3.exp(np.random.default_rng(0).normal(size=(2, 200, 6)) * np.repeat([0.01, 0.003], 3))
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
@@ -92,7 +82,7 @@ def fed(tmp_path_factory):
     ):
         for stamp_ns, T_world_sensor in zip(stamps_ns.tolist(), Ts, strict=True):
             publisher.publish(
-                message(publisher.msg_type, stamp_ns + late_ns, T_world_sensor, frame)
+                ros_harness.message(publisher.msg_type, stamp_ns + late_ns, T_world_sensor, frame)
             )
     peer.spin_until(lambda: "199 poses" in peer.trigger("solve").message, "all poses in the result")
     yield peer
@@ -120,7 +110,7 @@ def test_a_change_while_the_node_runs_changes_the_answer_and_back(fed, name):
 
 def frame_is_used(start_node, peer, tmp_path, stream, text):
     start_node(*QUIET, f"-p {stream}_frame:=chosen")
-    assert text in peer.solve(peer.publishers(), *drive())[0].message
+    assert text in peer.solve(peer.publishers(), *ros_harness.drive())[0].message
 
 
 def type_is_used(start_node, peer, tmp_path, stream):
@@ -133,13 +123,13 @@ def type_is_used(start_node, peer, tmp_path, stream):
 
 def measures_is_used(start_node, peer, tmp_path, stream):
     start_node(*QUIET, f"-p {stream}_measures:=rotations")
-    assert peer.solve(peer.publishers(), *drive())[1].transform.translation.x == 0.0
+    assert peer.solve(peer.publishers(), *ros_harness.drive())[1].transform.translation.x == 0.0
 
 
 def solve_period_is_used(start_node, peer, tmp_path):
     start_node(*QUIET)
     heard = peer.listen(TransformStamped, "extrinsic")
-    peer.feed(peer.publishers(), *drive())
+    peer.feed(peer.publishers(), *ros_harness.drive())
     assert peer.set_parameter("solve_period", 0.1).successful
     peer.spin_until(lambda: heard, "a result without being asked")
 
@@ -147,7 +137,7 @@ def solve_period_is_used(start_node, peer, tmp_path):
 def output_directory_is_used(start_node, peer, tmp_path):
     start_node(*QUIET)
     assert "output_directory" in peer.trigger("save").message
-    peer.solve(peer.publishers(), *drive())
+    peer.solve(peer.publishers(), *ros_harness.drive())
     assert not peer.trigger("save").success
     assert peer.set_parameter("output_directory", str(tmp_path / "out")).successful
     saved = peer.trigger("save")
@@ -169,21 +159,21 @@ def journal_is_used(start_node, peer, tmp_path):
 def others_are_solved_together(start_node, peer, tmp_path):
     """Saving solves for all sensors, without a report of the two as well."""
     node = start_node(
-        *RELIABLE_INPUTS,
+        *ros_harness.RELIABLE_INPUTS,
         "-p qos_overrides./child2_odom.subscription.reliability:=reliable",
         "-p other_children:=1",
         f"-p output_directory:={tmp_path / 'out'}",
     )
     rear = peer.publisher(Odometry, "child2_odom")
     peer.wait_matched(rear)
-    stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
+    stamps_ns, Ts_pw_p, Ts_cw_c = ros_harness.drive(200)
     for stamp_ns, T in zip(stamps_ns, Ts_pw_p @ T_PARENT_REAR, strict=True):
-        rear.publish(message(Odometry, stamp_ns, T, "rear"))
+        rear.publish(ros_harness.message(Odometry, stamp_ns, T, "rear"))
     node.wait_for_log("first pose on /child2_odom")
     peer.solve(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
     assert peer.trigger("save").message.endswith("rig/ follows")
     node.wait_for_log("rig/report.html\n", may_have_ended=True)
-    for name, T in (("camera", T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
+    for name, T in (("camera", ros_harness.T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
         found = hec.load(tmp_path / "out/rig" / name)
         np.testing.assert_allclose(found.T_parent_child, T, atol=1e-3)
     assert not (tmp_path / "out/report.html").exists()
@@ -193,7 +183,7 @@ def report_is_used(start_node, peer, tmp_path):
     """The report follows after the end of the node; a replay of the journal makes it again."""
     out = tmp_path / "out"
     node = start_node(*QUIET, "-p report:=true", f"-p output_directory:={out}", "-p scale:=none")
-    answer, _ = peer.solve(peer.publishers(), *drive())
+    answer, _ = peer.solve(peer.publishers(), *ros_harness.drive())
     assert answer.success
     code, _ = node.stop()
     assert code == 0
@@ -238,8 +228,10 @@ def tf_is_used(start_node, peer, tmp_path, name, value, topic):
 
 
 def installed_is_used(start_node, peer, tmp_path):
-    node = start_node("-p solve_period:=0.2", "-p installed:=1 2 3 0 0 0", *RELIABLE_INPUTS)
-    peer.feed(peer.publishers(), *drive())
+    node = start_node(
+        "-p solve_period:=0.2", "-p installed:=1 2 3 0 0 0", *ros_harness.RELIABLE_INPUTS
+    )
+    peer.feed(peer.publishers(), *ros_harness.drive())
     node.wait_for_log("installed is what 1 2 3 0 0 0 says")
 
 
@@ -247,15 +239,19 @@ def enabled_is_used(start_node, peer, tmp_path):
     node = start_node(*QUIET, "-p enabled:=false")
     node.wait_for_log("no poses are accepted before ~/set_enabled")
     statuses, inputs = peer.diagnostics(), ("parent", "child")
-    peer.feed(peer.publishers(), *drive(10))
+    peer.feed(peer.publishers(), *ros_harness.drive(10))
 
     def ignored():
-        values = [values_of(statuses[f"/calibrator: {name} input"]) for name in inputs if statuses]
+        values = [
+            ros_harness.values_of(statuses[f"/calibrator: {name} input"])
+            for name in inputs
+            if statuses
+        ]
         return [(each["messages"], each["poses_taken"]) for each in values] == [("10", "0")] * 2
 
     peer.spin_until(ignored, "messages that are not taken")
     assert peer.set_enabled(True).success
-    assert peer.solve(peer.publishers(), *drive())[0].success
+    assert peer.solve(peer.publishers(), *ros_harness.drive())[0].success
 
 
 def monitor_is_used(start_node, peer, tmp_path):
@@ -267,7 +263,7 @@ def monitor_is_used(start_node, peer, tmp_path):
     ]
     # Its page has a button that ends the watch, and calibrates anew.
     assert peer.set_parameter("monitor", False).successful
-    peer.solve(peer.publishers(), *drive(60))
+    peer.solve(peer.publishers(), *ros_harness.drive(60))
     peer.spin_until(lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration")
 
 
@@ -399,7 +395,7 @@ def start_launch(prefix, domain, tmp_path):
     try:
         for process, log in running:
             process.send_signal(signal.SIGINT)
-            code = process.wait(PATIENCE_S)
+            code = process.wait(ros_harness.PATIENCE_S)
             assert (code, "Traceback" in log.read_text()) == (0, False), log.read_text()
     finally:
         for process, _ in running:
@@ -439,7 +435,7 @@ TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child
 )
 def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, told):
     """The node is not started."""
-    options = dict(capture_output=True, text=True, timeout=PATIENCE_S)
+    options = dict(capture_output=True, text=True, timeout=ros_harness.PATIENCE_S)
     done = subprocess.run([*LAUNCHER, argument], env=environment(prefix), **options)
     assert done.returncode == 1
     assert told in done.stdout + done.stderr

@@ -10,15 +10,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import assess_adaptive
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.gls import estimator
-from hand_eye_calib.gls.increments import (
-    N_SYSTEMATIC,
-    PARAMETERS,
-    SYSTEMATIC,
-    Streams,
-    course_of,
-    linearise,
-)
+from hand_eye_calib.gls import estimator, increments
 from hand_eye_calib.gls.noise_model import CENTRES
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import PosePairs
@@ -38,7 +30,7 @@ VALUES = {
 
 def parameters_of(names):
     """Parameters of some systematic errors."""
-    return [index for name in names.split("+") for index in PARAMETERS.get(name, ())]
+    return [index for name in names.split("+") for index in increments.PARAMETERS.get(name, ())]
 
 
 def stamps(n_poses):
@@ -82,13 +74,13 @@ def with_noise(streams, seed):
 
 
 def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=None):
-    course = course_of(streams, T_PARENT_CHILD)
-    given = np.zeros(N_SYSTEMATIC) if parameters is None else parameters
-    return linearise(streams, course, T_parent_child, given)
+    course = increments.course_of(streams, T_PARENT_CHILD)
+    given = np.zeros(increments.N_SYSTEMATIC) if parameters is None else parameters
+    return increments.linearise(streams, course, T_parent_child, given)
 
 
 def streams_of(parent, child, interval_s=0.1):
-    return Streams(np.arange(len(parent)) * interval_s, parent, child)
+    return increments.Streams(np.arange(len(parent)) * interval_s, parent, child)
 
 
 def test_derivatives_are_the_numerical_ones():
@@ -96,8 +88,8 @@ def test_derivatives_are_the_numerical_ones():
     streams = streams_of(parent, child_of(parent))
     jacobian = linearised(streams).columns[3:-3, :, :-1]
     step = 1e-6
-    for column in range(6 + N_SYSTEMATIC):
-        change = np.zeros(6 + N_SYSTEMATIC)
+    for column in range(6 + increments.N_SYSTEMATIC):
+        change = np.zeros(6 + increments.N_SYSTEMATIC)
         change[column] = step
         ahead, behind = (
             linearised(
@@ -255,7 +247,8 @@ def test_a_lag_is_not_taken_for_a_lever():
         parent = wandering_poses(300, seed)
         noisy = with_noise((parent, late(child_of(parent), 0.02)), seed)
         answers = [
-            estimator.solve(stamps(300), *noisy, systematic=models) for models in ((), SYSTEMATIC)
+            estimator.solve(stamps(300), *noisy, systematic=models)
+            for models in ((), increments.SYSTEMATIC)
         ]
         assert answers[1].time_offset_s == pytest.approx(-0.02, abs=1e-3)
         said = " ".join(answers[1].describe(stamps(300)).in_words)
@@ -270,7 +263,7 @@ def test_on_flat_ground_no_sideways_slip_is_assumed():
     # It could not be told from a child that is mounted askew; forwards and upwards it can.
     streams = systematic(planar_poses(400), "bias", [0.0, 0.05, 0.0])
     solution = estimator.solve(stamps(400), *with_noise(streams, 1))
-    assert abs(solution.parameters[PARAMETERS["bias"][1]]) < 1e-3
+    assert abs(solution.parameters[increments.PARAMETERS["bias"][1]]) < 1e-3
 
 
 def test_poses_wrong_by_themselves_are_bridged():

@@ -2,32 +2,13 @@
 
 import dataclasses
 
+import motions
 import numpy as np
 import pytest
 import real_data
-from motions import (
-    T_PARENT_CHILD,
-    child_of,
-    disturbed,
-    noisy_pair,
-    planar_poses,
-    walked,
-    wandering_poses,
-    write_pair,
-)
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.covariance import (
-    FLOOR_ROTATION,
-    FLOOR_TRANSLATION,
-    assess,
-    common_mode_floor,
-    floor_of_pairs,
-    judged,
-    open_scale_floor,
-    usual_speed,
-    widened_by_halves,
-)
+from hand_eye_calib.assessment import covariance as uncertainty
 from hand_eye_calib.assessment.reference_selection import select_reference
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
@@ -49,21 +30,22 @@ DNL = Method("dnl")
 def solve_and_assess(parent, child, reference="B1", method=DNL):
     pairs = motion_pairs(parent, child, reference)
     solution = method.solve(pairs)
-    return solution, assess(
+    return solution, uncertainty.assess(
         pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
     )
 
 
 def errors_and_covariances(n_runs, estimate):
     """Errors xi against the truth (R, 6) and covariances (R, 6, 6) over independent noise."""
-    parent = wandering_poses(120)
-    child = child_of(parent)
+    parent = motions.wandering_poses(120)
+    child = motions.child_of(parent)
     errors, covariances = [], []
     for run in range(n_runs):
         solution, covariance = estimate(
-            disturbed(parent, 2 * run, 0.005, 0.005), disturbed(child, 2 * run + 1, 0.005, 0.005)
+            motions.disturbed(parent, 2 * run, 0.005, 0.005),
+            motions.disturbed(child, 2 * run + 1, 0.005, 0.005),
         )
-        errors.append(se3.log(se3.inverse(solution.T_parent_child) @ T_PARENT_CHILD))
+        errors.append(se3.log(se3.inverse(solution.T_parent_child) @ motions.T_PARENT_CHILD))
         covariances.append(covariance)
     return np.array(errors), np.array(covariances)
 
@@ -84,11 +66,11 @@ def test_the_stated_sigma_is_the_scatter_that_is_found():
 def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_right(kind):
     ratios = []
     for run in range(12):
-        parent = wandering_poses(150, seed=run)
+        parent = motions.wandering_poses(150, seed=run)
         child = (
-            disturbed(child_of(parent), run, 0.005, 0.005)
+            motions.disturbed(motions.child_of(parent), run, 0.005, 0.005)
             if kind == "white"
-            else drifting(child_of(parent), run)
+            else drifting(motions.child_of(parent), run)
         )
         stamps_ns = np.arange(len(parent)) * 100_000_000
         solution = estimator.solve(stamps_ns, parent, child, systematic=())
@@ -104,7 +86,7 @@ def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_
 def drifting(poses, seed):
     steps = se3.inverse(poses[:-1]) @ poses[1:]
     steps = steps @ se3.exp(np.random.default_rng(seed).normal(0.0, 0.003, (len(steps), 6)))
-    return walked(steps, poses[0])
+    return motions.walked(steps, poses[0])
 
 
 @pytest.mark.parametrize(
@@ -119,7 +101,7 @@ def drifting(poses, seed):
     ],
 )
 def test_an_axis_is_judged_by_its_standard_deviation(axis, sigma, verdict):
-    judgement = judged(axis, sigma)
+    judgement = uncertainty.judged(axis, sigma)
     assert (judgement.name, judgement.verdict) == (axis, verdict)
     assert judgement.sigma == (np.inf if verdict is DofVerdict.UNOBSERVABLE else sigma)
 
@@ -128,7 +110,7 @@ def test_an_axis_is_judged_by_its_standard_deviation(axis, sigma, verdict):
 
 
 def streams(scale=1.0):
-    parent, child = noisy_pair(wandering_poses(120), 1, 1e-4, 1e-4)
+    parent, child = motions.noisy_pair(motions.wandering_poses(120), 1, 1e-4, 1e-4)
     return parent, child.scaled(scale)
 
 
@@ -141,9 +123,9 @@ class TestFloor:
             answers.append(Method("dnl").solve(pairs))
         pairs = motion_pairs(parent.poses, child.poses, "B5")
         T = answers[0].T_parent_child
-        floor = floor_of_pairs(pairs, answers[0].weights, T, 0.0)
+        floor = uncertainty.floor_of_pairs(pairs, answers[0].weights, T, 0.0)
         by_scale = se3.log(se3.inverse(T) @ answers[1].T_parent_child)
-        of_scale = floor - common_mode_floor()
+        of_scale = floor - uncertainty.common_mode_floor()
         direction = by_scale / np.linalg.norm(by_scale)
         assert direction @ of_scale @ direction > 0.99 * np.trace(of_scale)
         # These poses know the scale far better than one per cent.
@@ -151,26 +133,26 @@ class TestFloor:
 
     def test_the_scale_is_as_open_as_the_data_leave_it(self):
         by_scale = np.r_[2.0, np.zeros(5)]
-        fixed = common_mode_floor()
-        np.testing.assert_allclose(np.diag(fixed)[:3], FLOOR_TRANSLATION**2)
-        np.testing.assert_allclose(np.diag(fixed)[3:], FLOOR_ROTATION**2)
+        fixed = uncertainty.common_mode_floor()
+        np.testing.assert_allclose(np.diag(fixed)[:3], uncertainty.FLOOR_TRANSLATION**2)
+        np.testing.assert_allclose(np.diag(fixed)[3:], uncertainty.FLOOR_ROTATION**2)
         for variance, expected in ((1e6, 0.02), (0.01**2, 0.02 / np.sqrt(2)), (0.0, 0.0)):
-            found = open_scale_floor(by_scale, variance)
+            found = uncertainty.open_scale_floor(by_scale, variance)
             assert np.sqrt(found[0, 0]) == pytest.approx(expected, rel=1e-3)
 
     def test_what_is_far_away_moves_the_centre_of_a_fast_odometry(self):
-        found = np.sqrt(np.diag(common_mode_floor(speed_m_s=2.4)))
+        found = np.sqrt(np.diag(uncertainty.common_mode_floor(speed_m_s=2.4)))
         np.testing.assert_allclose(found[:3], 0.013)
         fast = hec.calibrate(*(each.scaled(20.0) for each in streams()))
-        assert fast.sigmas_of_floor[:3].min() > 2 * FLOOR_TRANSLATION
+        assert fast.sigmas_of_floor[:3].min() > 2 * uncertainty.FLOOR_TRANSLATION
 
     def test_neither_stops_nor_jumps_count_for_the_usual_speed(self):
         stamps_ns = np.arange(600) * 100_000_000
         x = 0.2 * np.clip(np.arange(600) - 300, 0, None)  # half of the time at rest, then 2 m/s
         x[500:] += 40.0
         positions = np.column_stack([x, 0.0 * x, 0.0 * x])
-        assert usual_speed(stamps_ns, positions) == pytest.approx(2.0)
-        assert usual_speed(stamps_ns, 0.0 * positions) == 0.0
+        assert uncertainty.usual_speed(stamps_ns, positions) == pytest.approx(2.0)
+        assert uncertainty.usual_speed(stamps_ns, 0.0 * positions) == 0.0
 
     def test_exact_poses_have_none(self):
         both = hec.calibrate(*streams(), parent_kind="exact", child_kind="exact")
@@ -181,9 +163,11 @@ class TestFloor:
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
         result = hec.calibrate(*streams(), method=method)
-        np.testing.assert_allclose(result.sigmas_of_floor[3:], FLOOR_ROTATION, rtol=1e-3)
-        assert 0.999 * FLOOR_TRANSLATION < result.sigmas_of_floor[:3].max() < 0.01
-        assert result.sigmas[3:].max() < FLOOR_ROTATION
+        np.testing.assert_allclose(
+            result.sigmas_of_floor[3:], uncertainty.FLOOR_ROTATION, rtol=1e-3
+        )
+        assert 0.999 * uncertainty.FLOOR_TRANSLATION < result.sigmas_of_floor[:3].max() < 0.01
+        assert result.sigmas[3:].max() < uncertainty.FLOOR_ROTATION
         np.testing.assert_allclose(
             result.sigmas_with_floor**2, result.sigmas**2 + result.sigmas_of_floor**2
         )
@@ -206,12 +190,12 @@ class TestHalves:
         return found
 
     def test_the_direction_of_their_difference_is_widened(self):
-        wide = widened_by_halves(self.whole, self.products(9.0), misfit=1.0)
+        wide = uncertainty.widened_by_halves(self.whole, self.products(9.0), misfit=1.0)
         assert wide[0, 0] / 0.5 == pytest.approx(9.0**2 / 2 / 10.64)
         np.testing.assert_allclose(wide[1:, 1:], self.whole[1:, 1:])
 
     def test_the_misfit_belongs_to_their_covariance(self):
-        kept = widened_by_halves(self.whole, self.products(9.0), misfit=5.0)
+        kept = uncertainty.widened_by_halves(self.whole, self.products(9.0), misfit=5.0)
         np.testing.assert_array_equal(kept, self.whole)
 
 
@@ -219,7 +203,7 @@ class TestHalves:
 
 
 def noisy_streams(n_poses=150):
-    return noisy_pair(wandering_poses(n_poses), 1, 0.002, 0.002)
+    return motions.noisy_pair(motions.wandering_poses(n_poses), 1, 0.002, 0.002)
 
 
 class TestWhichAnswerStands:
@@ -296,7 +280,7 @@ MOUNT = se3.from_rotation_translation(
 
 
 def flat_drive(noise=0.001, mount=MOUNT):
-    return noisy_pair(planar_poses(400), 1, noise, noise, mount=mount)
+    return motions.noisy_pair(motions.planar_poses(400), 1, noise, noise, mount=mount)
 
 
 def sigmas(result):
@@ -371,7 +355,7 @@ class TestFlatGround:
 @pytest.fixture(scope="module")
 def wandering():
     """Two streams of full motion, and their calibration without a prior."""
-    streams = noisy_pair(wandering_poses(300), 1, 0.01, 0.005, mount=MOUNT)
+    streams = motions.noisy_pair(motions.wandering_poses(300), 1, 0.01, 0.005, mount=MOUNT)
     return streams, calibrate(*streams, reference="B10")
 
 
@@ -411,7 +395,7 @@ def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
 
 
 def test_the_command_refuses_a_contradiction(tmp_path, capsys):
-    paths = write_pair(tmp_path, *flat_drive())
+    paths = motions.write_pair(tmp_path, *flat_drive())
     frames = ["--parent-frame", "lidar", "--child-frame", "camera"]
     command = ["calibrate", *paths, *frames, "--reference", "B10", "--out", str(tmp_path / "out")]
     assert main([*command, "--prior", "x=100+/-1e-9"]) == 1

@@ -13,19 +13,10 @@ import re
 import subprocess
 import sys
 
+import bag_making
 import numpy as np
 import pytest
 from backports import zstd
-from bag_making import (
-    ODOMETRY,
-    POSE_STAMPED,
-    STORAGES,
-    all_poses,
-    bag_path,
-    poses_of,
-    storage_file,
-    write_compressed,
-)
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
@@ -45,8 +36,11 @@ MOST_MIB = 1000
 PLACES = 100
 POSES = wandering_poses(60)
 STREAMS = {
-    "/a": (as_trajectory(POSES, sensor_frame="lidar", world_frame="map"), ODOMETRY),
-    "/b": (as_trajectory(child_of(POSES), sensor_frame="camera", world_frame="odom"), POSE_STAMPED),
+    "/a": (as_trajectory(POSES, sensor_frame="lidar", world_frame="map"), bag_making.ODOMETRY),
+    "/b": (
+        as_trajectory(child_of(POSES), sensor_frame="camera", world_frame="odom"),
+        bag_making.POSE_STAMPED,
+    ),
 }
 TOPICS = ["--parent-topic", "/a", "--child-topic", "/b"]
 # Largest error of an entry of T_parent_child that may go unnoticed.
@@ -61,12 +55,12 @@ def _nothing_hangs():
     faulthandler.cancel_dump_traceback_later()
 
 
-@pytest.fixture(params=STORAGES)
+@pytest.fixture(params=bag_making.STORAGES)
 def bag(request, tmp_path):
     """Bytes of a bag's file, and where to put damaged ones."""
-    path = bag_path(tmp_path, request.param)
+    path = bag_making.bag_path(tmp_path, request.param)
     write_bag(path, STREAMS, request.param)
-    file = storage_file(path)
+    file = bag_making.storage_file(path)
     return file.read_bytes(), tmp_path / f"damaged{file.suffix}"
 
 
@@ -74,7 +68,7 @@ def read(path):
     """Poses and warnings, or None and the one line of an error."""
     try:
         with PoseBag(path) as bag:
-            poses = poses_of(bag, *bag.select())
+            poses = bag_making.poses_of(bag, *bag.select())
             found = poses, bag.warnings
     except InputError as error:
         found = None, [str(error)]
@@ -150,18 +144,18 @@ def test_a_bit_flipped_anywhere(bag, capsys):
 
 STAMPS_NS = 1_000 + 100_000_007 * np.arange(4000)
 LONG = Trajectory(STAMPS_NS, se3.exp(np.random.default_rng(1).normal(size=(4000, 6))))
-LONG = dict.fromkeys(STREAMS, (LONG, ODOMETRY))
+LONG = dict.fromkeys(STREAMS, (LONG, bag_making.ODOMETRY))
 
 
 @pytest.mark.parametrize("kind", ["mcap", "zstd"])
 def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
     """The recorder lost power: no index, the last chunk incomplete, no metadata.yaml."""
-    path = bag_path(tmp_path, kind)
+    path = bag_making.bag_path(tmp_path, kind)
     if kind == "zstd":
-        write_compressed(path, LONG)
+        bag_making.write_compressed(path, LONG)
     else:
         write_bag(path, LONG, kind)
-    whole, file = all_poses(path), storage_file(path)
+    whole, file = bag_making.all_poses(path), bag_making.storage_file(path)
     (path / "metadata.yaml").unlink()
     size = file.stat().st_size
     for share in (0.9, 0.5, 0.3, 0.04):  # the last in the first chunk
@@ -175,8 +169,8 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
 
 
 def test_a_damaged_chunk_is_refused(tmp_path):
-    path = write_compressed(tmp_path / "bag", LONG)
-    file = storage_file(path)
+    path = bag_making.write_compressed(tmp_path / "bag", LONG)
+    file = bag_making.storage_file(path)
     data = bytearray(file.read_bytes())
     data[100_000:100_100] = bytes(100)  # in the second of six chunks
     file.write_bytes(data)
@@ -197,7 +191,7 @@ def test_a_damaged_chunk_is_refused(tmp_path):
 def test_mcap_files_without_parts_of_an_index_are_whole(tmp_path, options):
     write_bag(tmp_path / "bag", STREAMS)
     with (
-        storage_file(tmp_path / "bag").open("rb") as whole,
+        bag_making.storage_file(tmp_path / "bag").open("rb") as whole,
         (tmp_path / "a.mcap").open("wb") as new,
     ):
         writer = Writer(new, **options)
@@ -210,15 +204,15 @@ def test_mcap_files_without_parts_of_an_index_are_whole(tmp_path, options):
             times = message.log_time, message.publish_time
             writer.add_message(ids[channel.id], times[0], message.data, times[1])
         writer.finish()
-    assert read(tmp_path / "a.mcap") == (all_poses(tmp_path / "bag"), [])
+    assert read(tmp_path / "a.mcap") == (bag_making.all_poses(tmp_path / "bag"), [])
 
 
 def test_without_the_library_mcap_whole_files_are_read(tmp_path, monkeypatch):
     write_bag(tmp_path / "bag", STREAMS)
-    whole = all_poses(tmp_path / "bag")
+    whole = bag_making.all_poses(tmp_path / "bag")
     monkeypatch.setattr(storage, "find_spec", lambda _: None)
-    assert all_poses(tmp_path / "bag") == whole
-    file = storage_file(tmp_path / "bag")
+    assert bag_making.all_poses(tmp_path / "bag") == whole
+    file = bag_making.storage_file(tmp_path / "bag")
     os.truncate(file, file.stat().st_size // 2)
     with pytest.raises(InputError, match="cut off.*'pip install mcap'"):
         PoseBag(tmp_path / "bag")
@@ -255,14 +249,14 @@ def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, dat
     with_message(tmp_path / "bag", "sqlite3", data)
     message = "/a: a message is not a readable nav_msgs/msg/Odometry .*expected plain CDR"
     with pytest.raises(InputError, match=message):
-        all_poses(tmp_path / "bag")
+        bag_making.all_poses(tmp_path / "bag")
 
 
 @pytest.mark.parametrize("name", ["run#1.db3", "run%41.db3", "what?.db3", "a?mode=rw&b.db3"])
 def test_a_path_is_not_read_as_an_address(tmp_path, name):
     write_bag(tmp_path / "bag", STREAMS, "sqlite3")
-    storage_file(tmp_path / "bag").rename(tmp_path / name)
-    assert len(all_poses(tmp_path / name)) == 120
+    bag_making.storage_file(tmp_path / "bag").rename(tmp_path / name)
+    assert len(bag_making.all_poses(tmp_path / name)) == 120
 
 
 # ---- bags made to do harm
@@ -303,7 +297,7 @@ def rosbag1_bomb(path):
     return path
 
 
-@pytest.mark.parametrize("kind", STORAGES)
+@pytest.mark.parametrize("kind", bag_making.STORAGES)
 def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, kind):
     is_ros1 = kind == "rosbag1"
     path = rosbag1_bomb(tmp_path) if is_ros1 else with_message(tmp_path / "bag", kind, BOMB)

@@ -333,7 +333,7 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
         ((_, message),) = stamped_messages(JAZZY.types, one, ODOMETRY, is_ros1=False)
         messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
     path = write_messages(tmp_path / "bag", messages)
-    with pytest.warns(UserWarning, match="/a: 1 stamps jump away and back against the bag's own"):
+    with pytest.warns(UserWarning, match="/a: 1 poses were left out: their stamps jump away from"):
         found = hec.read_trajectory(path, topic="/a")
     rest = np.arange(120) != 30
     assert_same_motion(found, PARENT.stamps_ns[rest], PARENT.poses[rest])

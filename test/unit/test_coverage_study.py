@@ -14,16 +14,9 @@ from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
 from reproduction import clean_recordings, faults
 from reproduction.coverage import __main__ as study
-from reproduction.coverage import classes, motions
+from reproduction.coverage import classes, motions, sensor_errors
 from reproduction.coverage.bound import ideal_estimate
 from reproduction.coverage.scores import misclosure, truth_cases
-from reproduction.coverage.sensor_errors import (
-    GaussMarkov,
-    SensorErrors,
-    Tail,
-    mixture_information,
-    sigmas,
-)
 from reproduction.fault_cases import LATER
 from reproduction.recordings import CYCLE, Truth, real_rigs
 
@@ -32,13 +25,14 @@ SMALL = classes.RecordingClass(
     motion=motions.hand_held,
     duration_s=12.0,
     rate_hz=10.0,
-    parent=SensorErrors(
-        white=sigmas(0.0005, 0.02), slow=(GaussMarkov(2.0, sigmas(0.002, 0.05), in_world=True),)
+    parent=sensor_errors.SensorErrors(
+        white=sensor_errors.sigmas(0.0005, 0.02),
+        slow=(sensor_errors.GaussMarkov(2.0, sensor_errors.sigmas(0.002, 0.05), in_world=True),),
     ),
-    child=SensorErrors(
-        white=sigmas(0.0005, 0.02),
-        walk=sigmas(0.001, 0.02),
-        slow=(GaussMarkov(0.5, sigmas(0.001, 0.05)),),
+    child=sensor_errors.SensorErrors(
+        white=sensor_errors.sigmas(0.0005, 0.02),
+        walk=sensor_errors.sigmas(0.001, 0.02),
+        slow=(sensor_errors.GaussMarkov(0.5, sensor_errors.sigmas(0.001, 0.05)),),
         scale=(0.01, 5.0),
     ),
 )
@@ -71,11 +65,11 @@ def test_ideal_weighted_estimator_scatters_by_the_bound():
 
 
 def test_information_of_heavy_tails():
-    assert mixture_information(0.0, 10.0) == pytest.approx(1.0, abs=1e-6)
+    assert sensor_errors.mixture_information(0.0, 10.0) == pytest.approx(1.0, abs=1e-6)
     # Spikes far out are seen for what they are, and lost.
-    assert mixture_information(0.1, 100.0) == pytest.approx(0.9, abs=0.01)
-    assert Tail("student", factor=1e6).information() == pytest.approx(1.0, abs=1e-5)
-    tail, rng = Tail("student", factor=3.0), np.random.default_rng(0)
+    assert sensor_errors.mixture_information(0.1, 100.0) == pytest.approx(0.9, abs=0.01)
+    assert sensor_errors.Tail("student", factor=1e6).information() == pytest.approx(1.0, abs=1e-5)
+    tail, rng = sensor_errors.Tail("student", factor=3.0), np.random.default_rng(0)
     draws = np.array(tail.draw(rng, 20_000, 0.1))
     x = draws.reshape(-1, 1) * rng.standard_normal((20_000, 6))
     scores = 9.0 * x[:, 0] / (3.0 + np.sum(x**2, axis=1))
@@ -86,7 +80,7 @@ def test_recordings_of_a_class_repeat_and_differ():
     first, again, other = (classes.make("hand_white", seed) for seed in (1, 1, 2))
     assert np.array_equal(first.child.poses, again.child.poses)
     assert not np.allclose(first.T_parent_child, other.T_parent_child)
-    none = SensorErrors(white=sigmas(1e-9, 1e-9))
+    none = sensor_errors.SensorErrors(white=sensor_errors.sigmas(1e-9, 1e-9))
     exact = dataclasses.replace(SMALL, parent=none, child=none)
     recording = classes.simulate(exact, 0)
     X, parent, child = recording.T_parent_child, recording.parent.poses, recording.child.poses

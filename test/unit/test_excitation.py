@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, noisy_pair, planar_poses, wandering_poses
 
-from hand_eye_calib.assessment.excitation import (
-    LeverArms,
-    excitation,
-    helpful_motion,
-    what_is_missing,
-)
+from hand_eye_calib.assessment import excitation
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.geometry import se3
@@ -20,7 +15,7 @@ from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 
 
 def seen_in(poses):
-    return excitation(PosePairs(np.arange(len(poses)), poses, child_of(poses)))
+    return excitation.excitation(PosePairs(np.arange(len(poses)), poses, child_of(poses)))
 
 
 def turning(amplitudes_rad, n_poses=300):
@@ -55,7 +50,7 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
 
 @pytest.mark.parametrize("n_poses", [0, 1, 20])
 def test_standing_still_is_said(n_poses):
-    text = what_is_missing(seen_in(np.repeat(np.eye(4)[None], n_poses, axis=0)))
+    text = excitation.what_is_missing(seen_in(np.repeat(np.eye(4)[None], n_poses, axis=0)))
     assert text == (
         "x, y and z cannot be determined from the motion so far: move in curves, to both sides"
     )
@@ -63,21 +58,23 @@ def test_standing_still_is_said(n_poses):
 
 def test_nothing_is_missing_after_turns_about_all_axes():
     poses = wandering_poses(200)
-    assert what_is_missing(seen_in(poses)) == ""
+    assert excitation.what_is_missing(seen_in(poses)) == ""
     result = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
-    assert what_is_missing(seen_in(poses), result) == ""
+    assert excitation.what_is_missing(seen_in(poses), result) == ""
     weak = dataclasses.replace(
         result,
         observability=(DofObservability("x", DofVerdict.WEAK, 0.08), *result.observability[1:]),
     )
-    assert what_is_missing(seen_in(poses), weak).startswith("x still uncertain after the motion")
+    assert excitation.what_is_missing(seen_in(poses), weak).startswith(
+        "x still uncertain after the motion"
+    )
 
 
 def test_the_verdicts_of_a_result_win():
     poses = wandering_poses(200)
     result = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
-    text = what_is_missing(
+    text = excitation.what_is_missing(
         seen_in(poses),
         dataclasses.replace(result, observability=(*result.observability[:5], hidden)),
     )
@@ -93,19 +90,19 @@ def test_an_arm_is_not_told_to_drive():
     path = np.stack([np.sin(2 * s), np.cos(3 * s), np.sin(5 * s + 1)], axis=1)
     seen = seen_in(se3.from_rotation_translation(se3.rotation_exp(turns), path))
     assert not seen.drives
-    assert what_is_missing(seen) == (
+    assert excitation.what_is_missing(seen) == (
         "z cannot be determined from the motion so far: tilt the sensors about x and y, or measure "
         "it by hand"
     )
-    assert helpful_motion(["x"], seen) == "rotations about y help most"
+    assert excitation.helpful_motion(["x"], seen) == "rotations about y help most"
     still = seen_in(se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path))
-    assert what_is_missing(still).endswith("rotate the sensors, about all axes")
+    assert excitation.what_is_missing(still).endswith("rotate the sensors, about all axes")
 
 
 def test_a_vehicle_is_told_to_drive_over_a_ramp():
     seen = seen_in(planar_poses(300))
     assert seen.drives
-    assert what_is_missing(seen) == (
+    assert excitation.what_is_missing(seen) == (
         "z cannot be determined from the motion so far: tilt the sensors over a ramp or a kerb, or "
         "measure it by hand"
     )
@@ -125,9 +122,9 @@ def about_z_and_x(share, n=200):
 
 
 def test_the_axis_of_all_rotations_is_hidden():
-    assert LeverArms.of(chords(about_z_and_x(0.0))).hidden_axes() == ("z",)
-    assert LeverArms.of(chords(about_z_and_x(0.02))).hidden_axes() == ("z",)
-    assert LeverArms.of(chords(about_z_and_x(0.3))).hidden_axes() == ()
+    assert excitation.LeverArms.of(chords(about_z_and_x(0.0))).hidden_axes() == ("z",)
+    assert excitation.LeverArms.of(chords(about_z_and_x(0.02))).hidden_axes() == ("z",)
+    assert excitation.LeverArms.of(chords(about_z_and_x(0.3))).hidden_axes() == ()
 
 
 @pytest.mark.parametrize(("pitch_rad", "hidden"), [(0.0, True), (0.004, True), (0.15, False)])
@@ -143,7 +140,7 @@ def test_verdict_finding_and_hint_agree(pitch_rad, hidden):
     parent, child = noisy_pair(poses, 1, 1e-4, 1e-5)
     result = calibrate(parent, child, reference="B10")
     codes = [finding.code for finding in check_streams(parent, child).findings]
-    seen = excitation(PosePairs(parent.stamps_ns, parent.poses, child.poses))
+    seen = excitation.excitation(PosePairs(parent.stamps_ns, parent.poses, child.poses))
     assert ("z" in result.unobservable()) is hidden
     assert ("one_axis" in codes) is hidden
     assert ("z" in seen.hidden_axes()) is hidden

@@ -7,16 +7,9 @@ import time
 import tracemalloc
 import xml.dom.minidom
 
+import motions
 import pytest
 import yaml
-from motions import (
-    as_trajectory,
-    child_of,
-    disturbed,
-    read_trajectory_file,
-    wandering_poses,
-    write_pair,
-)
 from result_making import calibration
 
 from hand_eye_calib.cli.batch.run import stored
@@ -25,9 +18,10 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.results import load_result, save_result
 from hand_eye_calib.io.trajectory_files.table import write_trajectory
 
-PARENT = as_trajectory(wandering_poses(30), sensor_frame="lidar")
-CHILD = as_trajectory(
-    disturbed(child_of(wandering_poses(30)), 1, 1e-3, 1e-3), sensor_frame="camera"
+PARENT = motions.as_trajectory(motions.wandering_poses(30), sensor_frame="lidar")
+CHILD = motions.as_trajectory(
+    motions.disturbed(motions.child_of(motions.wandering_poses(30)), 1, 1e-3, 1e-3),
+    sensor_frame="camera",
 )
 
 
@@ -149,16 +143,16 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
     os.mkfifo(path)
     for format in ("tum", "csv", "euroc"):
         with pytest.raises(InputError, match="is not a regular file") as caught:
-            read_trajectory_file(path, format)
+            motions.read_trajectory_file(path, format)
         one_line(caught)
     with pytest.raises(InputError, match="is not a regular file"):
         load_result(path)
 
 
 def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix(tmp_path):
-    write_trajectory(tmp_path / "poses.tum", as_trajectory(wandering_poses(5_000)))
+    write_trajectory(tmp_path / "poses.tum", motions.as_trajectory(motions.wandering_poses(5_000)))
     tracemalloc.start()
-    reading = read_trajectory_file(tmp_path / "poses.tum")
+    reading = motions.read_trajectory_file(tmp_path / "poses.tum")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(reading.trajectory) == 5_000
@@ -170,7 +164,7 @@ def test_a_file_of_line_ends_is_refused_at_once(tmp_path):
     path.write_bytes(b"\n" * 10_000_000)
     began = time.process_time()
     with pytest.raises(InputError, match="no poses in it"):
-        read_trajectory_file(path, "auto")
+        motions.read_trajectory_file(path, "auto")
     assert time.process_time() - began < 0.7  # 0.15; 1.4 line by line
 
 
@@ -185,7 +179,7 @@ def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
     ):
         path.write_text(text)
         with pytest.raises(InputError) as caught:
-            read_trajectory_file(path, "csv")
+            motions.read_trajectory_file(path, "csv")
         one_line(caught)
 
 
@@ -211,7 +205,7 @@ def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     times.write_text("\n".join(map(str, range(1, 9))))
     options = {"times": times} if format == "kitti" else {}
     with pytest.raises(InputError, match=f"parent, line {3 + (format == 'csv')}: ") as caught:
-        read_trajectory_file(path, format, **options)
+        motions.read_trajectory_file(path, format, **options)
     one_line(caught)
 
 
@@ -221,7 +215,7 @@ def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
 @pytest.fixture
 def calibrate(run, tmp_path):
     """Runs calibrate into the folder ``out``."""
-    files = write_pair(tmp_path, PARENT, CHILD)
+    files = motions.write_pair(tmp_path, PARENT, CHILD)
     (tmp_path / "out").mkdir()
     return lambda: run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0]
 

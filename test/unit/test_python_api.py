@@ -5,19 +5,10 @@ import inspect
 from types import SimpleNamespace
 from typing import Literal
 
+import motions
 import numpy as np
 import pytest
 import result_making
-from motions import (
-    T_PARENT_CHILD,
-    as_trajectory,
-    child_of,
-    disturbed,
-    noisy_pair,
-    planar_poses,
-    smooth_poses,
-    wandering_poses,
-)
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import BACKENDS, METHODS, CalibratorConfig
@@ -33,8 +24,8 @@ PRIOR_FIELDS = {f"prior_{axis}" for axis in AXIS_UNITS}
 
 
 def streams(n_poses=40):
-    poses = wandering_poses(n_poses)
-    return as_trajectory(poses), as_trajectory(child_of(poses))
+    poses = motions.wandering_poses(n_poses)
+    return motions.as_trajectory(poses), motions.as_trajectory(motions.child_of(poses))
 
 
 class TestOptionsOfCalibrate:
@@ -165,7 +156,7 @@ class TestResiduals:
         crosses = (residuals.start_ns < parent.stamps_ns[40]) & (
             residuals.end_ns >= parent.stamps_ns[40]
         )
-        error_m = np.linalg.norm((result.T_parent_child - T_PARENT_CHILD)[:3, 3])
+        error_m = np.linalg.norm((result.T_parent_child - motions.T_PARENT_CHILD)[:3, 3])
         assert METHODS[name].rejects_outliers == (error_m < 1e-4)
         assert METHODS[name].rejects_outliers == (result.n_inliers < result.n_pairs)
         if METHODS[name].rejects_outliers:
@@ -177,9 +168,11 @@ class TestResiduals:
 
     def test_those_of_the_adaptive_estimator_have_its_scale_and_time_offset(self):
         times_s = np.arange(400) / 20
-        parent = as_trajectory(disturbed(smooth_poses(times_s), 1, 1e-4, 1e-4), 20.0)
-        late = child_of(smooth_poses(times_s + 0.05))
-        child = as_trajectory(disturbed(late, 2, 1e-4, 1e-4), 20.0).scaled(0.95)
+        parent = motions.as_trajectory(
+            motions.disturbed(motions.smooth_poses(times_s), 1, 1e-4, 1e-4), 20.0
+        )
+        late = motions.child_of(motions.smooth_poses(times_s + 0.05))
+        child = motions.as_trajectory(motions.disturbed(late, 2, 1e-4, 1e-4), 20.0).scaled(0.95)
         exact = hec.calibrate(parent, child, method="adaptive", time_offset=0.05, scale=1 / 0.95)
         found = hec.calibrate(parent, child, method="adaptive")
         assert found.time_offset_s == pytest.approx(0.05, abs=1e-3)
@@ -197,8 +190,8 @@ class TestResiduals:
 class TestAnswerOfTheMethod:
     def test_it_has_the_objective_and_the_result_is_the_settled_one(self):
         """Flat ground does not reveal z: the method's answer has one, the result has about 0."""
-        poses = planar_poses(300)
-        parent, child = noisy_pair(poses, 1, 2e-3, 1e-3)
+        poses = motions.planar_poses(300)
+        parent, child = motions.noisy_pair(poses, 1, 2e-3, 1e-3)
         result = hec.calibrate(parent, child, method="dnl", reference="B10")
         assert result.unobservable() == ["z"]
         pairs = motion_pairs(parent.poses, child.poses, "B10")

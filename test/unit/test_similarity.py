@@ -4,18 +4,9 @@ deviations, and refused where the evidence is weak.
 
 import dataclasses
 
+import motions
 import numpy as np
 import pytest
-from motions import (
-    T_PARENT_CHILD,
-    as_trajectory,
-    child_of,
-    disturbed,
-    feed,
-    noisy_pair,
-    planar_poses,
-    wandering_poses,
-)
 
 from hand_eye_calib.alignment.similarity import estimate_scale
 from hand_eye_calib.alignment.time_offset import correlate_rates, estimate_time_offset
@@ -28,9 +19,9 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 
 
-def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=wandering_poses):
+def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=motions.wandering_poses):
     """Both at 10 Hz; the child's lengths must be multiplied by ``scale``."""
-    parent, child = noisy_pair(poses(n_poses, seed), seed + 1, noise, noise)
+    parent, child = motions.noisy_pair(poses(n_poses, seed), seed + 1, noise, noise)
     return parent, child.scaled(1 / scale)
 
 
@@ -39,7 +30,7 @@ def pose_pairs(parent, child):
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.3048, 1.0, 3.34, 1000.0])
-@pytest.mark.parametrize("poses", [wandering_poses, planar_poses])
+@pytest.mark.parametrize("poses", [motions.wandering_poses, motions.planar_poses])
 def test_noise_free_scale_is_exact(scale, poses):
     found = estimate_scale(pose_pairs(*streams(scale=scale, poses=poses)))
     assert found.scale == pytest.approx(scale, rel=1e-5)
@@ -71,7 +62,7 @@ def test_every_method_takes_it(method):
     result = calibrate(parent, child, method=method, reference="B10", scale="estimate")
     assert result.scale == pytest.approx(2.0, rel=0.005)
     assert 0 < result.scale_sigma < 0.01
-    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
+    np.testing.assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
 
 
 def test_auto_estimates_only_where_the_streams_call_for_it():
@@ -103,11 +94,11 @@ def test_a_scale_that_explains_nothing_is_refused():
 RATES_HZ = 20.0, 33.0
 
 
-def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=wandering_poses):
+def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=motions.wandering_poses):
     """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is
     the offset to find.
     """
-    truth = as_trajectory(wander(seconds * 10, seed), 10.0)
+    truth = motions.as_trajectory(wander(seconds * 10, seed), 10.0)
     start_ns, end_ns = (int(stamp) for stamp in truth.stamps_ns[[0, -1]])
 
     def sampled(rate_hz, first_ns):
@@ -115,11 +106,11 @@ def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=wander
         return stamps_ns, truth.at(stamps_ns)
 
     stamps_ns, poses = sampled(hz[0], start_ns)
-    parent = Trajectory(stamps_ns, disturbed(poses, seed + 1, noise, noise))
+    parent = Trajectory(stamps_ns, motions.disturbed(poses, seed + 1, noise, noise))
     stamps_ns, poses = sampled(hz[1], start_ns + 7_000_000)
-    child = Trajectory(stamps_ns, disturbed(child_of(poses), seed + 2, noise, noise)).shifted(
-        -shift_s
-    )
+    child = Trajectory(
+        stamps_ns, motions.disturbed(motions.child_of(poses), seed + 2, noise, noise)
+    ).shifted(-shift_s)
     return parent, child
 
 
@@ -135,7 +126,7 @@ def test_a_body_that_rotates_about_one_of_its_sensors():
     """No scale shows, and the offset does all the same."""
 
     def rotating(n_poses, seed):
-        poses = wandering_poses(n_poses, seed)
+        poses = motions.wandering_poses(n_poses, seed)
         poses[:, :3, 3] = 0.0
         return poses
 
@@ -184,7 +175,7 @@ class TestWeakEvidenceIsRefused:
     def test_motion_without_turns(self):
         poses = np.tile(np.eye(4), (300, 1, 1))
         poses[:, 0, 3] = np.linspace(0, 50, 300)
-        straight = as_trajectory(poses)
+        straight = motions.as_trajectory(poses)
         with pytest.raises(NotEnoughDataError, match="hardly rotate"):
             estimate_time_offset(straight, straight)
 
@@ -234,13 +225,13 @@ class TestInTheEngine:
         for part in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
                 first, last = (k * len(trajectory) // 8 for k in (part, part + 1))
-                feed(calibrator, stream, trajectory[first:last])
+                motions.feed(calibrator, stream, trajectory[first:last])
         snapshot = calibrator.snapshot()
         assert len(snapshot.kept) > 0
         assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
         result = snapshot.estimate()
         assert result.time_offset_s == snapshot.time_offset.seconds
-        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.02)
+        np.testing.assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
 
     def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self):
         calibrator = Calibrator(
@@ -249,7 +240,7 @@ class TestInTheEngine:
         for stream, trajectory in zip(
             ("parent", "child"), (drive(1)[0], drive(77)[1]), strict=True
         ):
-            feed(calibrator, stream, trajectory)
+            motions.feed(calibrator, stream, trajectory)
         assert calibrator.statistics("child").dropped_unpaired > 0
         with pytest.raises(NotEnoughDataError):
             calibrator.estimate()

@@ -14,15 +14,8 @@ from hand_eye_calib.cli import simulate as simulate_command
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.trajectory_files.reading import read_trajectory
 from hand_eye_calib.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.simulation import options
 from hand_eye_calib.simulation.drive import simulate_drive, surface
-from hand_eye_calib.simulation.options import (
-    HILLY_DRIVE,
-    MIXTURE,
-    PUBLISHED_DRIVE,
-    REALISTIC,
-    DriveConfig,
-    NoiseConfig,
-)
 
 # --- the drive ------------------------------------------------------------------------
 
@@ -44,7 +37,7 @@ def test_noise_free_sensors_move_as_one_body():
 
 def test_sensors_at_different_rates_are_on_one_body():
     config = dataclasses.replace(
-        DriveConfig(), parent_rate=200.0, child_rate=31.0, child_delay=0.0051, poses=400
+        options.DriveConfig(), parent_rate=200.0, child_rate=31.0, child_delay=0.0051, poses=400
     )
     drive = simulate_drive(1, config)
     inside = drive.child.stamps_ns <= drive.parent.stamps_ns[-1]
@@ -57,7 +50,9 @@ def test_sensors_at_different_rates_are_on_one_body():
 
 
 def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
-    config = dataclasses.replace(DriveConfig(), terrain_height=0.0, poses=2001, parent_rate=100.0)
+    config = dataclasses.replace(
+        options.DriveConfig(), terrain_height=0.0, poses=2001, parent_rate=100.0
+    )
     poses = simulate_drive(7, config).parent.poses
     yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
     yaw_rates = np.diff(yaw) * 100.0
@@ -93,7 +88,7 @@ def published_runs(folder, level):
 def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder):
     for parent, _ in published_runs(published_folder, "noise/noise_0.000000"):
         x, y = parent[:, 0, 3], parent[:, 1, 3]
-        z, slope_x, slope_y = surface(DriveConfig(), x, y)
+        z, slope_x, slope_y = surface(options.DriveConfig(), x, y)
         np.testing.assert_allclose(parent[:, 2, 3], z, atol=1e-12)
         normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -114,10 +109,10 @@ clean_drive = functools.cache(simulate_drive)
 @pytest.mark.parametrize(
     ("level", "config"),
     [
-        ("noise/noise_0.010000", NoiseConfig(gaussian=0.01)),
-        ("outliers/outliers_10", NoiseConfig(outliers=0.1)),
-        ("drift/drift_0.050000", NoiseConfig(drift=0.05)),
-        ("mixture", MIXTURE),
+        ("noise/noise_0.010000", options.NoiseConfig(gaussian=0.01)),
+        ("outliers/outliers_10", options.NoiseConfig(outliers=0.1)),
+        ("drift/drift_0.050000", options.NoiseConfig(drift=0.05)),
+        ("mixture", options.MIXTURE),
     ],
 )
 def test_noise_is_as_strong_as_published(published_folder, level, config):
@@ -148,7 +143,7 @@ def test_command_writes_the_published_layout(tmp_path, run):
     assert [path.name for path in folders] == ["run_01", "run_02", "run_03"]
     for number, folder in enumerate(folders):
         expected = simulate_drive(
-            (4, number), dataclasses.replace(PUBLISHED_DRIVE, poses=20), MIXTURE
+            (4, number), dataclasses.replace(options.PUBLISHED_DRIVE, poses=20), options.MIXTURE
         )
         for name, trajectory in (("T_S1_W1", expected.parent), ("T_S2_W2", expected.child)):
             written = read_trajectory(folder / f"{name}.txt")
@@ -166,7 +161,9 @@ def test_command_writes_bags(tmp_path, run, storage, name):
 
     given = f"--drive hilly --poses 30 --bag {storage}".split()
     assert run("simulate", "--out", tmp_path / "sims", *given)[0] == 0
-    drive = simulate_drive((0, 0), dataclasses.replace(HILLY_DRIVE, poses=30), REALISTIC)
+    drive = simulate_drive(
+        (0, 0), dataclasses.replace(options.HILLY_DRIVE, poses=30), options.REALISTIC
+    )
     with PoseBag(tmp_path / "sims" / "run_01" / name) as bag:
         topics = simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC
         poses = bag.poses(*topics)

@@ -5,18 +5,10 @@ import functools
 import re
 import tracemalloc
 
+import motions
 import numpy as np
 import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
-from motions import (
-    as_trajectory,
-    child_of,
-    disturbed,
-    noisy_pair,
-    planar_poses,
-    wandering_poses,
-    write_pair,
-)
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, fit_similarity
 from hand_eye_calib.alignment.time_offset import estimate_time_offset
@@ -32,10 +24,10 @@ from hand_eye_calib.simulation.drive import simulate, simulate_drive
 from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 
 
-def drive(seed=0, noise=0.001, wander=wandering_poses, n_poses=500):
+def drive(seed=0, noise=0.001, wander=motions.wandering_poses, n_poses=500):
     """A walk far from the origin, so that it matters whose pose is in which frame."""
     start = se3.from_rotation_translation(np.eye(3), [30.0, -20.0, 2.0])
-    return noisy_pair(start @ wander(n_poses, seed), seed + 1, noise, noise)
+    return motions.noisy_pair(start @ wander(n_poses, seed), seed + 1, noise, noise)
 
 
 def grave(agreement):
@@ -47,13 +39,13 @@ def grave(agreement):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("wander", [wandering_poses, planar_poses])
+@pytest.mark.parametrize("wander", [motions.wandering_poses, motions.planar_poses])
 def test_no_false_alarm(seed, wander):
     agreement = check_streams(*drive(seed, wander=wander))
     assert grave(agreement) == []
 
 
-@pytest.mark.parametrize("wander", [wandering_poses, planar_poses])
+@pytest.mark.parametrize("wander", [motions.wandering_poses, motions.planar_poses])
 def test_no_rival_is_taken_for_noisy_streams_that_agree(wander, monkeypatch):
     fits = []
 
@@ -70,11 +62,11 @@ def test_no_rival_is_taken_for_noisy_streams_that_agree(wander, monkeypatch):
 @pytest.mark.parametrize("centred", ["parent", "child"])
 def test_a_body_that_rotates_about_one_of_its_sensors(centred):
     """The translations of that sensor are noise, and any small scale would fit them."""
-    rotating = wandering_poses(500, 3)
+    rotating = motions.wandering_poses(500, 3)
     rotating[:, :3, 3] = 0.0
-    streams = [rotating, child_of(rotating, T_cw_pw=np.eye(4))]
+    streams = [rotating, motions.child_of(rotating, T_cw_pw=np.eye(4))]
     parent, child = (
-        as_trajectory(disturbed(se3.inverse(poses[0]) @ poses, seed, 0.005, 0.001))
+        motions.as_trajectory(motions.disturbed(se3.inverse(poses[0]) @ poses, seed, 0.005, 0.001))
         for seed, poses in enumerate(streams if centred == "parent" else streams[::-1])
     )
     assert grave(check_streams(parent, child)) == []
@@ -84,9 +76,9 @@ class TestTwoSensorsInOneStream:
     """Levels in turn; a body that shakes has none."""
 
     def codes(self, heights):
-        poses = planar_poses(len(heights), 4)
+        poses = motions.planar_poses(len(heights), 4)
         poses[:, 2, 3] += heights
-        stream = as_trajectory(disturbed(poses, 5, 0.001, 0.001))
+        stream = motions.as_trajectory(motions.disturbed(poses, 5, 0.001, 0.001))
         return {finding.code for finding in check_stream(stream, "child")}
 
     @pytest.mark.parametrize("shakes_hz", [3.9, 4.2, 4.7])
@@ -104,8 +96,8 @@ def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     places = np.outer(seconds, [0.05, 0.07, 0.8]) + [0.0, 0.0, np.pi / 2]
     places = np.sin(places) * [20.0, 20.0, 0.5]
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
-    noisy = disturbed(child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-4, 2e-4)
-    parent, child = as_trajectory(poses, 20), as_trajectory(noisy, 20)
+    noisy = motions.disturbed(motions.child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-4, 2e-4)
+    parent, child = motions.as_trajectory(poses, 20), motions.as_trajectory(noisy, 20)
     assert grave(check_streams(parent, child)) == []
     assert grave(check_streams(inverted(parent), inverted(child))) == [("inverse_both", "both")]
 
@@ -134,7 +126,7 @@ def test_streams_that_nearly_agree_as_they_are_may_be_in_another_order():
 class TestWhichStreamAndWhatToDo:
     @pytest.mark.parametrize("factor", [np.pi / 180, 0.5])
     def test_angles_in_another_unit_or_halved(self, factor):
-        parent, child = drive(wander=planar_poses)
+        parent, child = drive(wander=motions.planar_poses)
         turns = se3.rotation_exp(factor * se3.rotation_log(child.poses[:, :3, :3]))
         poses = se3.from_rotation_translation(turns, child.poses[:, :3, 3])
         other = dataclasses.replace(child, poses=poses)
@@ -179,8 +171,8 @@ class TestWhichStreamAndWhatToDo:
         lying = se3.from_rotation_translation(
             se3.rotation_exp(np.array([np.pi / 2, 0, 0])), np.zeros(3)
         )
-        parent, child = drive(wander=planar_poses)
-        note = check_streams(as_trajectory(parent.poses @ lying), child).findings[0]
+        parent, child = drive(wander=motions.planar_poses)
+        note = check_streams(motions.as_trajectory(parent.poses @ lying), child).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
         assert note.what == "y cannot be determined from this motion, and will be unobservable"
         assert note.options == {"prior.y": "VALUE+/-SIGMA"}
@@ -242,7 +234,7 @@ class TestOneStream:
 class TestCommand:
     @pytest.fixture
     def files(self, tmp_path):
-        return functools.partial(write_pair, tmp_path)
+        return functools.partial(motions.write_pair, tmp_path)
 
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
@@ -283,11 +275,13 @@ class TestSlowStreams:
 
     @pytest.mark.parametrize("interval_s", [1.0, 20.0])
     def test_equal_stamps_have_motions_in_common(self, interval_s):
-        parent, child = (as_trajectory(each.poses[::5], 1 / interval_s) for each in drive())
+        parent, child = (motions.as_trajectory(each.poses[::5], 1 / interval_s) for each in drive())
         assert grave(check_streams(parent, child)) == []
 
     def test_a_clock_offset_is_found_between_poses(self):
-        parent, child = (as_trajectory(each.poses, 1.0) for each in drive(wander=planar_poses))
+        parent, child = (
+            motions.as_trajectory(each.poses, 1.0) for each in drive(wander=motions.planar_poses)
+        )
         assert [code for code, _ in grave(check_streams(parent, child.shifted(-3.0)))] == [
             "time_offset"
         ]
@@ -313,18 +307,20 @@ def around_a_target(n_poses, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_camera_around_its_target_is_no_sign_of_inverse_poses(seed):
     camera = around_a_target(40, seed)
-    hand = child_of(camera, se3.exp(np.array([0.03, -0.05, 0.08, 0.1, -0.2, 1.5])), np.eye(4))
+    hand = motions.child_of(
+        camera, se3.exp(np.array([0.03, -0.05, 0.08, 0.1, -0.2, 1.5])), np.eye(4)
+    )
     hand[:, :3, 3] -= [0.05, 0.05, -0.1]
-    parent = as_trajectory(disturbed(hand, seed, 2e-4, 2e-4), 1.0)
-    child = as_trajectory(disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0)
+    parent = motions.as_trajectory(motions.disturbed(hand, seed, 2e-4, 2e-4), 1.0)
+    child = motions.as_trajectory(motions.disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0)
     assert grave(check_streams(parent, child)) == []
 
 
 def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
-    poses = wandering_poses(600, 5, 0.02)
+    poses = motions.wandering_poses(600, 5, 0.02)
     severities = []
     for length_m, noise in ((0.0005, 1e-4), (0.004, 1e-4), (0.016, 0.004), (0.016, 0.02)):
         X = se3.from_rotation_translation(se3.rotation_exp([0.4, -0.8, 0.3]), [length_m, 0.0, 0.0])
-        found = check_streams(*noisy_pair(poses, 1, noise, noise, mount=X)).findings
+        found = check_streams(*motions.noisy_pair(poses, 1, noise, noise, mount=X)).findings
         severities.append({each.severity for each in found if each.code == "same_position"})
     assert severities == [{Severity.ERROR}, {Severity.WARNING}, set(), set()]

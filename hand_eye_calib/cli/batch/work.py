@@ -164,8 +164,8 @@ class Outcome(NamedTuple):
         as_given: remote.AsGiven = lambda value: value,
         **more: str,
     ) -> "Outcome":
-        """From what there is to say of a task beside what is known of every task; ``as_given`` puts
-        URLs back.
+        """The outcome of a task, from its error, or its result with inputs and page; ``as_given``
+        puts URLs back, and ``more`` goes into the text.
         """
         inputs = inputs or {}
         row: Row = {"name": task.name, "vehicle": task.vehicle, "error": error}

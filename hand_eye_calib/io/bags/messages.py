@@ -414,8 +414,8 @@ def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatAr
 
 
 class MessageReader:
-    """Unpacks the messages of one topic, in their order, as poses: of what is no pose, the other
-    part means nothing (level positions, rotations at the origin).
+    """Unpacks the messages of one topic, in their order, as poses. Positions alone get level
+    orientations, and rotations alone positions at the origin: these mean nothing.
 
     ``measures`` is as of :func:`measured_as`, ``origin`` that of latitudes and longitudes, the
     first one read by default. ``n_left_out`` counts messages without a fix or an orientation.

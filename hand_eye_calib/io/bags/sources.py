@@ -81,13 +81,13 @@ class TopicReading(Reading):
         is_right, (name,) = are_believable(table.stamps_ns, table.bag_ns), self.topics
         if not is_right.all():
             self.notes.append(
-                f"{name}: {(~is_right).sum()} stamps jump away and back against the bag's own "
-                "time; their poses were left out, the bag may be damaged"
+                f"{name}: {(~is_right).sum()} poses were left out: their stamps jump away from "
+                "the bag's own time and back; the bag may be damaged"
             )
             table = table[is_right]
         if without := self._reader.n_left_out:
             self.notes.append(
-                f"{name}: {without} messages without a fix, or without what they were read for, "
+                f"{name}: {without} messages without a fix, or without the quantity that is read, "
                 "were left out"
             )
         return table
