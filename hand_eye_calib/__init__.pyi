@@ -19,8 +19,8 @@ from hand_eye_calib.results.records import Residuals as Residuals
 from hand_eye_calib.results.records import SolveStatus as SolveStatus
 from hand_eye_calib.results.verdict import Reason as Reason
 from hand_eye_calib.results.verdict import Verdict as Verdict
-from hand_eye_calib.rig.calibrate import RigCalibration as RigCalibration
-from hand_eye_calib.rig.calibrate import calibrate_rig as calibrate_rig
+from hand_eye_calib.session.rig import RigCalibration as RigCalibration
+from hand_eye_calib.session.rig import calibrate_rig as calibrate_rig
 from hand_eye_calib.session.together import calibrate_many as calibrate_many
 from hand_eye_calib.session.together import calibrate_together as calibrate_together
 from hand_eye_calib.session.together import compare as compare

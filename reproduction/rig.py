@@ -14,7 +14,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.rig.calibrate import calibrate_rig
+from hand_eye_calib.session.rig import calibrate_rig
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE
 from reproduction.partial import QUANTILE_90

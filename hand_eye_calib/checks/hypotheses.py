@@ -33,12 +33,7 @@ from hand_eye_calib.checks.findings import (
 from hand_eye_calib.checks.streams import PATH_STEP_S, coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import (
-    CLEARLY,
-    STEADY,
-    Trajectory,
-    scatter_of_direction,
-)
+from hand_eye_calib.geometry.trajectory import CLEARLY, STEADY, Trajectory, scatter_of_direction
 from hand_eye_calib.pairing.motion_pairs import (
     MotionPairs,
     PosePairs,

@@ -19,7 +19,7 @@ from hand_eye_calib.results.calibration import Calibration
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
     from hand_eye_calib.live.saving import SessionResult
-    from hand_eye_calib.rig.calibrate import RigCalibration
+    from hand_eye_calib.session.rig import RigCalibration
 
 REPORT = "report.html"
 # Frame of a child sensor that names none: in a rig it has the name of its input.
@@ -86,7 +86,7 @@ def _session_rig(directory: Path, result: "SessionResult") -> None:
     A time offset and a scale in numbers are the child's, which has them; the others have none.
     """
     from hand_eye_calib.io.results import save_rig
-    from hand_eye_calib.rig.calibrate import calibrate_rig
+    from hand_eye_calib.session.rig import calibrate_rig
 
     config, (parent, child) = result.snapshot.config, result.snapshot.streams
     of_all = ["method", "max_gap", "target.translation", "target.rotation"]

@@ -12,7 +12,7 @@ from hand_eye_calib.results.document import transforms_of
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
-    from hand_eye_calib.rig.calibrate import RigCalibration
+    from hand_eye_calib.session.rig import RigCalibration
 
 
 def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
@@ -22,7 +22,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     ``as_given`` puts the name of a remote bag back into plain values.
     """
     from hand_eye_calib.io.results import fingerprint, save_rig
-    from hand_eye_calib.rig import calibrate as of_rig
+    from hand_eye_calib.session import rig as of_rig
 
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")

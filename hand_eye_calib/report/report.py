@@ -27,7 +27,7 @@ from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
-from hand_eye_calib.rig.calibrate import RigCalibration
+from hand_eye_calib.session.rig import RigCalibration
 from hand_eye_calib.version import package_version
 
 MARKS = {"good": "✓", "warn": "!", "bad": "✗"}

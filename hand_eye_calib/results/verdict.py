@@ -12,12 +12,7 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.config import METHODS
-from hand_eye_calib.results.records import (
-    ROTATIONS,
-    TRANSLATIONS,
-    Severity,
-    SolveStatus,
-)
+from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS, Severity, SolveStatus
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.text import amount, axes_in_words, listing
 

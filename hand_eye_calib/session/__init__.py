@@ -1,1 +1,1 @@
-"""What a person does with results: reach a goal, compare with what is installed."""
+"""What a person does with results: reach a goal, join recordings and sensors, compare."""

@@ -34,14 +34,12 @@ ENGINE["assessment"] = ENGINE["gls"] | {"gls"}
 ENGINE["alignment"] = ENGINE["solvers"] | {"results", "solvers"}
 ENGINE["checks"] = ENGINE["alignment"] | {"results", "gls", "assessment", "alignment"}
 ENGINE["engine"] = set(ENGINE)
-ENGINE["rig"] = set(ENGINE)
 ENGINE["session"] = set(ENGINE)
 ALLOWED = ENGINE | {
     "io": GROUND | {"geometry", "results"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND
-    | {"geometry", "results", "engine", "rig", "session", "io", "report", "simulation"},
+    "root": GROUND | {"geometry", "results", "engine", "session", "io", "report", "simulation"},
     "live": {"io", *ENGINE},
     "watch": {"errors", "stats", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},

@@ -22,11 +22,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.results import load_result, save_result
 from hand_eye_calib.io.yaml_files import yaml_text
 from hand_eye_calib.plain import json_text, plain
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    SolveStatus,
-    Verdict,
-)
+from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.context import AxisProgress, Progress
 from hand_eye_calib.results.records import CorrelatedError, Noise, RateBias
 

@@ -13,11 +13,7 @@ from result_making import good_calibration as good
 from source_code import ROOT
 
 from hand_eye_calib.results import verdict as rules
-from hand_eye_calib.results.calibration import (
-    Calibration,
-    SolveStatus,
-    Verdict,
-)
+from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.context import Together
 from hand_eye_calib.results.records import AxisScatter, Finding, Severity
 from hand_eye_calib.results.verdict import RULES

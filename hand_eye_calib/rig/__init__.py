@@ -1,1 +1,0 @@
-"""Several sensors on one body, calibrated in one solve with the noise of every sensor."""
