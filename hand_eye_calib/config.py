@@ -201,10 +201,7 @@ class CalibratorConfig(OptionSet):
         within=(0.0, math.pi),
     )
     keyframe_min_interval: float = option(
-        0.0,
-        "Smallest time between pose pairs that are kept.",
-        unit="s",
-        within=(0.0, 60.0),
+        0.0, "Smallest time between pose pairs that are kept.", unit="s", within=(0.0, 60.0)
     )
     max_gap: float = option(
         0.5,
@@ -366,9 +363,7 @@ class NodeConfig(OptionSet):
         read_only=True,
     )
     enabled: bool = option(
-        True,
-        "Accept poses from the start; false waits for ~/set_enabled.",
-        read_only=True,
+        True, "Accept poses from the start; false waits for ~/set_enabled.", read_only=True
     )
     report: bool = option(
         True,

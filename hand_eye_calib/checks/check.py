@@ -16,14 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from hand_eye_calib.alignment import time_offset
 from hand_eye_calib.alignment.similarity import SimilarityFit, estimate_scale, scale_differs
-from hand_eye_calib.alignment.time_offset import (
-    MIN_VARIATION,
-    Correlation,
-    TimeOffset,
-    correlate_rates,
-    refine_time_offset,
-)
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import LeverArms
 from hand_eye_calib.checks.agreement import (
@@ -87,7 +81,7 @@ class CheckResult:
 
     findings: tuple[Finding, ...]
     fit: SimilarityFit | None = None
-    offset: TimeOffset | None = None
+    offset: time_offset.TimeOffset | None = None
 
 
 def check_streams(
@@ -96,7 +90,7 @@ def check_streams(
     time_offset_s: float = 0.0,
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
-    correlation: Correlation | None = None,
+    correlation: time_offset.Correlation | None = None,
     known: Known | None = None,
 ) -> CheckResult:
     """Check two streams.
@@ -117,7 +111,7 @@ def check_streams(
     findings += check_stream(child, "child", max_gap_s)
     if any(each.makes_unusable for each in findings):
         return CheckResult(gravest_first(findings))
-    correlation = correlation or correlate_rates(parent, child, max_gap_s)
+    correlation = correlation or time_offset.correlate_rates(parent, child, max_gap_s)
     times = correlation.ratio
     turns = graded("turns", "child", float(np.log(times)), times=times)
     if turns and 1.0 - correlation.correlation < HOLDS:
@@ -142,10 +136,10 @@ def check_streams(
     lengths = check_lengths(parent) if is_sound else []
     right = explanation.hypothesis.undo(streams)
     if right.interval_s > right.max_gap_s:  # too slow to refine it
-        offset = TimeOffset(correlation.offset_s, right.interval_s, correlation)
+        offset = time_offset.TimeOffset(correlation.offset_s, right.interval_s, correlation)
     else:
         both = right.parent, right.child, correlation, right.max_gap_s, explanation.fit
-        offset = refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
+        offset = time_offset.refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
@@ -155,8 +149,8 @@ def check_streams(
 
 
 def _on_one_clock(
-    streams: StreamPair, known_s: float, correlation: Correlation
-) -> tuple[StreamPair, Correlation]:
+    streams: StreamPair, known_s: float, correlation: time_offset.Correlation
+) -> tuple[StreamPair, time_offset.Correlation]:
     """The streams with the known offset, and the correlation from there. Poses too far apart to
     interpolate are compared where they have stamps in common, unless the coarse offset is off by
     more than its accuracy.
@@ -173,7 +167,10 @@ def _on_one_clock(
 
 
 def _explained(
-    streams: StreamPair, correlation: Correlation, start: FloatArray | None, is_frozen: bool
+    streams: StreamPair,
+    correlation: time_offset.Correlation,
+    start: FloatArray | None,
+    is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
     """The explanation that holds, if there is one, and findings."""
     try:
@@ -190,7 +187,7 @@ def _explained(
             return None, found or [*explanation.findings]
     if is_frozen:  # nothing is said about its rates
         return None, []
-    if correlation.variation < MIN_VARIATION:
+    if correlation.variation < time_offset.MIN_VARIATION:
         return None, [finding("no_turning")]
     doubt = f"the streams agree at no clock offset: {correlation.doubt()}"
     return None, [finding("unrelated", text=doubt)]
@@ -258,7 +255,7 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
     )
 
 
-def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
+def check_offset(found: time_offset.TimeOffset, known_s: float) -> list[Finding]:
     """A finding if the clocks differ by more than ``known_s``, which the child's stamps have."""
     values = offset_values(found.seconds, known_s) | {"sigma_s": found.sigma_s}
     values["beyond"] = f" beyond the {known_s:.4f} s that were added" if known_s else ""

@@ -32,15 +32,8 @@ from hand_eye_calib.checks.findings import (
 )
 from hand_eye_calib.checks.streams import PATH_STEP_S, coarse
 from hand_eye_calib.errors import NotEnoughDataError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import CLEARLY, STEADY, Trajectory, scatter_of_direction
-from hand_eye_calib.pairing.motion_pairs import (
-    MotionPairs,
-    PosePairs,
-    pairs_between,
-    pairs_over,
-    synchronise,
-)
+from hand_eye_calib.geometry import se3, trajectory
+from hand_eye_calib.pairing import motion_pairs
 from hand_eye_calib.stats import median, medians
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
@@ -76,8 +69,8 @@ _REACH_M = 3.0
 class StreamPair:
     """Two streams on about one clock, and the longest gap to interpolate across."""
 
-    parent: Trajectory
-    child: Trajectory
+    parent: trajectory.Trajectory
+    child: trajectory.Trajectory
     max_gap_s: float
 
     @property
@@ -90,11 +83,11 @@ class StreamPair:
         return replace(self, child=self.child.shifted(offset_s))
 
     @cached_property
-    def synchronised(self) -> PosePairs:
+    def synchronised(self) -> motion_pairs.PosePairs:
         """Poses of both at common stamps."""
-        return synchronise(self.parent, self.child, self.max_gap_s)
+        return motion_pairs.synchronise(self.parent, self.child, self.max_gap_s)
 
-    def pairs(self, lag_s: float, max_pairs: int) -> MotionPairs:
+    def pairs(self, lag_s: float, max_pairs: int) -> motion_pairs.MotionPairs:
         """Motion pairs over ``lag_s`` seconds.
 
         Raises
@@ -102,7 +95,7 @@ class StreamPair:
         NotEnoughDataError
             If the streams have too few in common.
         """
-        pairs = pairs_over(self.synchronised, lag_s, max_pairs)
+        pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
             raise NotEnoughDataError(
                 f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
@@ -152,7 +145,9 @@ class Hypothesis:
         if self is _PLAIN:
             return streams
         parent, child = (
-            Trajectory(given.stamps_ns, self.corrected(stream, given.poses)) if way else given
+            trajectory.Trajectory(given.stamps_ns, self.corrected(stream, given.poses))
+            if way
+            else given
             for stream, way, given in (
                 ("parent", self.parent, streams.parent),
                 ("child", self.child, streams.child),
@@ -301,7 +296,9 @@ def _below(
     tried = []
     for rival in rivals:
         poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
-        motions = pairs_between(*poses, np.arange(n_pairs), np.arange(n_pairs) + n_pairs)
+        motions = motion_pairs.pairs_between(
+            *poses, np.arange(n_pairs), np.arange(n_pairs) + n_pairs
+        )
         tried.append(Explanation(rival, fit_similarity(motions)))
     least = min(each.fit.unexplained for each in tried)
     limit = min(most, _ABOUT_EQUAL * least)
@@ -351,15 +348,15 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
         scatters.append([])
         for way in _WAYS:
             right = Hypothesis(way).corrected("parent", few)
-            scatters[-1].append(scatter_of_direction(right))
+            scatters[-1].append(trajectory.scatter_of_direction(right))
     scatter = dict(zip(_ALL_WAYS, np.maximum.outer(*scatters).flat, strict=True))
     of_chosen, least = scatter[chosen.hypothesis], min(scatter.values())
-    if least < min(STEADY, of_chosen / CLEARLY):
+    if least < min(trajectory.STEADY, of_chosen / trajectory.CLEARLY):
         best = [each for each in _ALL_WAYS if scatter[each] <= _ABOUT_EQUAL * least]
         steady = _fitted(min(best, key=lambda each: each.complexity), streams, lag_s)
         if steady.holds:
             return steady, True
-    return chosen, of_chosen < STEADY
+    return chosen, of_chosen < trajectory.STEADY
 
 
 def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:

@@ -27,10 +27,7 @@ _NAMELESS = "child_sensor"
 
 
 def write_report(
-    directory: Path,
-    calibration: Calibration,
-    snapshot: "Snapshot | None",
-    inputs: Document,
+    directory: Path, calibration: Calibration, snapshot: "Snapshot | None", inputs: Document
 ) -> None:
     """Write the report of a result, of the poses and options that gave it, and of where the data
     came from in plain values.

@@ -11,14 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset, correlate_rates, refine_time_offset
-from hand_eye_calib.checks.check import (
-    CheckResult,
-    check_offset,
-    check_parts,
-    check_streams,
-    offset_values,
-    unseen,
-)
+from hand_eye_calib.checks import check as checking
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.config import METHODS, CalibratorConfig
 from hand_eye_calib.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
@@ -62,7 +55,7 @@ class Run:
 
     calibration: Calibration
     snapshot: Snapshot
-    check: CheckResult = CheckResult(())
+    check: checking.CheckResult = checking.CheckResult(())
     options: Options = field(default_factory=dict)
     told: tuple[str, ...] = ()
 
@@ -128,11 +121,7 @@ def _on_another_clock(snapshot: Snapshot, checks: bool | None) -> Run | None:
     return _solved_with(other, {})
 
 
-def review(
-    calibration: Calibration,
-    snapshot: Snapshot,
-    settled: Collection[str] = (),
-) -> Run:
+def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str] = ()) -> Run:
     """Check the streams of a result, from the poses and options that gave it. If a check is certain
     of the time offset or of the scale, and neither the user nor an earlier check has ``settled``
     it, solve once more with it, and keep that if there is less to say against it.
@@ -214,7 +203,7 @@ def _doubting(found: Run, doubts: Collection[Finding]) -> Run:
     """Add findings about options that were set; a large offset that nobody gave is one."""
     offset_s = found.calibration.time_offset_s
     if "time_offset" in found.options and abs(offset_s) > UNASKED_S:
-        large = finding("large_time_offset", "child", **offset_values(offset_s))
+        large = finding("large_time_offset", "child", **checking.offset_values(offset_s))
         doubts = [*doubts, *([] if large in found.calibration.findings else [large])]
     findings = gravest_first((*found.calibration.findings, *doubts))
     return replace(found, calibration=replace(found.calibration, findings=findings))
@@ -272,7 +261,7 @@ def _telling(found: Run, options: Options, findings: Collection[Finding]) -> Run
     offset_s = found.calibration.time_offset_s
     what["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {found.calibration.time_offset_sigma_s:.4f} "
-        f"s {offset_values(offset_s)['direction']} the parent's"
+        f"s {checking.offset_values(offset_s)['direction']} the parent's"
     )
     if (rate := found.calibration.clock_rate) and rate.is_used:
         what["time_offset"] += f" and {rate}"
@@ -302,13 +291,13 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
     return certain
 
 
-def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+def check(snapshot: Snapshot, calibration: Calibration | None = None) -> checking.CheckResult:
     """Check the streams of a snapshot; of streams that are no poses, their sampling, and what the
     solve itself found. Time offset and scale of the result from them count as known; without one,
     those of the options, if they are given in numbers.
     """
     if snapshot.config.measured != "poses":
-        return CheckResult(gravest_first(_check_parts(snapshot, calibration)))
+        return checking.CheckResult(gravest_first(_check_parts(snapshot, calibration)))
     offset_s = calibration.time_offset_s if calibration else snapshot.config.time_offset
     scale = calibration.scale if calibration else snapshot.config.scale
     known = None
@@ -316,7 +305,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         sigmas = np.sqrt(np.diag(calibration.covariance))
         is_known = not calibration.unobservable()
         known = calibration.T_parent_child, np.where(is_known, sigmas, np.inf)
-    result = check_streams(
+    result = checking.check_streams(
         *snapshot.streams,
         time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
         scale=1.0 if isinstance(scale, str) else scale,
@@ -342,7 +331,7 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
-        found += check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)
+        found += checking.check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)
     hidden = set()
     if calibration:
         hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
@@ -352,7 +341,7 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
         if correlation.is_clear and abs(correlation.offset_s) >= _FOUND_BY_SOLVE_S:
             sigma_s = max(parent.interval_s, child.interval_s) / 5
             offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
-            found += check_offset(offset, known_s)
+            found += checking.check_offset(offset, known_s)
     if hidden and not any(each.makes_unusable for each in found):
-        found.append(unseen([axis for axis in AXES if axis in hidden]))
+        found.append(checking.unseen([axis for axis in AXES if axis in hidden]))
     return [each for index, each in enumerate(found) if each not in found[:index]]

@@ -21,11 +21,7 @@ from hand_eye_calib.geometry.frames import pose_of
 from hand_eye_calib.io.yaml_files import read_yaml
 
 # Names of both poses of a sample, the robot's first.
-_NAMES = (
-    ("effector_wrt_world", "object_wrt_sensor"),
-    ("robot", "tracking"),
-    ("robot", "optical"),
-)
+_NAMES = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"), ("robot", "optical"))
 
 # Frames in files of easy_handeye and easy_handeye2.
 _FRAMES = {

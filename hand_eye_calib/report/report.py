@@ -79,9 +79,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
 
 
 def render(
-    calibration: Calibration,
-    snapshot: Snapshot | None,
-    inputs: Document | None = None,
+    calibration: Calibration, snapshot: Snapshot | None, inputs: Document | None = None
 ) -> str:
     """The report as HTML, of a result and the poses and options that gave it (none for stops);
     ``inputs`` say in plain values where the data came from.

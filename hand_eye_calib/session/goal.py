@@ -91,7 +91,10 @@ class Goal:
             faults = [one.sentence for one in found if one.verdict is Verdict.DO_NOT_USE]
         may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
-        least_s = _least_motion_s(calibration)
+        # Below so many seconds of motion, a standard deviation is not believed.
+        lasting = calibration.noise.lasting if calibration.noise else ()
+        slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
+        least_s = max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
         is_known = bool(is_within) and motion_s >= least_s
         may_end = self.best is not None
         # Every result of a robot that stands still is the same result.
@@ -174,10 +177,3 @@ def _way_on(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
     if not np.isfinite(left_s):
         return f"{called} is not determined yet: {motion}."
     return f"Go on for about {left}: {called} takes longest, {motion}."
-
-
-def _least_motion_s(calibration: Calibration) -> float:
-    """Seconds of motion below which a standard deviation is not believed."""
-    lasting = calibration.noise.lasting if calibration.noise else ()
-    slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
-    return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)

@@ -96,12 +96,7 @@ class WebServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(
-        self,
-        board: Board,
-        ask: Callable[[str], None],
-        address: tuple[str, int],
-    ) -> None:
+    def __init__(self, board: Board, ask: Callable[[str], None], address: tuple[str, int]) -> None:
         self.key = _kept_key()
         self.board, self.ask = board, ask
         self.stopping = threading.Event()
