@@ -377,7 +377,7 @@ def other_answers(
     the time offset and the scale of the result, without priors; those with too few data are left
     out. Parameters as of :func:`cross_checked`.
     """
-    known: dict[str, Any] = {name: "" for name in vars(config) if name.startswith("prior_")}
+    known: dict[str, Any] = {f"prior_{axis}": "" for axis in AXES}
     known |= {"time_offset": calibration.time_offset_s, "scale": calibration.scale}
     settled = replace(config, method=_METHOD, backend="fast", **known)
 

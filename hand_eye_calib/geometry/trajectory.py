@@ -1,7 +1,7 @@
 """Trajectories: stamped poses of one sensor in a fixed frame of its own."""
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from os import PathLike
 from typing import Any, Protocol, Self, TypeAlias
@@ -95,6 +95,28 @@ class RateIntegrator:
         self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
         self._rotation = se3.nearest_rotation(rotations[-1])  # rounding adds up over hours
         return rotations
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Base of dataclasses whose fields are arrays of as many rows each."""
+
+    @property
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        """The arrays in the order of their fields."""
+        return tuple(getattr(self, each.name) for each in fields(self))
+
+    def __len__(self) -> int:
+        return len(self.columns[0])
+
+    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
+        """Some of the rows."""
+        return type(self)(*(each[index] for each in self.columns))
+
+    @classmethod
+    def concatenate(cls, *parts: Self) -> Self:
+        """The rows of all parts in the given order."""
+        return cls(*map(np.concatenate, zip(*(each.columns for each in parts), strict=True)))
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,13 @@ both between these, what every AX = XB solver starts from.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.stats import median
 from hand_eye_calib.text import parse_reference
 
@@ -29,7 +28,7 @@ MAX_PAIRS = 800
 
 
 @dataclass(frozen=True)
-class PosePairs:
+class PosePairs(Columns):
     """Poses of both sensors at common instants.
 
     Attributes
@@ -44,12 +43,6 @@ class PosePairs:
     Ts_pw_p: FloatArray
     Ts_cw_c: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        return type(self)(*(each[index] for each in vars(self).values()))
-
     def child_scaled(self, factor: float) -> Self:
         """The same poses with the child's translations times ``factor``."""
         Ts_cw_c = self.Ts_cw_c.copy()
@@ -60,12 +53,6 @@ class PosePairs:
     def empty(cls) -> Self:
         """No poses."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
-
-    @classmethod
-    def concatenate(cls, *parts: Self) -> Self:
-        """All parts in the given order."""
-        columns = zip(*(vars(one).values() for one in parts), strict=True)
-        return cls(*map(np.concatenate, columns))
 
 
 def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
@@ -208,7 +195,7 @@ def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]
 
 
 @dataclass(frozen=True)
-class MotionPairs:
+class MotionPairs(Columns):
     """K relative motions of both sensors between the same instants i and j.
 
     Attributes
@@ -225,12 +212,6 @@ class MotionPairs:
     Ts_childi_childj: FloatArray
     i: IntArray
     j: IntArray
-
-    def __len__(self) -> int:
-        return len(self.i)
-
-    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        return type(self)(*(each[index] for each in vars(self).values()))
 
     def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (K, 3) of translation and of rotation at X (4, 4).

@@ -22,7 +22,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, printable, required
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory
+from hand_eye_calib.geometry.trajectory import Columns, RateIntegrator, Trajectory
 from hand_eye_calib.io.bags.storage import MessageKind
 from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.geodetic import LocalOrigin
@@ -207,7 +207,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
 
 
 @dataclass(frozen=True)
-class PoseTable:
+class PoseTable(Columns):
     """N poses of streams, "parent" or "child", in columns (N,), in the order of bag time.
 
     ``stamps_ns`` are of the headers, ``bag_ns`` when the messages were recorded; frames are None if
@@ -238,20 +238,12 @@ class PoseTable:
         streams = np.full(len(self), stream, dtype=object)
         return replace(self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64))
 
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-    def __getitem__(self, index: Any) -> Self:
-        """A part of the table: any slice, mask or index array."""
-        return type(self)(*(column[index] for column in vars(self).values()))
-
     @classmethod
-    def joined(cls, tables: Iterable["PoseTable"]) -> "PoseTable":
+    def joined(cls, tables: Iterable[Self]) -> Self:
         """The rows of one or more tables in the order of bag time."""
-        columns = zip(*(vars(table).values() for table in tables), strict=True)
-        whole: Any = [*map(np.concatenate, columns)]
-        table, is_sorted = cls(*whole), (np.diff(whole[-1]) >= 0).all()
-        return table if is_sorted else table[np.argsort(whole[-1], kind="stable")]
+        table = cls.concatenate(*tables)
+        is_sorted = (np.diff(table.bag_ns) >= 0).all()
+        return table if is_sorted else table[np.argsort(table.bag_ns, kind="stable")]
 
     def trajectory(self) -> Trajectory:
         """Poses of one stream in the order of stamps; of those with equal stamps the first."""
