@@ -235,7 +235,7 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
     )
     found = open_installed(str(path))("imu", "cam1").T_parent_child
     np.testing.assert_allclose(found, se3.inverse(moved))
-    with pytest.raises(InputError, match="has several extrinsics, and none"):
+    with pytest.raises(InputError, match="it has several extrinsics, and the names"):
         open_installed(str(path))("imu", "lidar")
 
 
