@@ -95,8 +95,7 @@ class Goal:
         lasting = calibration.noise.lasting if calibration.noise else ()
         slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
         least_s = max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
-        is_known = bool(is_within) and motion_s >= least_s
-        may_end = self.best is not None
+        is_known, may_end = bool(is_within) and motion_s >= least_s, self.best is not None
         # Every result of a robot that stands still is the same result.
         if motion_s > self._motion_s:
             may_end |= is_known and self._was_known

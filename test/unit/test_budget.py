@@ -18,17 +18,17 @@ ROOT = SOURCE.parent
 # 450 functions in 50 files entered by ``calibrate a b``, 19,000 lines of tests.
 LIMITS = {
     "lines": 29_510,
-    "lines of code": 19_080,
+    "lines of code": 19_000,
     "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
-    "rooms": 30,
+    "rooms": 28,
     "floors": 17,
-    "arrows between rooms": 186,
+    "arrows between rooms": 170,
     "functions entered by calibrate": 552,
     "files entered by calibrate": 60,
     "lines of reproduction": 6_960,
-    "lines of tests": 19_165,
+    "lines of tests": 19_080,
     "words of documentation": 34_850,
 }
 
