@@ -53,7 +53,7 @@ def test_both_streams_in_millimetres_are_never_used(streams):
     assert result.verdict is Verdict.DO_NOT_USE
     (finding,) = result.findings
     assert (finding.code, finding.stream) == ("lengths", "parent")
-    assert "its lengths can hardly be in metres" in result.headline
+    assert "its lengths are probably not in metres" in result.headline
     assert finding.evidence["speed_m_s"] > 1000
     asked = hec.calibrate(
         parent.scaled(1000.0), child.scaled(1000.0), reference="B5", **finding.options
