@@ -136,24 +136,17 @@ def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatA
     """
     whole = np.zeros((6, 6))
     whole[:3, :3] = _widened(covariance, solution, slice(0, 3))
-    white, walk = _white_rotation(Ts), np.exp(solution.levels[WALK_ROTATION])
+    # White rotation noise per axis: at most what differs from step to step about the two axes with
+    # the smoothest rotation. Nothing else shows it where positions alone are measured: noise of the
+    # orientation would look like a small motion that does not move the lever arm.
+    steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
+    # Differences of steps have six times the variance of white noise.
+    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / CHI2[0.5][1] / 6.0
+    white, walk = float(np.sort(variances)[:2].mean()), np.exp(solution.levels[WALK_ROTATION])
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
     )
     return combined(np.eye(4), whole, None, basis([*np.eye(6)[3:], *hidden]))
-
-
-def _white_rotation(Ts: FloatArray) -> float:
-    """Variance (rad^2) per axis of the white rotation noise of poses: at most what differs
-    from step to step about the two axes with the smoothest rotation.
-
-    Nothing else shows it where positions alone are measured: noise of the orientation would look
-    like a small motion that does not move the lever arm.
-    """
-    steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
-    # Differences of steps have six times the variance of white noise.
-    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / CHI2[0.5][1] / 6.0
-    return float(np.sort(variances)[:2].mean())
 
 
 def _widened(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
@@ -207,10 +200,7 @@ def noise_driven(
 
 
 def combined(
-    T_parent_child: FloatArray,
-    model: FloatArray,
-    resampled: FloatArray | None,
-    unknown: FloatArray,
+    T_parent_child: FloatArray, model: FloatArray, resampled: FloatArray | None, unknown: FloatArray
 ) -> Assessment:
     """Covariance and verdicts from a model's covariance (6, 6) in the child's frame, that of
     resampling if there is one, and directions (6, U) that the motion does not reveal.

@@ -165,16 +165,7 @@ class Excitation:
 
 
 def excitation(pose_pairs: PosePairs) -> Excitation:
-    """The Excitation in synchronised poses.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-
-    Returns
-    -------
-    Excitation
-    """
+    """The Excitation in synchronised poses."""
     n_poses = len(pose_pairs)
     rotation, lever_arms = np.zeros(3), LeverArms.of(np.zeros((1, 3, 3)))
     if n_poses < 2:

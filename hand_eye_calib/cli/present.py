@@ -18,7 +18,7 @@ from hand_eye_calib.cli.options import (
     waiting_for,
 )
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.results.calibration import Calibration, Verdict
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from hand_eye_calib.results.document import Notation
 
 _WIDTH = 100
+
+# Verdicts on an axis that more motion would change.
+_OPEN = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
 
 
 def deliver(
@@ -172,7 +175,8 @@ def next_steps(
     extra = [typed_options([each]) for each in options]
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        if snapshot is not None and calibration.measured == "poses":
+        is_open = any(dof.verdict in _OPEN for dof in calibration.observability)
+        if is_open and snapshot is not None and calibration.measured == "poses":
             from hand_eye_calib.assessment.excitation import excitation, what_is_missing
 
             motion = what_is_missing(excitation(snapshot.pose_pairs), calibration)

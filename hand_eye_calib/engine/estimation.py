@@ -381,16 +381,6 @@ def other_answers(
     known |= {"time_offset": calibration.time_offset_s, "scale": calibration.scale}
     settled = replace(config, method=_METHOD, backend="fast", **known)
 
-    def answers(parts: Sequence[tuple[str, slice]]) -> list[Calibration]:
-        found = []
-        for reference, part in parts:
-            poses = pose_pairs[part]
-            if len(poses) >= _MIN_POSES:
-                with contextlib.suppress(HandEyeCalibError):
-                    config = replace(settled, reference=reference)
-                    found.append(solve_poses(poses, config, is_beside=True).calibration())
-        return found
-
     n_poses, own = len(pose_pairs), calibration.reference
     stride = max(-(-n_poses // _MOST_POSES), 1)
     others = [
@@ -405,13 +395,19 @@ def other_answers(
     # About the same pairs of every stride-th pose.
     own = f"{own[0]}{max(round(int(own[1:]) / stride), 1 if own[0] == 'B' else 2)}"
     halves = [(own, slice(*edges, stride)) for edges in ((0, half), (half, n_poses))]
-    return answers(others), answers(halves)
+    found: tuple[list[Calibration], list[Calibration]] = [], []
+    for answers, parts in zip(found, (others, halves), strict=True):
+        for reference, part in parts:
+            poses = pose_pairs[part]
+            if len(poses) >= _MIN_POSES:
+                with contextlib.suppress(HandEyeCalibError):
+                    alike = replace(settled, reference=reference)
+                    answers.append(solve_poses(poses, alike, is_beside=True).calibration())
+    return found
 
 
 def compare_answers(
-    calibration: Calibration,
-    others: Sequence[Calibration] = (),
-    halves: Sequence[Calibration] = (),
+    calibration: Calibration, others: Sequence[Calibration] = (), halves: Sequence[Calibration] = ()
 ) -> CrossCheck:
     """Compare a result with other answers to the same question: at other references, of which only
     those count that do not reject half of the motion pairs, and from the first and the second half

@@ -143,10 +143,8 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
     at least d, the floor. Pairs of equal cost share what those of smaller cost leave of it.
     """
     counted = costs < threshold
-    too_few = counted.sum(axis=-1) < floor
-    if not too_few.any():
-        weights = counted.astype(float)
-    else:
+    too_few, weights = counted.sum(axis=-1) < floor, counted.astype(float)
+    if too_few.any():
         last = math.ceil(floor) - 1
         largest = np.partition(costs, last, axis=-1)[..., last, None]
         counted |= costs <= largest  # these count already if there are enough
