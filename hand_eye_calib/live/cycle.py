@@ -274,7 +274,7 @@ class SolveCycle:
         else:
             kept = f"kept is the result of {result.n_poses} poses, as the newest is worse"
             kept = f"{kept}: {describe(newest)}"
-            self._log.info(kept, GOES_ON_S, key="kept")
+            self._log.info(kept, ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, kept))
         self.result, self._solved_at_s = self._with_findings(result), time.monotonic()
         self._told_result = _result_state(self.result)

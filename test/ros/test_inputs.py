@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -19,7 +20,7 @@ QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 
 
 def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, peer):
-    node = start_node(*QUIET)
+    node = start_node(*QUIET, "--log-level calibrator:=debug")
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -35,7 +36,10 @@ def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, p
         publishers[index].publish(wrong)
     refused = [f"/{name}_odom: a message is refused: " for name in ("parent", "child")]
     _, extrinsic = peer.solve(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
-    assert "Traceback" not in node.wait_for_log(*refused)
+    publishers[0].publish(message(Odometry, stamps_ns[-1], Ts_pw_p[-1], "lidar"))
+    log = node.wait_for_log(*refused, "is repeated or too late")
+    assert len(re.findall(r"message with stamp .* refused: ", log)) == 3, log
+    assert "Traceback" not in log
     np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
 
 

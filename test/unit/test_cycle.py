@@ -136,12 +136,12 @@ def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cyc
 def test_the_log_of_a_good_session_of_seven_minutes_is_short_and_asks_for_nothing(
     cycle, lines, monkeypatch
 ):
-    """One solve every two seconds; each axis in turn is the one that lacks."""
+    """One solve every two seconds; each axis in turn is the one that lacks, then one is kept."""
     for k in range(210):
         now_s = 1e4 + 2.0 * k
         monkeypatch.setattr(module.time, "monotonic", lambda now_s=now_s: now_s)
         sigmas_m = 0.2 / np.sqrt(1.0 + k) * np.roll([1.0, 0.95, 0.9], k)
-        answered(cycle, 2.0 * k, tuple(np.where(k > 170, 0.005, sigmas_m)), 100 + k)
+        answered(cycle, 2.0 * k, tuple(np.where(k > 90, 0.005 * (1 + k % 2), sigmas_m)), 100 + k)
     assert cycle.goal.progress.done
     assert {level for level, _ in lines} <= {"info", "debug"}, lines
     shown = [text for level, text in lines if level != "debug"]
