@@ -4,7 +4,6 @@ with time, and a row for each recording with a link to its report.
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -57,15 +56,13 @@ def render_batch(
     )
 
 
-@page_style()
+@page_style(path_simplify=False)
 def _trend(result: Calibration, number: int) -> Drawn:
     """The figure of a vehicle's recordings about their common extrinsic, axis by axis, over time;
     ``number`` is that of the vehicle on the page.
     """
     recordings = result.together.recordings if result.together else ()
-    at = np.array(
-        date2num([datetime.fromtimestamp(each.stamp_ns * 1e-9, UTC) for each in recordings])
-    )
+    at = date2num(np.array([each.stamp_ns for each in recordings], dtype="datetime64[ns]"))
     apart = np.array([bool(each.left_out) for each in recordings])
     figure = Figure(figsize=(LOOK.width, 3.9), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True).ravel()
@@ -80,10 +77,12 @@ def _trend(result: Calibration, number: int) -> Drawn:
         panel.axhline(0, color=GRID, lw=0.8)
         if np.isfinite(band):
             panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
-        for group, colour, fmt in ((~apart, INK, "o"), (apart, BAD, "s")):
-            ends = np.stack([values - sigmas, values + sigmas, np.full(len(at), np.nan)], axis=1)
-            panel.plot(np.repeat(at[group], 3), ends[group].ravel(), color=colour, lw=0.8)
-            panel.plot(at[group], values[group], fmt, color=colour, ms=3.2)
+        # A dot is a line of no length: a mark for each would make a page of many vehicles heavy.
+        for half, width in ((sigmas, 0.8), (0 * sigmas, 3.2)):
+            ends = np.stack([values - half, values + half, np.full(len(at), np.nan)], axis=1)
+            for group, colour, cap in ((~apart, INK, "round"), (apart, BAD, "projecting")):
+                line = panel.plot(np.repeat(at[group], 3), ends[group].ravel(), color=colour)
+                line[0].set(lw=width, solid_capstyle=cap)
     locator = AutoDateLocator(minticks=2, maxticks=4)
     panels[0].xaxis.set_major_locator(locator)
     panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))

@@ -119,16 +119,13 @@ def as_drawn(figure: Figure, name: str, title: str, said: str) -> Drawn:
     figure.savefig(
         written, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
     )
-    svg = written.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
-    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
-    hidden = r'\1 aria-hidden="true" focusable="false"'
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', hidden, svg, count=1)
-    svg = re.sub(r'\bid="', f'id="{name}-', svg)
-    svg = re.sub(r'href="#', f'href="#{name}-', svg).replace("url(#", f"url(#{name}-")
-    svg = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px var(--sans)", svg)
-    svg = re.sub(r"<!--.*?-->\n?", "", svg, flags=re.DOTALL)
+    svg = re.sub(r' (width|height)="[^"]*"', "", written.getvalue().partition("<svg")[2], count=2)
+    svg = f'<svg aria-hidden="true" focusable="false"{svg}'
+    svg = re.sub(r'<!--.*?-->|(?<=\n) +| xmlns(:\w+)?="[^"]*"', "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="', f'id="{name}-', re.sub(r'<g id="[^"]*"', "<g", svg))
+    svg = svg.replace('xlink:href="#', f'href="#{name}-').replace("url(#", f"url(#{name}-")
+    svg = re.sub(r"(font: [\d.]+px|font-family:) [^;\"]*", r"\1 var(--sans)", svg)
+    svg = re.sub(r"<[pu][^>]*>", lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]), svg)
     for colour, variable in _VARIABLES.items():
         svg = svg.replace(colour.lower(), f"var(--{variable})")
     return Drawn(name, title, said, svg)
@@ -342,23 +339,28 @@ class ShownFigure(Figure):
         return written.getvalue()
 
 
-def plot(calibration: Calibration) -> Figure:
+def plot(calibration: Calibration, ax: Any = None) -> Figure:
     """Draw where both sensors are and how they are turned, in three views of the parent sensor's
     frame, with three standard deviations of the child's position.
 
     Parameters
     ----------
     calibration : Calibration
+    ax : sequence of three matplotlib.axes.Axes, optional
+        To draw into. Default: a figure of its own.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Notebooks show it; ``savefig`` writes it to a file.
+        The figure of ``ax``, or a new one. Notebooks show it; ``savefig`` writes it to a file.
 
     Examples
     --------
     >>> hec.plot(result).savefig("result.png")
     """
+    if ax is not None:
+        draw_views(ax, calibration)
+        return ax[0].figure
     with page_style(figure_facecolor="white", savefig_facecolor="white"):
         figure = ShownFigure(figsize=(LOOK.width, 3.3), layout="constrained")
         FigureCanvasAgg(figure)

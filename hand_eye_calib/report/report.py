@@ -72,6 +72,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
         lstrip_blocks=True,
     )
     environment.filters |= {"number": text.fixed, "printable": printable}
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     environment.globals |= dict(amount=text.amount, change=text.change, counted=text.counted)
     environment.globals["axis_names"] = _AXIS_NAMES
     values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}

@@ -128,9 +128,9 @@ class Calibration(Result):
         """Write ``extrinsic.yaml`` and the files for robots; see :func:`hand_eye_calib.save`."""
         return upstairs("io.results", "save_result")(self, directory)
 
-    def plot(self) -> Any:
+    def plot(self, ax: Any = None) -> Any:
         """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
-        return upstairs("report.figures", "plot")(self)
+        return upstairs("report.figures", "plot")(self, ax)
 
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML file; a directory gets ``report.html``.

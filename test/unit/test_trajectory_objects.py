@@ -132,6 +132,9 @@ class TestShowing:
             (ellipse,) = figure.axes[0].patches
             np.testing.assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
             assert figure._repr_png_().startswith(b"\x89PNG")
+            panels = figure.subplots(1, 3)
+            assert each.plot(ax=panels) is figure
+            assert panels[0].patches
         hidden = tuple(
             dataclasses.replace(dof, sigma=np.inf) if dof.name == "z" else dof
             for dof in result.observability
