@@ -42,10 +42,11 @@ _UNDETERMINED = 8.0
 # Standard deviation that stands for "not determined" in the covariance (m, rad).
 _UNKNOWN = 1e3
 
-# Errors of stops that follow each other may last: over changes of the view (rad), beside a white
-# share of their variance; the first row is of errors that do not last. Within the smallest range
-# stops count as one where outliers are looked for, as an arm that rests gives many.
-_LASTING = np.array([(0.03, 1.0), *((0.03 * 2.5**k, 0.1) for k in range(6))])
+# Errors may last: over changes of the view (rad), beside a white share of their variance. The first
+# row is of errors that do not last, the second of those that come back with their place, the others
+# of those that last on the way from stop to stop. Within the smallest range stops that follow each
+# other count as one where outliers are looked for, as an arm that rests gives many.
+_LASTING = np.array([(0.03, 1.0), (0.03, 0.1), *((0.03 * 4.0**k, 0.1) for k in range(6))])
 
 # So many stops at once are looked at.
 _AT_ONCE = 300
@@ -278,18 +279,24 @@ def _information(rows: FloatArray, columns: IntArray, n_values: int) -> FloatArr
     return whole.reshape(n_values, n_values)
 
 
-def _path_rad(stops: Stops) -> FloatArray:
-    """How far the view changed up to each stop (N,): rotations, and ways over a usual distance."""
+def _views(stops: Stops) -> FloatArray:
+    """Views (N, 12) of the stops: rotations (rad), and places over a usual distance."""
     A = stops.Ts_world_parent
     distances_m = np.linalg.norm(stops.Ts_world_child[:, :3, 3], axis=1)
-    steps = np.linalg.norm(se3.log(se3.inverse(A[:-1]) @ A[1:]).reshape(-1, 2, 3), axis=2)
-    usual_m = np.median(distances_m) + steps[:, 0].sum() / len(A) + np.finfo(float).tiny
-    return np.cumsum(np.r_[0.0, steps @ [1.0 / usual_m, 1.0]])
+    ways_m = np.linalg.norm(np.diff(A[:, :3, 3], axis=0), axis=1)
+    usual_m = np.median(distances_m) + ways_m.sum() / len(A) + np.finfo(float).tiny
+    return np.concatenate([A[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0), A[:, :3, 3] / usual_m], 1)
+
+
+def _path_rad(views: FloatArray) -> FloatArray:
+    """How far the view changed up to each stop (N,)."""
+    turned, moved = np.split(np.diff(views, axis=0), [9], axis=1)
+    return np.cumsum(np.r_[0.0, np.linalg.norm(turned, axis=1) + np.linalg.norm(moved, axis=1)])
 
 
 def _alone(stops: Stops) -> FloatArray:
     """Weights (N,) of 1 on average: stops that follow each other at one place count as one."""
-    path_rad = _path_rad(stops)
+    path_rad = _path_rad(_views(stops))
     first, end = (
         np.searchsorted(path_rad, path_rad + x) for x in (-_LASTING[0, 0], _LASTING[0, 0])
     )
@@ -297,11 +304,14 @@ def _alone(stops: Stops) -> FloatArray:
     return np.asarray(alone / alone.mean())
 
 
-def _kernels(path_rad: FloatArray) -> FloatArray:
+def _kernels(stops: Stops) -> FloatArray:
     """Correlations (K, N, N) of the errors of stops in their order, for each row of _LASTING."""
-    ranges_rad, white = _LASTING.T[:, :, None, None]
-    apart = np.abs(np.subtract.outer(path_rad, path_rad)) / ranges_rad
-    return np.asarray(white * np.eye(len(path_rad)) + (1.0 - white) * np.exp(-apart))
+    views, (ranges_rad, white) = _views(stops), _LASTING.T[:, :, None, None]
+    path_rad = _path_rad(views)
+    places = np.linalg.norm(views[:, None] - views, axis=2)
+    way = np.abs(np.subtract.outer(path_rad, path_rad))
+    apart = np.stack([places, places, *[way] * (len(_LASTING) - 2)]) / ranges_rad
+    return np.asarray(white * np.eye(len(views)) + (1.0 - white) * np.exp(-apart))
 
 
 def _shares(kernels: FloatArray, errors: FloatArray, rows: FloatArray) -> FloatArray:
@@ -325,7 +335,7 @@ def _shares(kernels: FloatArray, errors: FloatArray, rows: FloatArray) -> FloatA
 
 
 def _lasting(stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray) -> FloatArray:
-    """Covariance of a fit, if errors last from stop to stop of a sensor and one of its worlds."""
+    """Covariance of a fit, if errors of a sensor and one of its worlds last or come back."""
     errors, jacobian = _linearise(stops, fit.Ts_parent_child, fit.Ts_world_world, in_world)
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
     weights = np.sqrt(fit.weights[fit.weights > 0.0])[:, None]
@@ -333,14 +343,14 @@ def _lasting(stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray) -
     blocks = np.stack([stops.child, len(fit.Ts_parent_child) + stops.world], axis=1)
     pairs, pair_of, counts = np.unique(blocks, axis=0, return_inverse=True, return_counts=True)
     most = np.flatnonzero(pair_of.ravel() == np.argmax(counts))[:_AT_ONCE]
-    kernels = _kernels(_path_rad(stops[most]))
+    kernels = _kernels(stops[most])
     shares = _shares(kernels, errors[most], weights[most, None] * rows[most])
     more = np.zeros_like(fit.information)
     for k, pair in enumerate(pairs):
         columns = (6 * pair[:, None] + np.arange(6)).ravel()
         own = np.flatnonzero(pair_of.ravel() == k)
         for part in np.array_split(own, -(-len(own) // _AT_ONCE)):
-            kernel = np.tensordot(shares, _kernels(_path_rad(stops[part])), 1)
+            kernel = np.tensordot(shares, _kernels(stops[part]), 1)
             kernel = alone[part, None] * kernel * alone[part] - np.diag(alone[part])
             across = np.swapaxes(rows[part], 0, 1)
             more[np.ix_(columns, columns)] += np.einsum("kni,knj->ij", across, kernel @ across)
