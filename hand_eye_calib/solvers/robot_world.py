@@ -46,7 +46,7 @@ _UNKNOWN = 1e3
 # row is of errors that do not last, the second of those that come back with their place, the others
 # of those that last on the way from stop to stop. Within the smallest range stops that follow each
 # other count as one where outliers are looked for, as an arm that rests gives many.
-_LASTING = np.array([(0.03, 1.0), (0.03, 0.1), *((0.03 * 4.0**k, 0.1) for k in range(6))])
+_LASTING = np.array([(0.03, 1.0), (0.05, 0.1), *((0.03 * 4.0**k, 0.1) for k in range(6))])
 
 # So many stops at once are looked at.
 _AT_ONCE = 300
