@@ -184,6 +184,12 @@ class Trajectory:
         object.__setattr__(self, "stamps_ns", stamps_ns)
         object.__setattr__(self, "poses", poses)
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Trajectory):
+            return NotImplemented
+        both = ([getattr(one, each.name) for each in fields(one)] for one in (self, other))
+        return all(map(np.array_equal, *both))
+
     @classmethod
     def from_quat_xyzw(
         cls,

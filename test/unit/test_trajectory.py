@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from motions import as_trajectory, wandering_poses
@@ -64,6 +66,16 @@ def test_shift_and_scale_keep_everything_else():
     assert (shifted.sensor_frame, scaled.world_frame) == ("lidar", "odom")
     np.testing.assert_array_equal(scaled.poses[:, :3, :3], POSES[:, :3, :3])
     np.testing.assert_array_equal(scaled.poses[:, :3, 3], 2 * POSES[:, :3, 3])
+
+
+def test_equal_trajectories_have_the_same_poses_stamps_and_frames():
+    trajectory, other = (
+        Trajectory(STAMPS, POSES, "lidar"),
+        Trajectory(STAMPS, POSES.copy(), "lidar"),
+    )
+    assert trajectory == other
+    changed = other.shifted(1.0), other.scaled(2.0), other[:2], replace(other, sensor_frame="")
+    assert trajectory not in [*changed, "lidar"]
 
 
 # ---- poses between those of a trajectory
