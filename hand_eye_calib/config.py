@@ -9,7 +9,7 @@ from collections.abc import Collection
 from dataclasses import InitVar, dataclass
 from typing import Any, NamedTuple, Self
 
-from hand_eye_calib import text
+import hand_eye_calib.text as text
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.option import OptionSet, option
 

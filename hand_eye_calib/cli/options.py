@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hand_eye_calib import config
+import hand_eye_calib.config as config
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.option import check_value, did_you_mean, option_name
 
