@@ -323,7 +323,7 @@ def _shares(kernels: FloatArray, errors: FloatArray, rows: FloatArray) -> FloatA
     n, n_values = len(errors), rows.shape[2]
     factors = np.linalg.cholesky(kernels)
     columns = np.concatenate([errors[..., None], rows], axis=2).reshape(n, -1)
-    whitened = np.linalg.solve(factors, columns).reshape(len(kernels), 6 * n, 1 + n_values)
+    whitened = np.linalg.solve(factors, columns[None]).reshape(len(kernels), 6 * n, 1 + n_values)
     # The last of the triangle's rows is what no values explain.
     triangle = np.linalg.qr(np.roll(whitened, -1, axis=2), mode="r")
     sizes = np.abs(np.diagonal(triangle, 0, 1, 2)) + np.finfo(float).tiny
