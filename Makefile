@@ -105,7 +105,7 @@ clean:
 # here, as pip does with packages that are not editable: commands start faster. A stamp file is
 # touched last, so that set-up is repeated if it was interrupted or a file it depends on is newer.
 $(VENV)/.ready-demo: EXTRAS := ros
-$(VENV)/.ready-test: EXTRAS := ros,camera,cluster,fleet,foxglove,lidar,notebook,px4,test,lint
+$(VENV)/.ready-test: EXTRAS := ros,camera,cluster,coverage,fleet,foxglove,lidar,notebook,px4,test,lint
 $(OLDEST)/.ready-test: EXTRAS := ros,cluster,fleet,notebook,test
 $(OLDEST)/.ready-test: CONSTRAINTS := --constraint requirements/oldest.txt
 $(OLDEST)/.ready-test: requirements/oldest.txt

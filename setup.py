@@ -117,6 +117,8 @@ setup(
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "camera": ["opencv-python-headless>=4.7,<5"],
         "cluster": ["distributed>=2024.1"],
+        # Not of "test": colcon would report on every file after each run, for minutes.
+        "coverage": ["pytest-cov>=5"],
         "qr": ["segno>=1.5"],
         "foxglove": ["mcap-protobuf-support>=0.5"],
         "fleet": ["fsspec[http]>=2024.2"],
@@ -130,7 +132,6 @@ setup(
             "nbclient>=0.9",
             "packaging",
             "pytest>=7.4",
-            "pytest-cov>=5",
             "wheel",
         ],
         "lint": ["mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],

@@ -93,12 +93,12 @@ def measured_node(report, arguments):
     latencies, durations, used = [], [], []
     receive, sent_at = TopicInput._receive, place_of_sending_time()
 
-    def stopwatch(self, read, data, info):
+    def stopwatch(self, data, info):
         begun = time.time()
         if not latencies:
             used.append((time.monotonic(), cpu_seconds()))
         latencies.append(begun - struct.unpack_from("<d", data, sent_at)[0])
-        receive(self, read, data, info)
+        receive(self, data, info)
         durations.append(time.time() - begun)
         if len(latencies) % 100 == 0:
             used[1:] = [(time.monotonic(), cpu_seconds())]

@@ -86,9 +86,8 @@ class TopicInput(PoseInput):
         measures = self.measures_as(type_name)
         self._session.set_measures(self.name, measures)
         self._read = MessageReader(type_name, measures, self._session.origin(self.name))
-        # rclpy looks at the signature: with two arguments it passes the info as well, which its
-        # annotations do not know.
-        callback: Any = partial(self._receive, self._read)
+        # With two arguments, rclpy passes the info as well, which its annotations do not know.
+        callback: Any = self._receive
         try:
             self._subscription = self._node.create_subscription(
                 message_class(type_name),
@@ -110,10 +109,10 @@ class TopicInput(PoseInput):
         """Take the messages that wait; whether there were any."""
         before = self._arrived
         for each in waiting_messages(self._subscription):
-            self._receive(self._read, *each)
+            self._receive(*each)
         return self._arrived > before
 
-    def _receive(self, read: MessageReader, data: bytes, info: dict[str, Any]) -> None:
+    def _receive(self, data: bytes, info: dict[str, Any]) -> None:
         # With several publishers, or none any more, the numbers of lost messages are not known.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
@@ -122,7 +121,7 @@ class TopicInput(PoseInput):
             received_s = info["received_timestamp"] * 1e-9
             self.refuse(f"received at {received_s:.3f} s", "malformed", str(error))
             return
-        self.accept(stamp_ns, partial(read, data))
+        self.accept(stamp_ns, partial(self._read, data))
 
 
 class TfInput(PoseInput):
