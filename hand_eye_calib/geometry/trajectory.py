@@ -97,14 +97,25 @@ class RateIntegrator:
         return rotations
 
 
-@dataclass(frozen=True)
-class Columns:
-    """Base of dataclasses whose fields are arrays of as many rows each."""
+@dataclass(frozen=True, eq=False)
+class WithArrays:
+    """Base of dataclasses with ``eq=False``: equal if all fields are, arrays as a whole."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and all(map(_equal, self.columns, other.columns))
 
     @property
-    def columns(self) -> tuple[NDArray[Any], ...]:
-        """The arrays in the order of their fields."""
+    def columns(self) -> tuple[Any, ...]:
+        """The values of the fields, in their order."""
         return tuple(getattr(self, each.name) for each in fields(self))
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
+
+
+class Columns(WithArrays):
+    """Base of dataclasses whose fields are arrays of as many rows each."""
 
     def __len__(self) -> int:
         return len(self.columns[0])
@@ -119,8 +130,8 @@ class Columns:
         return cls(*map(np.concatenate, zip(*(each.columns for each in parts), strict=True)))
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, eq=False)
+class Trajectory(WithArrays):
     """Stamped poses of a sensor, in strictly increasing order of time.
 
     Parameters
@@ -183,12 +194,6 @@ class Trajectory:
         _check_poses(poses)
         object.__setattr__(self, "stamps_ns", stamps_ns)
         object.__setattr__(self, "poses", poses)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Trajectory):
-            return NotImplemented
-        both = ([getattr(one, each.name) for each in fields(one)] for one in (self, other))
-        return all(map(np.array_equal, *both))
 
     @classmethod
     def from_quat_xyzw(

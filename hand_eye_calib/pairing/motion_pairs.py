@@ -27,7 +27,7 @@ _LEAP_S = 86_400.0
 MAX_PAIRS = 800
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PosePairs(Columns):
     """Poses of both sensors at common instants.
 
@@ -194,7 +194,7 @@ def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]
     return np.repeat(keyframes, step - 1), j
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MotionPairs(Columns):
     """K relative motions of both sensors between the same instants i and j.
 

@@ -168,16 +168,9 @@ def _at_distance(calibration: Calibration) -> str:
 
 def _targets(calibration: Calibration) -> str:
     """Target of x, y and z, of the rotations, and of the axes that have their own."""
-    single = [
-        f"{axis} {text.amount(axis, value)}" for axis, value in calibration.target_axes.items()
-    ]
-    return text.listing(
-        [
-            text.length(calibration.target_translation),
-            text.angle(calibration.target_rotation),
-            *single,
-        ]
-    )
+    of_all = text.length(calibration.target_translation), text.angle(calibration.target_rotation)
+    single = [f"{axis} {text.amount(axis, each)}" for axis, each in calibration.target_axes.items()]
+    return text.listing([*of_all, *single])
 
 
 class AxisRow(NamedTuple):

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.geometry.trajectory import Columns
 
 # Motion pairs with more weight than this count as inliers.
 INLIER_WEIGHT = 0.5
@@ -79,8 +80,8 @@ def by_hand(axis: str) -> str:
     return f"MEASURE_{axis.upper()}_BY_HAND"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Residuals:
+@dataclass(frozen=True, eq=False)
+class Residuals(Columns):
     """Residuals of K motion pairs at the result.
 
     A pair of the adaptive estimator runs from one pose to the next.
@@ -110,9 +111,6 @@ class Residuals:
     weights: FloatArray
     start_ns: IntArray
     end_ns: IntArray
-
-    def __len__(self) -> int:
-        return len(self.weights)
 
     @property
     def translation_m(self) -> FloatArray:

@@ -4,10 +4,10 @@ Comparison: of a result with what is installed, or of results with each other.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, count
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_r
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
 from hand_eye_calib.geometry.se3 import Extrinsic, deviation, turned, xyz_rpy
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import TrajectoryLike
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame
 from hand_eye_calib.results.context import Comparison, Difference, Recorded, Together
@@ -28,6 +28,9 @@ from hand_eye_calib.text import listing
 
 if TYPE_CHECKING:
     import pandas as pd
+
+_Pair: TypeAlias = tuple[TrajectoryLike, TrajectoryLike]
+_Recordings: TypeAlias = Iterable[_Pair] | Mapping[str, _Pair]
 
 # Values of a result that are in its row as they are.
 _TAKEN = (
@@ -45,7 +48,7 @@ _OF_NEWEST = (
 
 
 def calibrate_together(
-    recordings: Iterable[tuple[Trajectory, Trajectory]],
+    recordings: _Recordings,
     names: Sequence[str] | None = None,
     **options: Any,
 ) -> Calibration:
@@ -58,7 +61,7 @@ def calibrate_together(
     Parameters
     ----------
     recordings : iterable of (Trajectory, Trajectory), or of what can be read as one
-        Poses of parent and child in each.
+        Poses of parent and child in each; or a mapping of names to these.
     names : sequence of str, optional
         What to call the recordings; numbered by default.
     **options
@@ -83,14 +86,14 @@ def calibrate_together(
     2
     """
     results: dict[str, Calibration] = {}
-    for name, pair in zip(_named(names), recordings, strict=False):
+    for name, pair in _named(recordings, names):
         with located(name):
             results[name] = calibrate(*pair, **options)
     return together(results)
 
 
 def calibrate_many(
-    recordings: Iterable[tuple[Trajectory, Trajectory]],
+    recordings: _Recordings,
     names: Sequence[str] | None = None,
     **options: Any,
 ) -> "pd.DataFrame":
@@ -119,7 +122,7 @@ def calibrate_many(
     True
     """
     rows = []
-    for name, pair in zip(_named(names), recordings, strict=False):
+    for name, pair in _named(recordings, names):
         try:
             row = row_of_result(calibrate(*pair, **options).to_dict()) | {"error": None}
         except HandEyeCalibError as error:
@@ -128,10 +131,16 @@ def calibrate_many(
     return data_frame(rows, "name")
 
 
-def _named(names: Sequence[str] | None) -> Iterator[str]:
-    if names is not None and len(set(names)) < len(names):
-        raise InputError(f"expected different names, found {', '.join(names)}")
-    return iter(names) if names is not None else map(str, count(1))
+def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tuple[str, _Pair]]:
+    """Each recording with its name."""
+    if isinstance(recordings, Mapping):
+        names, recordings = [*recordings], recordings.values()
+    pairs = [*recordings]
+    if not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
+        raise InputError("each recording must be a pair of parent and child: [(parent, child)]")
+    if names is not None and len(set(names)) < len(pairs):
+        raise InputError(f"expected {len(pairs)} different names, found {', '.join(names)}")
+    return zip(names or map(str, count(1)), pairs, strict=False)
 
 
 def row_of_result(calibration: Document) -> Document:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import Trajectory, WithArrays
 from hand_eye_calib.simulation import options
 
 # Start of the published drives, heading along x; in units of the surface's arguments.
@@ -30,8 +30,8 @@ _LARGEST_OFFSET_M, _JUMP_VARIANCE = 0.5, 0.02
 _NO_NOISE = options.NoiseConfig()
 
 
-@dataclass(frozen=True)
-class SimulatedDrive:
+@dataclass(frozen=True, eq=False)
+class SimulatedDrive(WithArrays):
     """Trajectories as both sensors report them, and the truth.
 
     Attributes

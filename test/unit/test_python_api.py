@@ -150,12 +150,12 @@ class TestResiduals:
         result = hec.calibrate(parent, jumped, method=name, reference="B2", checks=False)
         residuals = result.residuals()
         assert len(residuals) == result.n_pairs
+        assert residuals == residuals[:] != residuals[1:]
         assert residuals.is_inlier.sum() == result.n_inliers
         step_ns = 100_000_000 * (2 if METHODS[result.method].uses_reference else 1)
         assert set(residuals.end_ns - residuals.start_ns) == {step_ns}
-        crosses = (residuals.start_ns < parent.stamps_ns[40]) & (
-            residuals.end_ns >= parent.stamps_ns[40]
-        )
+        crosses = residuals.start_ns < parent.stamps_ns[40]
+        crosses &= residuals.end_ns >= parent.stamps_ns[40]
         error_m = np.linalg.norm((result.T_parent_child - motions.T_PARENT_CHILD)[:3, 3])
         assert METHODS[name].rejects_outliers == (error_m < 1e-4)
         assert METHODS[name].rejects_outliers == (result.n_inliers < result.n_pairs)

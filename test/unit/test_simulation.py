@@ -22,6 +22,7 @@ from hand_eye_calib.simulation.drive import simulate_drive, surface
 
 def test_noise_free_sensors_move_as_one_body():
     drive = simulate_drive(4)
+    assert drive == simulate_drive(4) != simulate_drive(5)
     pairs = motion_pairs(drive.parent.poses, drive.child.poses, "B5")
     np.testing.assert_allclose(
         pairs.Ts_parenti_parentj @ drive.T_parent_child,

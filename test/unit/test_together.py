@@ -121,12 +121,14 @@ def test_python_takes_pairs_of_trajectories():
     np.testing.assert_allclose(joint.T_parent_child, T_PARENT_CHILD, atol=3e-3)
     assert [each.name for each in joint.together.recordings] == ["monday", "tuesday"]
     assert (joint.parent_frame, joint.child_frame) == ("lidar", "camera")
-    table = hec.calibrate_many([*pairs, (pairs[0][0][:5], pairs[0][1][:5])], checks=False)
-    assert list(table.index) == ["1", "2", "3"]
-    assert table.error.isna().tolist() == [True, True, False]
-    assert table.x_m["1"] == pytest.approx(T_PARENT_CHILD[0, 3], abs=3e-3)
+    named = {"a": pairs[0], "b": pairs[1], "c": (pairs[0][0][:5], pairs[0][1][:5])}
+    table = hec.calibrate_many(named, checks=False)
+    assert table.error.isna().to_dict() == {"a": True, "b": True, "c": False}
+    assert table.x_m["a"] == pytest.approx(T_PARENT_CHILD[0, 3], abs=3e-3)
     with pytest.raises(InputError, match="monday: "):
         hec.calibrate_together([(pairs[0][0], 3)], ["monday"])
+    with pytest.raises(InputError, match="a pair of parent and child"):
+        hec.calibrate_many(pairs[0])
 
 
 # ---- results of one rig agree, scatter, or have one among them that does not belong there

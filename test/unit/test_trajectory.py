@@ -69,10 +69,7 @@ def test_shift_and_scale_keep_everything_else():
 
 
 def test_equal_trajectories_have_the_same_poses_stamps_and_frames():
-    trajectory, other = (
-        Trajectory(STAMPS, POSES, "lidar"),
-        Trajectory(STAMPS, POSES.copy(), "lidar"),
-    )
+    trajectory, other = (Trajectory(STAMPS, each, "lidar") for each in (POSES, POSES.copy()))
     assert trajectory == other
     changed = other.shifted(1.0), other.scaled(2.0), other[:2], replace(other, sensor_frame="")
     assert trajectory not in [*changed, "lidar"]

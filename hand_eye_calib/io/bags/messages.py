@@ -206,7 +206,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
 # ---- poses in columns
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseTable(Columns):
     """N poses of streams, "parent" or "child", in columns (N,), in the order of bag time.
 

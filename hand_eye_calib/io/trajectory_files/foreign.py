@@ -299,8 +299,8 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
             stamps, Ts = stamps[inside], attitudes.at(1000 * stamps[inside])
             Ts[:, :3, 3] = places[inside]
     except Exception as error:  # of many kinds, at damaged logs
-        reason = f"{type(error).__name__}: {error}"
-        raise ValueError(f"a log of PX4 without {' or '.join(topics[:2])}, {reason}") from None
+        reason = "" if isinstance(error, KeyError) else f", {type(error).__name__}: {error}"
+        raise ValueError(f"a log of PX4 without {' or '.join(topics[:2])}{reason}") from None
     flip = np.diag([*np.diag(_FLIP), 1.0])
     rows = np.c_[stamps, _as_rows(flip @ Ts @ flip)].tolist()
     note = "axes: x forward, y left, z up, in north, west, up; PX4 has forward, right, down"
