@@ -53,8 +53,8 @@ def deliver(
     if arguments.out:
         from hand_eye_calib.io.results import keep_earlier_results, save_result
 
-        keep_earlier_results(arguments.out)
-        note(f"wrote {save_result(calibration, arguments.out, inputs)}")
+        kept = keep_earlier_results(arguments.out)
+        note(f"wrote {save_result(calibration, arguments.out, inputs)}{kept}")
     steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     print_result(as_lines(calibration, steps, arguments.verbose), document)

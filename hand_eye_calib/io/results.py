@@ -132,18 +132,19 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
     return yaml_text({**document, "provenance": provenance})
 
 
-def keep_earlier_results(directory: str | Path) -> None:
-    """Copy the result files of a directory into its folder ``previous`` before they are replaced;
-    an InputError if that is not possible.
+def keep_earlier_results(directory: str | Path) -> str:
+    """Copy the result files and the report of a directory into its folder ``previous`` before they
+    are replaced; returns words about it, empty if there are none. An InputError if that fails.
     """
-    previous = Path(directory, "previous")
-    found = [path for name in _NAMES if (path := Path(directory, name)).exists()]
+    previous, names = Path(directory, "previous"), (*_NAMES, "report.html")
+    found = [path for name in names if (path := Path(directory, name)).exists()]
     try:
         if found:
             previous.mkdir(exist_ok=True)
         write_atomically({previous / path.name: read_bytes(path) for path in found})
     except OSError as error:
         raise InputError(f"cannot keep {error.filename} in {previous}: {error.strerror}") from None
+    return f"; the files that were there are in {previous}" if found else ""
 
 
 def fingerprint(path: str | Path) -> dict[str, Any]:

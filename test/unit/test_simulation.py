@@ -51,9 +51,8 @@ def test_sensors_at_different_rates_are_on_one_body():
 
 
 def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
-    config = dataclasses.replace(
-        options.DriveConfig(), terrain_height=0.0, poses=2001, parent_rate=100.0
-    )
+    fast = {"terrain_height": 0.0, "poses": 2001, "parent_rate": 100.0}
+    config = dataclasses.replace(options.DriveConfig(), **fast)
     poses = simulate_drive(7, config).parent.poses
     yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
     yaw_rates = np.diff(yaw) * 100.0

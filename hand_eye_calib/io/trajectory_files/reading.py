@@ -362,7 +362,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
 
 def _decoded(path: str | Path, data: bytes) -> str:
     try:
-        return data.decode("utf-8-sig")
+        return data.replace(b"\0", b"\xff").decode("utf-8-sig")  # no text has a zero
     except UnicodeDecodeError:
         raise InputError(
             f"{path}: not a text file; expected lines of a trajectory: save the poses of MATLAB, "
