@@ -93,7 +93,7 @@ class CalibratorNode(Node):
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
         self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
-        hooks = self._answered.trigger, self._robot.complete, self._publish_result
+        hooks = self._answered.trigger, self._robot.complete, self._publish
         self._cycle = SolveCycle(self._session, self._log, *hooks, config.targets)
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
@@ -195,13 +195,11 @@ class CalibratorNode(Node):
         self._tf.look(self._cycle.result, self._why_not_broadcast())
         if self._mount is not None:
             self._mount.look()
+        if not has_ended:
+            self.take_messages()  # which a slow computer has kept waiting
         clock_ns = self.get_clock().now().nanoseconds
         self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
         self._cycle.tell_who_waits()
-
-    def _publish_result(self) -> None:
-        self.take_messages()  # those that have waited for what was done with the result
-        self._publish()
 
     def _why_not_broadcast(self) -> str:
         result, progress = self._cycle.result, self._cycle.goal.progress

@@ -1,6 +1,6 @@
 """The subscriptions of the node's inputs: from a topic, or from transforms, to poses."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -31,16 +31,39 @@ _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, Assertio
 Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
 
 
-class TopicInput(PoseInput):
+class RosInput(PoseInput):
+    """An input that subscribes; with each subscription, what is called with a message and its info.
+    The parts are those of :class:`~hand_eye_calib.live.input.PoseInput`.
+    """
+
+    def __init__(self, name: str, topic: str, parts: Parts) -> None:
+        super().__init__(name, topic, *parts)
+        self._subscribed: list[tuple[Subscription, Callable[[Any, dict[str, Any]], None]]] = []
+
+    def take_waiting(self) -> bool:
+        """Take the messages that wait in the queues; whether there were any."""
+        before = self._arrived
+        for subscription, callback in self._subscribed:
+            with subscription.handle:
+                for _ in range(subscription.qos_profile.depth):
+                    taken = subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    )
+                    if taken is None:
+                        break
+                    callback(*taken)
+        return self._arrived > before
+
+
+class TopicInput(RosInput):
     """Subscribes to the poses of one sensor: to messages of the wanted type, or "auto" for that of
-    the publishers. The parts are those of :class:`~hand_eye_calib.live.input.PoseInput`.
+    the publishers.
     """
 
     def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
         self._relative_topic = f"{name}_odom"
-        super().__init__(name, node.resolve_topic_name(self._relative_topic), *parts)
+        super().__init__(name, node.resolve_topic_name(self._relative_topic), parts)
         self._node, self._wanted_type = node, wanted_type
-        self._subscription: Subscription | None = None
         self._n_publishers = 0
 
     def discover(self) -> None:
@@ -64,7 +87,7 @@ class TopicInput(PoseInput):
             self._log.warning(
                 f"{self.topic}: {self.problem}: remap {self._relative_topic} to a topic with poses"
             )
-        if self._subscription is not None or not (usable or is_wanted):
+        if self._subscribed or not (usable or is_wanted):
             return
         try:
             self._subscribe((usable or wanted)[0])
@@ -77,8 +100,8 @@ class TopicInput(PoseInput):
     def _why_deaf(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Why the middleware brings nothing of these publishers; empty if it does."""
         offered = {each.qos_profile.reliability for each in publishers}
-        own = self._subscription.qos_profile.reliability if self._subscription else None
-        if own is not ReliabilityPolicy.RELIABLE or offered != {ReliabilityPolicy.BEST_EFFORT}:
+        own = {each.qos_profile.reliability for each, _ in self._subscribed}
+        if own != {ReliabilityPolicy.RELIABLE} or offered != {ReliabilityPolicy.BEST_EFFORT}:
             return ""
         return "it is published best effort, and qos_overrides ask for reliable: leave them out"
 
@@ -89,7 +112,7 @@ class TopicInput(PoseInput):
         # With two arguments, rclpy passes the info as well, which its annotations do not know.
         callback: Any = self._receive
         try:
-            self._subscription = self._node.create_subscription(
+            subscription = self._node.create_subscription(
                 message_class(type_name),
                 self._relative_topic,
                 callback,
@@ -103,14 +126,8 @@ class TopicInput(PoseInput):
             raise ConfigError(
                 f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
             ) from error
+        self._subscribed = [(subscription, callback)]
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
-
-    def take_waiting(self) -> bool:
-        """Take the messages that wait; whether there were any."""
-        before = self._arrived
-        for each in waiting_messages(self._subscription):
-            self._receive(*each)
-        return self._arrived > before
 
     def _receive(self, data: bytes, info: dict[str, Any]) -> None:
         # With several publishers, or none any more, the numbers of lost messages are not known.
@@ -124,19 +141,17 @@ class TopicInput(PoseInput):
         self.accept(stamp_ns, partial(self._read, data))
 
 
-class TfInput(PoseInput):
-    """Takes the poses of one sensor, parent or child, from ``/tf`` and ``/tf_static``. The parts
-    are those of :class:`~hand_eye_calib.live.input.PoseInput`.
-    """
+class TfInput(RosInput):
+    """Takes the poses of one sensor, parent or child, from ``/tf`` and ``/tf_static``."""
 
     def __init__(self, node: Node, name: str, source: TfSource, parts: Parts) -> None:
-        super().__init__(name, str(source), *parts)
+        super().__init__(name, str(source), parts)
         self._stream = TfStream(source, max_gap_s=0.0)
-        self._subscriptions: dict[str, Subscription] = {}
         kind = message_type(f"{name}_tf")
         for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, quick())):
             heard: Any = partial(self._hear, topic)
-            self._subscriptions[topic] = node.create_subscription(kind, topic, heard, qos)
+            subscription = node.create_subscription(kind, topic, heard, qos)
+            self._subscribed.append((subscription, heard))
 
     def configure(self, config: CalibratorConfig) -> None:
         super().configure(config)
@@ -147,30 +162,10 @@ class TfInput(PoseInput):
         """Say what is missing; to be called often."""
         self.problem = self._stream.describe_missing()
 
-    def take_waiting(self) -> bool:
-        """Take the messages that wait; whether there were any."""
-        before = self._arrived
-        for topic, subscription in self._subscriptions.items():
-            for message, _ in waiting_messages(subscription):
-                self._hear(topic, message)
-        return self._arrived > before
-
-    def _hear(self, topic: str, message: Any) -> None:
+    def _hear(self, topic: str, message: Any, info: dict[str, Any]) -> None:
         for transform in map(from_transform, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
                     self.accept(pose.stamp_ns, partial(PoseFields, *pose))
             except InputError as error:
                 self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
-
-
-def waiting_messages(subscription: Subscription | None) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Messages that wait in a subscription's queue, each with its info."""
-    if subscription is None:
-        return
-    with subscription.handle:
-        for _ in range(subscription.qos_profile.depth):
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                return
-            yield taken
