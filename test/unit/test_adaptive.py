@@ -340,9 +340,6 @@ def test_no_motion_at_all_is_no_number():
     assert all(verdicts[axis] is DofVerdict.UNOBSERVABLE for axis in "xyz")
 
 
-# ---- which systematic errors are assumed
-
-
 def mixture(number):
     """Poses of a drive with the paper's mixture of errors, and the true extrinsic."""
     drive = simulate_drive((0, number), DriveConfig(poses=200))

@@ -14,8 +14,8 @@ from source_code import SOURCE, imports_of, room_of
 ROOT = SOURCE.parent
 
 # What may not be exceeded: the sizes of today, which may only be lowered, but lines, constants and
-# long functions, which have goals of 30,000, 400 and 10. Goals still ahead: 19,000 lines of code,
-# 450 functions in 50 files entered by ``calibrate a b``, 19,000 lines of tests.
+# long functions, which have goals of 30,000, 400 and 10. Goal still ahead:
+# 450 functions entered by ``calibrate a b``.
 LIMITS = {
     "lines": 29_510,
     "lines of code": 19_000,
@@ -28,7 +28,7 @@ LIMITS = {
     "functions entered by calibrate": 546,
     "files entered by calibrate": 52,
     "lines of reproduction": 6_960,
-    "lines of tests": 19_070,
+    "lines of tests": 19_000,
     "words of documentation": 34_850,
 }
 

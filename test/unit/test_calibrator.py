@@ -169,9 +169,6 @@ def test_a_snapshot_does_not_change_when_poses_come_in():
     assert calibrator.estimate().n_poses > before.n_poses
 
 
-# ---- sessions of hours
-
-
 # 10 s at 10 Hz, so that a short drive outgrows the buffers many times; half a second for late
 # arrivals.
 SMALL = BufferLimits(capacity=500, pairing_starts=100, batch=16, batch_every=4, late_ns=500_000_000)
@@ -280,7 +277,7 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     feed(calibrator, "child", child)
     snapshot = calibrator.snapshot().resolved
     calibrator.adopt(snapshot.time_offset)
-    monkeypatch.setattr("hand_eye_calib.engine.calibrator.estimated_time_offset", None)
+    monkeypatch.setattr("hand_eye_calib.engine.snapshot.estimated_time_offset", None)
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)
     assert calibrator.estimate().time_offset_s == snapshot.time_offset.seconds

@@ -38,9 +38,6 @@ def matrix(text):
     return np.array(json.loads(text)["T_parent_child"]["matrix"])
 
 
-# ---- sources
-
-
 def write_session(directory, options, *given):
     """The journal of a node that has heard both trajectories."""
     streams = {"parent": (PARENT, "/a"), "child": (CHILD, "/b")}
@@ -124,9 +121,6 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
     np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
 
 
-# ---- several bags
-
-
 def parts_of(tmp_path, slices, later_s=0.0):
     """Bags of parts of the drive, all but the first so much later."""
     paths = []
@@ -165,9 +159,6 @@ def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, r
     code, out, err = run(*paths, "--topics", "/a", "/b", "/a")
     assert (code, out) == (1, "")
     assert reason in err
-
-
-# ---- listing
 
 
 def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):

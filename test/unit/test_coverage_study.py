@@ -165,9 +165,6 @@ def test_every_real_set_can_be_read():
             assert min(len(recording.parent), len(recording.child)) > 100
 
 
-# ---- the study of faults
-
-
 def test_there_are_more_than_a_hundred_clean_recordings_of_more_than_ten_kinds():
     names = clean_recordings.names(None)
     assert len(names) == len(set(names)) > 100

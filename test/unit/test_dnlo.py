@@ -82,9 +82,6 @@ def test_ipopt_and_the_fast_backend_agree(method, jumpy_pairs):
         np.testing.assert_allclose(fast.T_parent_child, ipopt.T_parent_child, atol=1e-5)
 
 
-# ---- the quadratic form
-
-
 @pytest.fixture
 def pairs():
     return noisy_pairs(1)
@@ -120,9 +117,6 @@ def test_gauss_newton_steps_reach_the_minimum(pairs):
     for _ in range(12):
         stepped = quadratic_form.gauss_newton_step(Q[None], stepped)
     np.testing.assert_allclose(stepped, T, atol=1e-8)
-
-
-# ---- the proof
 
 
 HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])

@@ -108,9 +108,6 @@ def test_a_vehicle_is_told_to_drive_over_a_ramp():
     )
 
 
-# ---- rotation about one axis only: the verdict, the finding and the hint agree
-
-
 def chords(rotation_vectors):
     return se3.rotation_exp(np.asarray(rotation_vectors, dtype=float)) - np.eye(3)
 

@@ -292,8 +292,6 @@ def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):
     assert "same" in capsys.readouterr().out
 
 
-# ---- the pages
-
 DOCS = ROOT / "docs" / "exports"
 CAMERA = se3.from_rotation_translation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.12, 0.05, 0.3])
 LIDAR = se3.from_rotation_translation([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.12, 0.05, 0.3])

@@ -32,9 +32,6 @@ def one_line(error):
     return text
 
 
-# ---- YAML
-
-
 HOSTILE_YAML = {
     "aliases": ("a: &a [x]\nb: *a", "aliases are not read: write out the value of 'a'"),
     "deep flow": ("[" * 100_000, "nest"),
@@ -124,18 +121,12 @@ def test_a_name_that_is_too_long_for_a_file_is_one_line(run, tmp_path, command):
     assert len(err) < 200
 
 
-# ---- batches
-
-
 @pytest.mark.parametrize("state", ["5", "[" * 100_000, '{"key": 1}\n{}', '{"key": "K"}\n{}'])
 def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
     task = Task(name="a", bags=("absent",))
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "batch.jsonl").write_text(state.replace("K", task.key()))
     assert stored(task, tmp_path) is None
-
-
-# ---- trajectories as text
 
 
 def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
@@ -207,9 +198,6 @@ def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     with pytest.raises(InputError, match=f"parent, line {3 + (format == 'csv')}: ") as caught:
         motions.read_trajectory_file(path, format, **options)
     one_line(caught)
-
-
-# ---- results
 
 
 @pytest.fixture

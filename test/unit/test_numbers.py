@@ -35,9 +35,6 @@ def test_the_quantile_of_chi_square_is_that_of_scipy(tail):
     assert stats.chi_square_quantile(tail) == pytest.approx(chi2.isf(tail, 6), rel=1e-12)
 
 
-# ---- numbers as people read them
-
-
 @pytest.mark.parametrize(
     ("value", "sigma", "text"),
     [

@@ -241,9 +241,6 @@ def test_colcon_installed_commands_run(install_space):
     assert MANIFEST.findtext("version") in said
 
 
-# ---- workflows of the forge
-
-
 WORKFLOWS = {
     path.stem: yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"]
     for path in (ROOT / ".github" / "workflows").glob("*.yml")
@@ -283,9 +280,6 @@ def test_what_ci_runs_here_runs_there_and_on_every_declared_python():
     declared = re.findall(r"Programming Language :: Python :: (3\.\d+)", setup)
     assert WORKFLOWS["ci"]["test"]["strategy"]["matrix"]["python"] == declared
     assert f'python_requires=">={declared[0]}"' in setup
-
-
-# ---- layouts for RViz and Foxglove
 
 
 CONFIG = ROOT / "config"

@@ -49,9 +49,6 @@ def noisy():
     return random_pairs(noise=0.03)
 
 
-# Metrics
-
-
 def test_relative_errors_of_a_pair_worked_out_by_hand():
     # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t +
     # t_A - R t_B - t = (-1, 2, 0) - t_B.
@@ -75,9 +72,6 @@ def test_absolute_errors_keep_their_digits_at_any_angle(angle):
     assert e_aR == pytest.approx(angle, abs=1e-15, rel=1e-9)
 
 
-# Park and Taylor
-
-
 def test_park_aligns_the_rotation_vectors(noisy):
     rotvecs = [
         se3.rotation_log(T[:, :3, :3]) for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)
@@ -94,9 +88,6 @@ def test_rotation_is_never_a_reflection():
     motions = se3.exp(np.array([*twists, [0.2, 0.2, 0.1, 0.3, 0.3, 0.0]]))
     pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
     np.testing.assert_allclose(all_pairs.solve_park(pairs).T_parent_child, TRUTH, atol=1e-12)
-
-
-# Zhuang
 
 
 def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
@@ -120,9 +111,6 @@ def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
     angle = np.linalg.norm(rotvec)
     found = np.r_[np.tan(angle / 2) * rotvec / angle, translation]
     np.testing.assert_allclose(minimize(cost, found, tol=1e-10).x, found, atol=1e-5)
-
-
-# Ali
 
 
 def test_ali_minimises_the_translation_residual_over_rotations(noisy):

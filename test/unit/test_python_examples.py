@@ -65,9 +65,6 @@ def test_the_roles_may_be_exchanged(names):
     assert (there == "another", there == there.inverse()) == (False, False)
 
 
-# ---- the folder examples/
-
-
 EXAMPLES = ROOT / "examples"
 
 

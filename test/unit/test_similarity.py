@@ -88,9 +88,6 @@ def test_a_scale_that_explains_nothing_is_refused():
     assert calibrate(parent, other, reference="B10", scale="auto").scale == 1.0
 
 
-# ---- the clock offset
-
-
 RATES_HZ = 20.0, 33.0
 
 

@@ -160,9 +160,6 @@ class TestOneStreamComputedFromTheOther:
         assert "not_independent" not in [each.code for each in found]
 
 
-# ---- a mount that moved within a recording
-
-
 SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]
 
 

@@ -75,9 +75,6 @@ def test_equal_trajectories_have_the_same_poses_stamps_and_frames():
     assert trajectory not in [*changed, "lidar"]
 
 
-# ---- poses between those of a trajectory
-
-
 HZ = 10
 
 

@@ -17,9 +17,6 @@ from hand_eye_calib.io.trajectory_files.reading import AUTO, FileOptions, read_t
 SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
 
 
-# ---- the order of quaternions
-
-
 def write_unnamed(path, trajectory, order, separator=" "):
     """Eight numbers in each line, and no header."""
     quats = se3.to_quat_xyzw(trajectory.poses)[:, order]
@@ -76,9 +73,6 @@ def test_only_auto_guesses(tmp_path):
     assert read_trajectory_file(path).guesses == []
     with pytest.raises(InputError, match="so that their order is unknown; name the 8 with"):
         read_trajectory_file(path, "csv")
-
-
-# ---- angles
 
 
 def table(path, header, *columns):
@@ -193,9 +187,6 @@ def test_files_with_the_same_columns_that_no_convention_fits_are_refused(tmp_pat
     assert "have the same columns, but no convention of their angles fits the motion" in error
 
 
-# ---- latitude and longitude
-
-
 @pytest.mark.parametrize(
     ("header", "unit"),
     [
@@ -244,9 +235,6 @@ def test_the_example_of_the_epsg_for_metres_east_north_and_up_of_a_place():
     origin.geodetic = *np.radians([55.0, 5.0]), 200.0
     found = origin.local(np.array([lat]), np.array([lon]), np.array([73.0]))
     np.testing.assert_allclose(found, [[-189013.869, -128642.040, -4220.171]], atol=1e-3)
-
-
-# ---- published files
 
 
 def test_published_files_need_no_options():
