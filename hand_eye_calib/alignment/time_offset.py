@@ -311,7 +311,7 @@ def refine_time_offset(
     best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation), start
     held: list[float] = []
     for lag_s in _LAGS_S:
-        found = _fine_offset(parent, child, correlation, lag_s, max_gap_s, fit, least_s)
+        found = offset_over(lag_s, parent, child, correlation, max_gap_s, fit, least_s)
         if (fit := found.fit) is None:
             continue
         holds = fit.explains_translation and abs(found.seconds - correlation.offset_s) <= reach_s
@@ -323,17 +323,18 @@ def refine_time_offset(
     return replace(best, spread_s=np.ptp(held)) if len(held) == len(_LAGS_S) else best
 
 
-def _fine_offset(
+def offset_over(
+    lag_s: float,
     parent: Trajectory,
     child: Trajectory,
     correlation: Correlation,
-    lag_s: float,
     max_gap_s: float,
-    fit: SimilarityFit | None,
+    start: SimilarityFit | FloatArray | None,
     least_s: float,
 ) -> TimeOffset:
-    """Offset and fit over motions of ``lag_s``; no fit if there are too few. A clearly smaller
-    offset than ``least_s`` is not refined, others no better than that asks for.
+    """Offset and fit over motions of ``lag_s``, from the coarse offset and a fit, or X, to start
+    at; no fit if there are too few. A clearly smaller offset than ``least_s`` is not refined,
+    others no better than that asks for.
     """
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
@@ -353,11 +354,11 @@ def _fine_offset(
         steps, spans_s = se3.log(se3.inverse(before) @ after), np.diff(ends_ns, axis=0)[0] * 1e-9
         twists = (steps / spans_s[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
-        fit = fit_similarity(pairs, of_child, start=fit)
+        start = fit = fit_similarity(pairs, of_child, start=start)
         if not fit.explains_translation:
             # A body that rotates about one of its sensors shows no scale.
             in_one_unit = fit_similarity(pairs, of_child, same_unit=True)
-            fit = in_one_unit if in_one_unit.explains_translation else fit
+            start = fit = in_one_unit if in_one_unit.explains_translation else fit
         speed = float(np.sqrt(np.mean((twists[:, 3:] ** 2).sum(axis=1))))
         of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(speed, 1e-9)
         span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))
@@ -370,7 +371,6 @@ def _fine_offset(
                 break
             most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
     known = rate if np.isfinite(rate.sigma_ppm) else None
-    assert fit is not None
     return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known)
 
 

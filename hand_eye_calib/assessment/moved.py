@@ -30,19 +30,12 @@ from enum import Enum
 
 import numpy as np
 
+from hand_eye_calib import stats
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.results.records import AXES, AxisDifference
-from hand_eye_calib.stats import (
-    CHI2,
-    LARGEST_OF_SIX,
-    NINE_TIMES_OUT_OF_TEN,
-    median,
-    robust_sigma,
-    student_weights,
-)
 from hand_eye_calib.text import amount, angle, length, listing
 
 # Shifts that are looked for: one standard deviation per axis (m, rad).
@@ -151,15 +144,16 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
     sigmas = np.sqrt(np.diag(covariance))
     chi2 = float(values @ np.linalg.solve(covariance, values))
     sigmas = np.where(sigmas > UNKNOWN_FROM, np.inf, sigmas)
-    visible = (LARGEST_OF_SIX + NINE_TIMES_OUT_OF_TEN) * sigmas
+    largest = stats.LARGEST_OF_SIX
+    visible = (largest + stats.NINE_TIMES_OUT_OF_TEN) * sigmas
     verdicts = [
-        Change.MOVED if ratio > LARGEST_OF_SIX else Change.SAME if seen else Change.CANNOT_TELL
+        Change.MOVED if ratio > largest else Change.SAME if seen else Change.CANNOT_TELL
         for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
     ]
     columns = (each.tolist() for each in (values, sigmas, visible))
     rows = zip(*columns, (each.value for each in verdicts), strict=True)
     axes = {axis: AxisDifference(*row) for axis, row in zip(AXES, rows, strict=True)}
-    return Moved(axes, Change.MOVED if chi2 > CHI2[0.001][6] else Change.of_all(verdicts))
+    return Moved(axes, Change.MOVED if chi2 > stats.CHI2[0.001][6] else Change.of_all(verdicts))
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
@@ -244,11 +238,11 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariance (6, 6) of residuals (K, 6) whose noise is Student's t, and the weight (K,) of
     each: 1 on average, small for jumps.
     """
-    sigmas = np.repeat([robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3)
+    sigmas = np.repeat([stats.robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3)
     covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
     for _ in range(_ROUNDS):
         squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)
-        weights = student_weights(squared)
+        weights = stats.student_weights(squared)
         scatter = (weights[:, None] * residuals).T @ residuals / len(residuals)
         covariance = scatter + np.diag(_LEAST_SIGMA**2)
     return covariance, weights
@@ -311,7 +305,7 @@ def _by_second(
     """Starts (N,) of the seconds of a recording, H (N, 6, 6) and S (N, 6) of each."""
     stamps_ns = pose_pairs.stamps_ns
     duration_ns = int(stamps_ns[-1] - stamps_ns[0])
-    lag_s = max(_BLOCK_NS, median(np.diff(stamps_ns))) * 1e-9
+    lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
     most = max(duration_ns * _MOTIONS_PER_BLOCK // _BLOCK_NS, 2)
     pairs = pairs_over(pose_pairs, lag_s, most)
     residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)

@@ -2,7 +2,8 @@
 little of the motion unexplained and yet spoil the extrinsic.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -105,12 +106,16 @@ def check_agreement(
     change = find_change(pose_pairs, X)
     slow, axes = response(pose_pairs, motions, X, change.at_ns if change else None)
     speed = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
-    tried = [_world_drift(slow, pose_pairs, speed), _rotation_gain(slow, axes)]
-    tried += [_turned(slow, stream) for stream in (*_STREAMS, "both")]
-    tried += [_axis_gain(slow, stream) for stream in _STREAMS]
+    tried: dict[str, Callable[[], Finding | None]] = {
+        "drift": lambda: _world_drift(slow, pose_pairs, speed),
+        "gain": lambda: _rotation_gain(slow, axes),
+        **{f"turned_{each}": partial(_turned, slow, each) for each in (*_STREAMS, "both")},
+        **{f"axes_{each}": partial(_axis_gain, slow, each) for each in _STREAMS},
+    }
     if change:
-        tried += [_moved_mount(slow, change, int(pose_pairs.stamps_ns[0]))]
-    suspects = [max(tried, key=lambda each: each[0])]
+        tried["moved"] = lambda: _moved_mount(change, int(pose_pairs.stamps_ns[0]))
+    most = max(tried, key=slow.share)
+    suspects: list[_Suspect] = [(slow.share(most), tried[most]())]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
     if fast := delays(pose_pairs, motions, X):
         suspects += _delays(fast, pose_pairs, speed, offset_s)
@@ -124,8 +129,9 @@ def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Findi
     """Finding about a coordinate that explains why two streams with the same rotations disagree."""
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     slow, _ = response(pose_pairs, motions, X)
-    share, found = max((_axis_gain(slow, stream) for stream in _STREAMS), key=lambda each: each[0])
-    return [found] if found and share > _MOST else []
+    stream = max(_STREAMS, key=lambda each: slow.share(f"axes_{each}"))
+    is_most = slow.share(f"axes_{stream}") > _MOST
+    return [*filter(None, [_axis_gain(slow, stream)])] if is_most else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -148,7 +154,7 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     return [finding(key, "both", severity, size=size, translation_m=distance_m)]
 
 
-def _rotation_gain(slow: Regression, axes: FloatArray) -> _Suspect:
+def _rotation_gain(slow: Regression, axes: FloatArray) -> Finding | None:
     """A gain of the child's rotations about an axis."""
     fitted, biases = slow.fit("gain"), slow.biases("gain")
     sigmas, least, *_ = LIMITS["rotation_gain"]
@@ -157,22 +163,22 @@ def _rotation_gain(slow: Regression, axes: FloatArray) -> _Suspect:
     ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
-        return fitted.share, None
+        return None
     axis, gain = ", ".join(f"{component:.2f}" for component in axes[:, k]), fitted.values[k]
     values = {"axis": axis, "gain": 1.0 + gain, "sigma": fitted.sigmas[k]}
-    return fitted.share, graded("rotation_gain", "child", gain, **values)
+    return graded("rotation_gain", "child", gain, **values)
 
 
-def _turned(slow: Regression, stream: str) -> _Suspect:
+def _turned(slow: Regression, stream: str) -> Finding | None:
     """Positions of a stream that are turned against its orientations."""
     fitted = slow.fit(f"turned_{stream}")
     sizes, (sigmas, least, *_) = np.abs(fitted.values), LIMITS["worlds_turned"]
     limits = np.hypot(sigmas * fitted.sigmas, _BIASES * slow.biases(f"turned_{stream}"))
     if (sizes < limits).all() or sizes.max() < least:
-        return fitted.share, None
+        return None
     turned_rad = float(np.linalg.norm(sizes))
     values = {"axis": "xyz"[int(np.argmax(sizes))], "turned_deg": float(np.degrees(turned_rad))}
-    return fitted.share, graded("worlds_turned", stream, turned_rad, **values)
+    return graded("worlds_turned", stream, turned_rad, **values)
 
 
 def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
@@ -191,45 +197,45 @@ def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
     return best
 
 
-def _axis_gain(slow: Regression, stream: str) -> _Suspect:
+def _axis_gain(slow: Regression, stream: str) -> Finding | None:
     """A coordinate of a stream that has another scale than the others."""
-    fitted = slow.fit(f"axes_{stream}", without="scale")
+    fitted = slow.fit(f"axes_{stream}")
     k, off, sigma = _odd_one(fitted)
     of_noise = slow.biases(f"axes_{stream}")[k]
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
     if abs(off) < _BIASES * (of_noise + of_drift):
-        return fitted.share, None
+        return None
     size = off if fitted.share > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
     values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-    return fitted.share, graded("axis_scale", stream, size, sigma, **values)
+    return graded("axis_scale", stream, size, sigma, **values)
 
 
-def _moved_mount(slow: Regression, change: MountChange, start_ns: int) -> _Suspect:
+def _moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     """A mount that has moved."""
-    share, sigmas = slow.fit("moved").share, np.sqrt(np.diag(change.covariance))
+    sigmas = np.sqrt(np.diag(change.covariance))
     known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
     if change.log_ratio < SIGNIFICANT:
-        return share, None
+        return None
     size = max(moved_m, moved_rad)
     if change.log_ratio < 2.0 * SIGNIFICANT:
         size = min(size, LIMITS["mount_moved"][-1])
     told = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
     values = {"size": told, "at_s": (change.at_ns - start_ns) * 1e-9}
-    return share, graded("mount_moved", "both", size, **values)
+    return graded("mount_moved", "both", size, **values)
 
 
-def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> _Suspect:
+def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Finding | None:
     """A world that moves against the other."""
     drift, positions = slow.fit("drift"), pose_pairs.Ts_cw_c[:, :3, 3]
     turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(usual, 1e-9)
     if (np.abs(drift.values) < LIMITS["world_drift"][0] * drift.sigmas).all():
-        return drift.share, None
+        return None
     speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
     values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
-    return drift.share, graded("world_drift", "both", share, **values, percent=100 * share)
+    return graded("world_drift", "both", share, **values, percent=100 * share)
 
 
 def _delays(

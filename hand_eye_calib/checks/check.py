@@ -9,34 +9,21 @@ wrong with them.
 4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.alignment import time_offset
-from hand_eye_calib.alignment.similarity import SimilarityFit, estimate_scale, scale_differs
+from hand_eye_calib.alignment import similarity, time_offset
+from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import LeverArms
-from hand_eye_calib.checks.agreement import (
-    Known,
-    check_agreement,
-    check_coordinates,
-    check_independent,
-    check_same,
-)
+from hand_eye_calib.checks import agreement, hypotheses
+from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
-from hand_eye_calib.checks.hypotheses import (
-    HOLDS,
-    LAGS_S,
-    MAX_PAIRS,
-    MIN_PAIRS,
-    Explanation,
-    StreamPair,
-    explain,
-)
+from hand_eye_calib.checks.hypotheses import Explanation, StreamPair
 from hand_eye_calib.checks.streams import (
     check_flat,
     check_frozen,
@@ -90,7 +77,7 @@ def check_streams(
     time_offset_s: float = 0.0,
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
-    correlation: time_offset.Correlation | None = None,
+    correlate: Callable[[], time_offset.Correlation] | None = None,
     known: Known | None = None,
 ) -> CheckResult:
     """Check two streams.
@@ -102,8 +89,8 @@ def check_streams(
         Known: seconds to add to the child's stamps, and factor of its lengths.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
-    correlation : Correlation, optional
-        Of the angular rates of the streams as they are, if it is known.
+    correlate : callable, optional
+        Correlates the angular rates of the streams as they are, which is not always needed.
     known : ((4, 4) array, (6,) array), optional
         An extrinsic of these streams, and its standard deviations.
     """
@@ -111,41 +98,68 @@ def check_streams(
     findings += check_stream(child, "child", max_gap_s)
     if any(each.makes_unusable for each in findings):
         return CheckResult(gravest_first(findings))
-    correlation = correlation or time_offset.correlate_rates(parent, child, max_gap_s)
-    times = correlation.ratio
-    turns = graded("turns", "child", float(np.log(times)), times=times)
-    if turns and 1.0 - correlation.correlation < HOLDS:
-        return CheckResult(gravest_first([*findings, turns]))
-    streams, correlation = _on_one_clock(
-        StreamPair(parent, child.scaled(scale), max_gap_s), time_offset_s, correlation
-    )
+    given = StreamPair(parent, child.scaled(scale), max_gap_s)
+    streams, correlation = given.shifted(time_offset_s), time_offset.Correlation()
+    explanation, offset = _as_they_are(streams, known[0]) if known else (None, None)
+    if not explanation:
+        correlation = (correlate or given.correlate)()
+        times = correlation.ratio
+        turns = graded("turns", "child", float(np.log(times)), times=times)
+        if turns and 1.0 - correlation.correlation < hypotheses.HOLDS:
+            return CheckResult(gravest_first([*findings, turns]))
+        streams, correlation = _on_one_clock(given, time_offset_s, correlation)
     aligned = streams.shifted(correlation.offset_s if correlation.is_clear else 0.0)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
         return CheckResult(gravest_first([*findings, *flat]))
-    start = known[0] if known else None
-    explanation, found = _explained(aligned, correlation, start, is_frozen=bool(frozen))
-    findings += found
-    if explanation is None:
+    if not explanation:
+        start = known[0] if known else None
+        explanation, found = _explained(aligned, correlation, start, is_frozen=bool(frozen))
+        findings += found
+    if not explanation:
         return CheckResult(gravest_first(findings))
-    if not correlation.is_clear:
-        # Short recordings may not show the offset, and yet the streams agree at the given one.
-        correlation = replace(correlation, offset_s=0.0)
     is_sound = not any(each.makes_unusable for each in findings)
     lengths = check_lengths(parent) if is_sound else []
     right = explanation.hypothesis.undo(streams)
-    if right.interval_s > right.max_gap_s:  # too slow to refine it
-        offset = time_offset.TimeOffset(correlation.offset_s, right.interval_s, correlation)
-    else:
-        both = right.parent, right.child, correlation, right.max_gap_s, explanation.fit
-        offset = time_offset.refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
+    offset = offset or _fine_offset(right, correlation, explanation.fit)
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
         findings += _check_agreeing(right, streams, fit, known, time_offset_s + offset.seconds)
     return CheckResult(gravest_first(findings), explanation.fit, offset)
+
+
+def _as_they_are(
+    streams: StreamPair, X: FloatArray
+) -> tuple[Explanation, time_offset.TimeOffset] | tuple[None, None]:
+    """The fit from a known extrinsic X, and the clock offset with it, of streams that clearly agree
+    as they are, on one clock and in one unit; none of others.
+    """
+    least_s, lag_s = LIMITS["time_offset"][1], hypotheses.LAGS_S[1]
+    both = streams.parent, streams.child, time_offset.Correlation()
+    # In one step: it is good to a tenth of what it takes away.
+    offset = time_offset.offset_over(lag_s, *both, streams.max_gap_s, X, 4.0 * least_s)
+    fit, left_s = offset.fit, offset.largest_s(streams.child.duration_s)
+    explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
+    if fit and explains and left_s < least_s:
+        found = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), streams, lag_s)
+        return (None, None) if found.findings else (found, offset)
+    return None, None
+
+
+def _fine_offset(
+    right: StreamPair, correlation: time_offset.Correlation, fit: SimilarityFit
+) -> time_offset.TimeOffset:
+    """What is left of the clock offset in streams that agree by a fit."""
+    if not correlation.is_clear:
+        # Short recordings may not show the offset, and yet the streams agree at the given one.
+        correlation = replace(correlation, offset_s=0.0)
+    if right.interval_s > right.max_gap_s:  # too slow to refine it
+        return time_offset.TimeOffset(correlation.offset_s, right.interval_s, correlation)
+    both = right.parent, right.child, correlation, right.max_gap_s, fit
+    return time_offset.refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
 
 
 def _on_one_clock(
@@ -161,7 +175,7 @@ def _on_one_clock(
         return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
-        if len(found.synchronised) > MIN_PAIRS and (is_near or not correlation.is_clear):
+        if len(found.synchronised) > hypotheses.MIN_PAIRS and (is_near or not correlation.is_clear):
             return found, replace(correlation, offset_s=0.0)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
@@ -174,7 +188,7 @@ def _explained(
 ) -> tuple[Explanation | None, list[Finding]]:
     """The explanation that holds, if there is one, and findings."""
     try:
-        explanation = explain(streams, correlation.is_clear, start)
+        explanation = hypotheses.explain(streams, correlation.is_clear, start)
     except NotEnoughDataError as error:
         if correlation.is_clear:
             return None, [finding("too_short", text=str(error))]
@@ -183,7 +197,7 @@ def _explained(
             return explanation, [*explanation.findings]
         if correlation.is_clear:
             pairs = streams.synchronised
-            found = check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
+            found = agreement.check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
             return None, found or [*explanation.findings]
     if is_frozen:  # nothing is said about its rates
         return None, []
@@ -199,15 +213,16 @@ def _check_sizes(
     """Findings about the scale, beside the one that is known, and the axes of rotation of streams
     that agree, and the fit with the scale. ``timed`` is the fit with the time offset.
     """
-    rotations, fit = _motions(pose_pairs, MAX_PAIRS).Ts_parenti_parentj[:, :3, :3], explanation.fit
+    motions, fit = _motions(pose_pairs, hypotheses.MAX_PAIRS), explanation.fit
+    chords = motions.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
     of_noise = fit.sigma_rotation**2 * np.eye(3)
-    hidden = LeverArms.of(rotations - np.eye(3)).hidden_axes(of_noise)
+    hidden = LeverArms.of(chords).hidden_axes(of_noise)
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
             of_both = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
-            fit = estimate_scale(pose_pairs, of_both)
-            if scale_differs(fit):
+            fit = similarity.estimate_scale(pose_pairs, of_both)
+            if similarity.scale_differs(fit):
                 values: dict[str, Any] = {"scale": fit.scale, "sigma": fit.scale_sigma}
                 values["options"] = {"scale": round(known * fit.scale, 4)}
                 differs = graded("scale", "child", fit.scale - 1.0, **values)
@@ -223,11 +238,11 @@ def _check_agreeing(
     """
     of_fit = fit.T_parent_child, fit.sigmas[:6]
     best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-    if copied := check_independent(given.parent, given.child, right.child):
-        return [*copied, *check_same(*best)]
+    if copied := agreement.check_independent(given.parent, given.child, right.child):
+        return [*copied, *agreement.check_same(*best)]
     pose_pairs = right.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
-    return check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
+    return agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
@@ -291,9 +306,9 @@ def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | 
 
 def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
     """Motions over 3 s, or less if there are too few of those."""
-    motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in LAGS_S)
+    motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in hypotheses.LAGS_S)
     # There are enough over one of the lags: the fit is over it.
-    return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
+    return next(pairs for pairs in motions if len(pairs) >= hypotheses.MIN_PAIRS)
 
 
 def unseen(axes: Sequence[str]) -> Finding:

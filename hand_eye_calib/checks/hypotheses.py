@@ -21,6 +21,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
+from hand_eye_calib.alignment.time_offset import Correlation, correlate_rates
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.checks.findings import (
     CONVENTIONS,
@@ -77,6 +78,10 @@ class StreamPair:
     def interval_s(self) -> float:
         """Median time between poses of the faster stream, s."""
         return min(self.parent.interval_s, self.child.interval_s)
+
+    def correlate(self) -> Correlation:
+        """Correlation of the angular rates of both."""
+        return correlate_rates(self.parent, self.child, self.max_gap_s)
 
     def shifted(self, offset_s: float) -> "StreamPair":
         """The same with another clock of the child."""
@@ -142,7 +147,7 @@ class Hypothesis:
 
     def undo(self, streams: StreamPair) -> StreamPair:
         """Both streams without the mistakes."""
-        if self is _PLAIN:
+        if self is PLAIN:
             return streams
         parent, child = (
             trajectory.Trajectory(given.stamps_ns, self.corrected(stream, given.poses))
@@ -199,7 +204,7 @@ _WAYS: list[_Way] = [
     ("quaternion_names",),
 ]
 _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child in _WAYS]
-_PLAIN = _ALL_WAYS[0]
+PLAIN = _ALL_WAYS[0]
 
 
 # Those that invert both streams besides fit as well, over longer paths.
@@ -238,9 +243,9 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
     failed: list[Explanation] = []
     for lag_s in LAGS_S:
         try:
-            plain = _fitted(_PLAIN, streams, lag_s, start)
+            plain = _fitted(PLAIN, streams, lag_s, start)
             if start is not None and not plain.holds:
-                plain = _fitted(_PLAIN, streams, lag_s)
+                plain = _fitted(PLAIN, streams, lag_s)
         except NotEnoughDataError as error:
             too_few = error
             continue
@@ -249,13 +254,13 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
         if chosen is plain and not plain.holds:
             # A body that rotates about one of its sensors: that one's translations are noise.
-            in_one_unit = _fitted(_PLAIN, streams, lag_s, same_unit=True)
+            in_one_unit = _fitted(PLAIN, streams, lag_s, same_unit=True)
             chosen = in_one_unit if in_one_unit.holds else plain
         if not chosen.holds and thorough and not failed:
             chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:
             chosen, doubts = _or_axes(chosen, streams, lag_s)
-            found = _attributed(chosen, streams, lag_s)
+            found = attributed(chosen, streams, lag_s)
             return replace(found, findings=(*found.findings, *doubts))
         # Jumps spoil long motions more than short ones.
         failed.append(chosen)
@@ -264,9 +269,9 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
     best = min(failed, key=lambda tried: tried.fit.unexplained)
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
-        attributed = _attributed(best, streams, LAGS_S[0])
-        findings = (*attributed.findings, finding("noisy", share=unexplained))
-        return replace(attributed, findings=findings, limit=_NOISY)
+        noisy = attributed(best, streams, LAGS_S[0])
+        findings = (*noisy.findings, finding("noisy", share=unexplained))
+        return replace(noisy, findings=findings, limit=_NOISY)
     share = min(unexplained, 1.0)
     text = f"no extrinsic, scale or usual mistake explains {share:.0%} of the motion"
     return replace(best, findings=(finding("unrelated", text=text, share=share),))
@@ -359,7 +364,7 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
     return chosen, of_chosen < trajectory.STEADY
 
 
-def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
     """The explanation with its findings, after deciding by paths which stream is inverted, or both:
     the fits do not differ.
     """
@@ -383,7 +388,7 @@ def _attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> 
         if is_other:
             hypothesis = hypothesis.inverted()
             explanation = _fitted(hypothesis, streams, lag_s)
-    if hypothesis is _PLAIN:
+    if hypothesis is PLAIN:
         return explanation
     findings = []
     for code, stream in hypothesis.mistakes:

@@ -37,6 +37,9 @@ _BLOCKS = 10
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING, _ROUNDS = 3.0, 4
 
+# Scales by axis stand in place of the scale.
+_INSTEAD = {"axes_child": "scale", "axes_parent": "scale"}
+
 _Columns: TypeAlias = Mapping[str, FloatArray]
 _Where: TypeAlias = Mapping[str, list[int]]
 
@@ -84,9 +87,10 @@ class Regression:
             blocks.append(probe.reshape(-1, n_columns).T @ part.reshape(-1, n_columns))
         self._blocks = np.stack(blocks)
 
-    def _columns(self, *groups: str, without: str = "") -> list[int]:
-        names = [*(name for name in self._base if name != without), *groups]
-        return [column for name in names for column in self._where[name]]
+    def _columns(self, group: str = "", *beside: str) -> list[int]:
+        """Columns that a group is fitted beside."""
+        base = (name for name in self._base if name != _INSTEAD.get(group))
+        return [column for name in (*base, *beside) for column in self._where[name]]
 
     def biases(self, group: str) -> FloatArray:
         """By how much (m,) noise of the columns of a group, if it is as large as that of the rows,
@@ -99,24 +103,25 @@ class Regression:
         """Root mean square (m,) of the displacements that each value of a group makes, per unit."""
         return np.asarray(self._displaced[self._where[group]])
 
-    def fit(self, group: str, *beside: str, without: str = "") -> Fitted:
+    def share(self, group: str, *beside: str) -> float:
+        """The share of the squared residuals that a group takes away."""
+        before, costs = self._columns(group, *beside), []
+        for columns in (before, [*before, *self._where[group]]):
+            x, at = np.append(-_solved(self._blocks.sum(axis=0), columns), 1.0), [*columns, -1]
+            costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
+        return 1.0 - costs[1] / max(costs[0], 1e-300)
+
+    def fit(self, group: str, *beside: str) -> Fitted:
         """Fit a group beside the base, or what is left of it, and ``beside`` other groups."""
-        before = self._columns(*beside, without=without)
-        known, total = [*before, *self._where[group]], self._blocks.sum(axis=0)
+        before, total = self._columns(group, *beside), self._blocks.sum(axis=0)
         # All rows, and all but those of each block, or of two: errors may last longer than one.
         left_out = np.concatenate([self._blocks, self._blocks[::2] + self._blocks[1::2]])
-        solved = _solved(np.concatenate([total[None], total - left_out]), known)
-        _, *parts = np.split(solved[:, len(before) :], [1, 1 + _BLOCKS])
+        tables = np.concatenate([total[None], total - left_out])
+        solved = _solved(tables, [*before, *self._where[group]])[:, len(before) :]
+        _, *parts = np.split(solved, [1, 1 + _BLOCKS])
         variances = [(len(values) - 1) * values.var(axis=0) for values in parts]
-        costs = []
-        for columns, found in ((before, _solved(total, before)), (known, solved[0])):
-            x, at = np.append(-found, 1.0), [*columns, -1]
-            costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
-        return Fitted(
-            values=solved[0, len(before) :],
-            sigmas=np.sqrt(np.max(variances, axis=0)),
-            share=1.0 - costs[1] / max(costs[0], 1e-300),
-        )
+        sigmas = np.sqrt(np.max(variances, axis=0))
+        return Fitted(values=solved[0], sigmas=sigmas, share=self.share(group, *beside))
 
 
 def _solved(products: FloatArray, columns: list[int]) -> FloatArray:

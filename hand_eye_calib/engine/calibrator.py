@@ -9,24 +9,18 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.snapshot import (
-    STREAMS,
-    Snapshot,
-    downsample,
-    estimated_time_offset,
-    name_frames,
-    pair_poses,
-)
+from hand_eye_calib.engine import snapshot as snapshots
+from hand_eye_calib.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.frames import check_pose
 from hand_eye_calib.geometry.trajectory import REACH, Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs, slower_stream
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 
 
@@ -177,7 +171,7 @@ class Calibrator:
             self._forget_pairs()
         self.config = config
 
-    def inputs(self, topics: Mapping[str, object]) -> dict[str, Any]:
+    def inputs(self, topics: Mapping[str, object]) -> Document:
         """Where a result came from, in plain values: options, and streams by their topics."""
         streams = {}
         for stream, topic in topics.items():
@@ -260,7 +254,8 @@ class Calibrator:
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
         parent, child = self._buffers["parent"], self._buffers["child"]
-        parent_frame, child_frame, warnings = name_frames(self.config, parent.frame, child.frame)
+        frames = parent.frame, child.frame
+        parent_frame, child_frame, warnings = snapshots.name_frames(self.config, *frames)
         return Snapshot(
             config=self.config,
             kept=self._kept,
@@ -303,7 +298,7 @@ class Calibrator:
         if isinstance(config.time_offset, str):
             if self._time_offset is None and is_full:
                 with contextlib.suppress(NotEnoughDataError):
-                    self._time_offset = self._proposed_offset or estimated_time_offset(
+                    self._time_offset = self._proposed_offset or snapshots.estimated_time_offset(
                         config, parent.trajectory(), child.trajectory()
                     )
             if self._time_offset is None:
@@ -318,14 +313,14 @@ class Calibrator:
         )
         of_child = child.trajectory(horizon_ns - offset_ns)
         of_child = self._time_offset.steadied(of_child) if self._time_offset else of_child
-        made = pair_poses(
+        made = snapshots.pair_poses(
             config, parent.trajectory(horizon_ns), of_child, self._paired_at, self._kept_parts[-1]
         )
         made = made[made.stamps_ns <= horizon_ns]
         if len(made):
             self._kept_parts.append(made)
             if sum(map(len, self._kept_parts)) > config.max_pairs:
-                self._kept_parts = [downsample(self._kept, config.max_pairs)]
+                self._kept_parts = [snapshots.downsample(self._kept, config.max_pairs)]
         is_alone = max(parent.stamps_ns[0], child.stamps_ns[0] + offset_ns) > horizon_ns
         parent.drop(horizon_ns, unpaired=is_alone)
         child.drop(horizon_ns - offset_ns, unpaired=is_alone)

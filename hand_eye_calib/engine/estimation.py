@@ -134,12 +134,10 @@ def calibration_of(
     """A result from a solution with ``converged`` and ``objective``, what was fused with the prior,
     the residuals, the stamps of the poses, and further fields.
     """
-    values: dict[str, Any] = {
-        "status": fused.status(solution.converged),
-        "method": "adaptive",
-        "backend": "fast",
-        "stamp_ns": int(stamps_ns[-1]),
-    }
+    fields.setdefault("method", "adaptive")
+    fields.setdefault("backend", "fast")
+    fields.setdefault("stamp_ns", int(stamps_ns[-1]))
+    fields.setdefault("status", fused.status(solution.converged))
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.assessment.cov_parent_child_in_child,
@@ -153,7 +151,7 @@ def calibration_of(
         target_rotation=config.target_rotation,
         target_axes=parse_targets("target.axes", config.target_axes),
         motion_residuals=residuals,
-        **values | fields,
+        **fields,
     )
 
 
@@ -377,9 +375,10 @@ def other_answers(
     the time offset and the scale of the result, without priors; those with too few data are left
     out. Parameters as of :func:`cross_checked`.
     """
-    known: dict[str, Any] = {f"prior_{axis}": "" for axis in AXES}
-    known |= {"time_offset": calibration.time_offset_s, "scale": calibration.scale}
-    settled = replace(config, method=_METHOD, backend="fast", **known)
+    free = replace(config, prior_x="", prior_y="", prior_z="")
+    free = replace(free, prior_roll="", prior_pitch="", prior_yaw="")
+    offset_s, scale = calibration.time_offset_s, calibration.scale
+    settled = replace(free, method=_METHOD, backend="fast", time_offset=offset_s, scale=scale)
 
     n_poses, own = len(pose_pairs), calibration.reference
     stride = max(-(-n_poses // _MOST_POSES), 1)

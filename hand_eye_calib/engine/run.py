@@ -228,7 +228,7 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
     # As they came in: what is put right is put right once.
-    usual: dict[str, Any] = {name: getattr(CalibratorConfig, name) for name in _REPAIRS}
+    usual: Options = {name: getattr(CalibratorConfig, name) for name in _REPAIRS}
     parent, child = replace(snapshot, config=replace(snapshot.config, **usual)).streams
     return replace(
         snapshot,
@@ -310,7 +310,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> checkin
         time_offset_s=0.0 if isinstance(offset_s, str) else offset_s,
         scale=1.0 if isinstance(scale, str) else scale,
         max_gap_s=snapshot.max_gap_s,
-        correlation=snapshot.correlation,
+        correlate=lambda: snapshot.correlation,
         known=known,
     )
     obsolete = set()
