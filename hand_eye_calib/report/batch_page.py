@@ -108,6 +108,6 @@ def _cells(row: Document, is_linked: bool) -> list[Any]:
     """
     known = row["verdict"] is not None and not row["error"]
     values = [text.replace(" +/- ", " ") for text in _values(row)] if known else row["error"]
-    start = (row["start"] or "").removesuffix("+00:00").replace("T", " ")
+    start = (row["start"] or "")[:16].replace("T", " ")  # to the minute
     verdict = "failed" if row["error"] else row["verdict"]
     return [printable(row["name"]), row["vehicle"], verdict, start, int(is_linked), values]

@@ -59,7 +59,7 @@ class Look(NamedTuple):
     bar_decades: float = 4.0
     bar_above: float = 1.0
     points: int = 1000
-    vehicles: int = 8
+    vehicles: int = 4
 
 
 LOOK = Look()
