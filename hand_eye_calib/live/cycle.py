@@ -239,7 +239,9 @@ class SolveCycle:
             return False, "the session was reset during the solve: its result is dropped"
         # Solves that take longer than their period leave the processor free for half the time.
         self._rest_until_s = time.monotonic() + answer.seconds
-        self._seen, self._failure = answer.seen, answer.failure
+        # The most of each rotation so far: of more poses, it would fall while somebody drives on.
+        rotation = np.maximum(self._seen.rotation, answer.seen.rotation)
+        self._seen, self._failure = replace(answer.seen, rotation=rotation), answer.failure
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
             self._certain, self._told = self._certain | answer.options, answer.told

@@ -150,8 +150,7 @@ class TfInput(RosInput):
         kind = message_type(f"{name}_tf")
         for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, quick())):
             heard: Any = partial(self._hear, topic)
-            subscription = node.create_subscription(kind, topic, heard, qos)
-            self._subscribed.append((subscription, heard))
+            self._subscribed.append((node.create_subscription(kind, topic, heard, qos), heard))
 
     def configure(self, config: CalibratorConfig) -> None:
         super().configure(config)

@@ -20,7 +20,7 @@ from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.solving import Answer
-from hand_eye_calib.live.state import Level, NodeState
+from hand_eye_calib.live.state import Broadcast, Level, NodeState
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.records import AXES
@@ -110,6 +110,13 @@ def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypat
     cycle._process.answers = lambda: [Answer(0, 0.1, seen(40.0), result())]
     cycle.take_answers()
     assert len(told) == 1
+
+
+def test_the_rotation_that_was_seen_does_not_fall_while_driving(cycle):
+    for degrees in (179.0, 175.0, 174.0):
+        cycle.conclude(Answer(0, 0.1, seen(40.0, (0.0, 9.0, degrees)), result()))
+        told = cycle.extrinsic_state(True, (Broadcast.OFF, "")).rotation_deg
+        assert told == pytest.approx({"x": 0.0, "y": 9.0, "z": 179.0})
 
 
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):

@@ -96,6 +96,14 @@ def test_the_script_finds_what_it_looks_for():
     assert len(page.data["data-sure"]) == 2
 
 
+def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen():
+    style = (FOLDER / "page.css").read_text(encoding="utf-8")
+    (sizes,) = re.findall(r"h1 \{ font-size: clamp\((.+?)rem, (.+?)vw, (.+?)rem\)", style)
+    least, share, most = map(float, sizes)
+    assert 16 * least >= 27
+    assert min(12.8 * share, 16 * most) >= 64  # at 1,280 px
+
+
 def played(steps):
     """States of the page after each step, given in JavaScript."""
     run = "\n".join(f"{step}\nawait null; await null; states.push(state());" for step in steps)
