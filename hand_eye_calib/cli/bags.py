@@ -91,8 +91,6 @@ def _read_bags(
         sources, measures = select(bag, wanted, config)
         refuse_recordings(paths, sources.values())
         of_streams: dict[str, Any] = {f"{stream}_measures": measures[stream] for stream in STREAMS}
-        if "keyframe_min_interval" not in config.given:
-            of_streams["keyframe_min_interval"] = bag.apart_s(sources.values())
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
         bag.shown = with_progress
         poses = bag.poses(sources["parent"], sources["child"], config.max_gap, measures)

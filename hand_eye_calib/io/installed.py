@@ -29,8 +29,9 @@ from hand_eye_calib.text import parse_pose
 _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
-_EXPECTED = "a calibration: extrinsic.yaml of this package, or a file of " + ", ".join(
-    EXPORT_FORMATS
+_EXPECTED = (
+    f"a calibration: extrinsic.yaml of this package, or a file of {', '.join(EXPORT_FORMATS)}; "
+    "parameters of PX4 have a position and no rotation, give six numbers instead"
 )
 
 
@@ -63,11 +64,6 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         find = read_urdf(path).pose
     elif path.suffix in _DOCUMENTS:
         document = read_yaml(path, _EXPECTED)
-        if isinstance(document, str) and "EKF2_" in document:
-            raise InputError(
-                f"{path}: parameters of PX4 have a position and no rotation; give six numbers "
-                'instead, "X Y Z ROLL PITCH YAW"'
-            )
         if isinstance(document, Mapping) and document.get("format") == _FORMAT:
             return partial(_of_result, load_result(path), path)
         find = partial(_find, document)

@@ -18,7 +18,7 @@ from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import messages, sources
 from hand_eye_calib.io.bags.messages import PoseTable, Run
-from hand_eye_calib.io.bags.scans import TUNING
+from hand_eye_calib.io.bags.scans import ScanReading
 from hand_eye_calib.io.bags.sources import Reading, Source
 from hand_eye_calib.io.bags.storage import open_bags
 from hand_eye_calib.io.files import LONGEST_NAME
@@ -125,11 +125,6 @@ class PoseBag:
                 raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
             return usual if wanted == "auto" else wanted
         return messages.measured_as(self._type_of(source), wanted, source)
-
-    def apart_s(self, chosen: Iterable[Source]) -> float:
-        """The time (s) between poses whose errors are of their own: those of scans are alike."""
-        apart_s = min(TUNING.apart_s, self.duration_s / TUNING.least_poses)
-        return apart_s * (messages.POINTS_TYPE in map(self._type_of, chosen))
 
     def check(self, source: Source) -> None:
         """Raise InputError, with the topics that are there, for a topic without poses, and for
@@ -241,7 +236,7 @@ class PoseBag:
         if type_ == messages.PATH_TYPE:
             return sources.PathReading(stream, topic)
         if type_ == messages.POINTS_TYPE:
-            return sources.ScanReading(stream, topic, self.paths[0], self.files)
+            return ScanReading(stream, topic, self.paths[0], self.files)
         fixes, turns = self._parts_of(topic)
         return sources.JoinedReading(
             sources.TopicReading(stream, fixes, self._type_of(fixes), "positions"),

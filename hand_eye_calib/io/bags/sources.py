@@ -8,10 +8,9 @@ camera's intrinsics.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from decimal import Decimal
 from itertools import compress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from hand_eye_calib.errors import ConfigError, InputError, located, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import chained
 from hand_eye_calib.io.bags import messages
-from hand_eye_calib.io.bags.scans import ScanOdometry, scan_of
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import TWIST, Table
@@ -162,27 +160,6 @@ class PathReading(Reading):
         return table.recorded(self.stream, stamps_ns)
 
 
-class ScanReading(Reading):
-    """The points of a lidar, as odometry."""
-
-    def __init__(self, stream: str, topic: str, bag: Path, files: Sequence[Path]) -> None:
-        self._lidar, self._topic = ScanOdometry(topic, bag, files), topic
-        super().__init__(stream, *([] if self._lidar.kept else [topic]))
-
-    def take(self, run: messages.Run) -> None:
-        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
-            self._lidar.add(scan_of(message), bag_ns)
-
-    def table(self) -> messages.PoseTable:
-        poses, stamps_ns, bag_ns, frame, n_failed = self._lidar.odometry().values()
-        lost = f", {n_failed} of which could not be registered" if n_failed else ""
-        place = f"it is kept in {self._lidar.place}"
-        self.notes.append(f"{self._topic}: odometry from {len(poses)} scans{lost}; {place}")
-        return messages.PoseTable.of(stamps_ns, poses, "scans", str(frame)).recorded(
-            self.stream, bag_ns
-        )
-
-
 class ImageReading(Reading):
     """Images of a target: the poses of the camera in the frame of the target."""
 
@@ -225,8 +202,7 @@ class FieldReading(Reading):
         self._paths = [path.split(".") for _, path in pairs]
         of_table = "twists" if {*TWIST} <= {*self._names} else "auto"
         self._table = Table(topic, self._names, of_table)
-        self._bag_ns: list[int] = []
-        self._n_left_out = 0
+        self._bag_ns, self._n_left_out = list[int](), 0
         self.measures = "poses" if of_table == "twists" else self._table.measures
         if self.measures == "rates":
             raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")

@@ -154,7 +154,8 @@ _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<H4xQ8x")
 
 class McapFile(Storage):
     """An mcap file, through the library mcap: by its index if it is whole, otherwise record by
-    record up to the first that is damaged; of a chunk that is cut off, what is there.
+    record up to the first that is damaged; of a chunk that is cut off, what is there, unless it is
+    compressed.
     """
 
     def _open(self, opened: ExitStack) -> None:
@@ -235,26 +236,13 @@ class McapFile(Storage):
             losses.append(f"it is cut off or damaged ({_reason_of(error)}), the rest is lost")
             if not isinstance(error, EOFError):
                 return
-            # Of a chunk that is cut off, the records before that.
+            # Of a chunk that is cut off, the records before that, unless it is compressed.
             with suppress(Exception), self._file.open("rb") as file:
                 file.seek(position)
                 if file.read(_RECORD.size)[0] == opcode.Opcode.CHUNK:
                     chunk = records.Chunk.read(data_stream.ReadDataStream(file))
-                    rest = _WholeReads(BytesIO(_unpacked(chunk)))
+                    rest = _WholeReads(BytesIO(b"" if chunk.compression else chunk.data))
                     yield from stream_reader.StreamReader(rest, skip_magic=True).records
-
-
-def _unpacked(chunk: Any) -> Any:
-    """The content of an mcap chunk, as far as it goes if that is cut off."""
-    from mcap import stream_reader
-
-    if chunk.compression == "zstd":
-        return stream_reader.zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
-    if chunk.compression == "lz4":
-        # Before 1.6 the module has the package of that name instead of its part.
-        lz4 = getattr(stream_reader.lz4, "frame", stream_reader.lz4)
-        return lz4.LZ4FrameDecompressor().decompress(chunk.data)
-    return chunk.data
 
 
 def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:

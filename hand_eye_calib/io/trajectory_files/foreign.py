@@ -262,8 +262,7 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
 
 
 def _of_numpy(data: bytes, _: str | None) -> _Rows:
-    names, values = columns_of_array(np.load(io.BytesIO(data), allow_pickle=False))
-    return names, values.tolist(), ()
+    return *columns_of_array(np.load(io.BytesIO(data), allow_pickle=False)), ()
 
 
 def _of_pcd(data: bytes, _: str | None) -> _Rows:

@@ -57,7 +57,7 @@ _OF_POSITION = "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
 # paths such as .pose.pose.position.x.
 _ALIASES = {
     "header": "header_stamp",
-    "t": "t ts time timestamp timestamps stamp gpstime tracking_timestamp",
+    "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp",
     "x": _OF_POSITION.format("x") + "easting pos_east position0 actual_tcp_pose_0",
     "y": _OF_POSITION.format("y") + "northing pos_north position1 actual_tcp_pose_1",
     "z": _OF_POSITION.format("z") + "altitude pos_up position2 actual_tcp_pose_2",
