@@ -11,7 +11,6 @@ from typing import Any
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
@@ -35,13 +34,7 @@ LOOK_S = 5.0
 
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:
-    """tf2_msgs/TFMessage, which this parameter needs.
-
-    Raises
-    ------
-    ConfigError
-        If tf2_msgs is not installed.
-    """
+    """tf2_msgs/TFMessage, which this parameter needs; a ConfigError if that is not installed."""
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError:
@@ -186,7 +179,7 @@ class TfBroadcaster:
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
         self._node, self._log, self._tree = node, log, tree
         self._is_on, self._began_s = False, 0.0
-        self._publisher: Publisher | None = None
+        self._publisher: Any = None
         self.state: tuple[Broadcast, str] = Broadcast.OFF, ""
 
     def switch(self, on: bool) -> None:
@@ -203,10 +196,12 @@ class TfBroadcaster:
         """Broadcast the session's result if it is new, as far as the tree allows it now; to be
         called often. ``why_not`` is empty if it may be.
         """
-        self.state = self._judged(result, why_not)
+        if self._is_on and self._publisher is None:  # without a message: discovery takes seconds
+            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
+        was_on, self.state = self.state[0] is Broadcast.ON, self._judged(result, why_not)
         if result is not None and self.state[0] is Broadcast.ON:
-            self._broadcast(result)
-        elif self._publisher is not None:  # new listeners get nothing; the others keep it
+            self._broadcast(result, not was_on)
+        elif was_on:  # new listeners get nothing; the others keep it
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
             self._log.warning(
@@ -233,13 +228,12 @@ class TfBroadcaster:
             return Broadcast.REFUSED, forbidden
         return Broadcast.ON, ""
 
-    def _broadcast(self, result: Calibration) -> None:
+    def _broadcast(self, result: Calibration, is_first: bool) -> None:
         self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
-        kind, own, transform = message_type(), self._tree.own, to_transform(result, True)
-        if self._publisher is not None and transform == own[-1]:
-            return
-        if self._publisher is None:
-            self._publisher = self._node.create_publisher(kind, STATIC_TOPIC, LATCHED)
+        own, transform = self._tree.own, to_transform(result, True)
+        if is_first:
             self._log.info("the result is broadcast on /tf_static from now on")
+        elif transform == own[-1]:
+            return
         own.append(transform)
-        self._publisher.publish(kind(transforms=[transform]))
+        self._publisher.publish(message_type()(transforms=[transform]))
