@@ -121,7 +121,7 @@ def test_two_lidars_from_their_points(tmp_path, capsys):
     off = se3.log(se3.inverse(X) @ result.T_parent_child)
     assert (np.linalg.norm(off.reshape(2, 3), axis=1) < [0.01, np.radians(0.1)]).all()
     assert (result.parent_frame, result.child_frame) == ("front", "rear")
-    # A pose is that of the middle of its scan. With a constant motion in each, 0.015 deg.
+    # A pose is that of the middle of its scan. With a constant motion in each, 0.016 deg.
     middle_s = (np.arange(count) + 0.5 - 0.5 / COLUMNS) / RATE
     for name, T_body_lidar in (("front", np.eye(4)), ("rear", X)):
         kept = tmp_path / f"drive.{name}.odometry.npz"
@@ -129,7 +129,7 @@ def test_two_lidars_from_their_points(tmp_path, capsys):
         np.testing.assert_allclose(found["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
         poses = se3.from_quat_xyzw(found["poses"][:, :3], found["poses"][:, 3:])
         turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]
-        assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0125
+        assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0135
     # The second time, what is kept is read.
     before = kept.stat().st_mtime_ns
     with PoseBag(bag) as opened:

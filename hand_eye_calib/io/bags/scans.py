@@ -43,14 +43,14 @@ class Tuning:
     # Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
     ranges_m: tuple[float, float] = (1.0, 80.0)
     # Points of a scan that are used, evenly drawn: more take longer and change nothing.
-    most_points: int = 10_000
+    most_points: int = 7_000
     # Size of a voxel as a share of the median range, within limits (m).
     voxel_share: float = 0.03
     voxel_limits_m: tuple[float, float] = (0.1, 0.4)
     # Of the rough and the fine registration: voxels of the map, voxels that a scan is thinned to,
     # and over how much points are matched, all in voxels; share of matched points below which it
     # counts as failed. The fine map has few voxels in the beginning.
-    steps: tuple[tuple[float, ...], ...] = ((3.0, 3.0, 6.0, 0.3), (1.0, 1.25, 2.0, 0.1))
+    steps: tuple[tuple[float, ...], ...] = ((3.0, 3.0, 6.0, 0.3), (1.0, 1.5, 2.0, 0.1))
     # Points that a local plane is fitted to: fewer are of one ring, on a line.
     n_neighbours: int = 15
     # Rings by elevation, in half degrees; scans from one look at them to the next, what a look
@@ -156,8 +156,8 @@ class ScanReading(Reading):
         if not self._kept:
             if 2 * self._n_failed >= len(self._bag_ns):
                 raise InputError(
-                    f"{self.topics[0]}: {self._n_failed} of {len(self._bag_ns)} scans could not be "
-                    "registered; use the odometry of a lidar SLAM"
+                    f"{self.topics[0]}: of {len(self._bag_ns)} scans with points, {self._n_failed} "
+                    "could not be registered; use the odometry of a lidar SLAM"
                 )
             self._register(-1, 1)
             found = se3.to_rows(np.array(self._poses)), self._stamps_ns, self._bag_ns
