@@ -39,10 +39,10 @@ _TURNS, _STEADY_SHARE = 40, 0.6
 _MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
 _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
 
-# No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears ten times
-# gravity for a whole second (m/s^2), which is twice what a racing car does. Arms, which move least,
-# have 0.1 m/s^2 in metres and so exceed that in millimetres.
-_FASTEST, _HARDEST = 340.0, 98.0
+# No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears five times
+# gravity in a tenth of all seconds (m/s^2). Recordings have 6 at most; arms, which move least, 0.1,
+# and so exceed that in millimetres; what hand-held sensors have exceeds it in centimetres.
+_FASTEST, _HARDEST = 340.0, 49.0
 
 # Velocities are over so long (s), so that noise adds little. A tenth of them may be of jumps.
 _STEP_S, _USUAL = 1.0, 0.9
