@@ -14,6 +14,7 @@ from result_making import calibration
 
 from hand_eye_calib.cli.batch.run import stored
 from hand_eye_calib.cli.batch.work import Task
+from hand_eye_calib.engine import offline
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.results import load_result, save_result
 from hand_eye_calib.io.trajectory_files.table import write_trajectory
@@ -140,12 +141,16 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
         load_result(path)
 
 
-def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix(tmp_path):
-    write_trajectory(tmp_path / "poses.tum", motions.as_trajectory(motions.wandering_poses(5_000)))
+def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix_and_few_blocks(tmp_path):
+    both = motions.noisy_pair(motions.wandering_poses(5_000), 0, 1e-3, 1e-3)
+    write_trajectory(tmp_path / "poses.tum", both[0])
     tracemalloc.start()
     reading = motions.read_trajectory_file(tmp_path / "poses.tum")
     _, peak = tracemalloc.get_traced_memory()
+    offline.calibrate(*both, method="park")
+    _, peak_of_park = tracemalloc.get_traced_memory()
     tracemalloc.stop()
+    assert peak_of_park / 5_000 < 12_000  # 7,600 with its checks
     assert len(reading.trajectory) == 5_000
     assert peak / 5_000 < 900  # bytes; 1,120 with lists of lines and of numbers
 
