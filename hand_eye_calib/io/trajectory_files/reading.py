@@ -132,7 +132,7 @@ def read_trajectory(
         "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
     topic : str, optional
         Of a bag: the topic of the poses; or two frames, ``world:sensor``, whose transform is the
-        trajectory, from ``/tf`` and ``/tf_static``. No other option but ``measures`` goes with it.
+        trajectory, from ``/tf`` and ``/tf_static``. Only ``measures`` can be combined with it.
     columns : str, optional
         For csv without a header: the columns' names, such as
         ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other
@@ -181,7 +181,7 @@ def read_trajectory(
         return source
     if topic:
         if has_options or times is not None or stamp_unit or repair or not path:
-            raise ConfigError("topic is for bags: none of the options of text files goes with it")
+            raise ConfigError("topic is for bags and cannot be combined with options of text files")
         return _of_bag(path, topic, measures)
     if (has_options and not path) or (path and times is not None and not file_of_times):
         raise ConfigError(
