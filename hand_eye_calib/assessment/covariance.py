@@ -257,12 +257,8 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     cov_r = (weights[:, None] * residual_r).T @ residual_r / n_effective
     variance_r = np.trace(cov_r) / 3
 
-    rotation = solution.T_parent_child[:3, :3]
-    rotation_a, rotation_b = pairs.Ts_parenti_parentj[:, :3, :3], pairs.Ts_childi_childj[:, :3, :3]
-    translation_b, moved = pairs.Ts_childi_childj[:, :3, 3], rotation_a - np.eye(3)
-    jacobian_t = np.concatenate([moved @ rotation, rotation @ se3.skew(translation_b)], axis=2)
+    jacobian_t, jacobian_r = _derivatives(pairs, solution.T_parent_child[:3, :3])
     information_t = excitation.weighted_products(weights, jacobian_t)
-    jacobian_r = np.swapaxes(rotation_b, 1, 2) - np.eye(3)
     information_r = np.zeros((6, 6))
     information_r[3:, 3:] = excitation.weighted_products(weights, jacobian_r)
 
@@ -272,9 +268,17 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     inverse = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)) @ vectors.T
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 
-    hidden = excitation.LeverArms.of(moved @ rotation, weights).hidden_directions(cov_r).T
+    hidden = excitation.LeverArms.of(jacobian_t[..., :3], weights).hidden_directions(cov_r).T
     of_lever_arm = [np.r_[direction, np.zeros(3)] for direction in hidden]
     return covariance, basis([*of_lever_arm, *vectors[:, ~seen].T])
+
+
+def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of residual translations (K, 3, 6) by xi; of residual rotations by phi, but for a turn."""
+    chords = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    pushed = rotation @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
+    turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
+    return np.concatenate([chords @ rotation, pushed], axis=2), turned
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:
@@ -396,14 +400,12 @@ def floor_of_pairs(
     ``-R t_B ds``. Pairs that overlap are as much evidence of the scale as those that do not.
     """
     rotation = T_parent_child[:3, :3]
-    moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    translation_b = pairs.Ts_childi_childj[:, :3, 3]
+    by_xi, turned = _derivatives(pairs, rotation)
     residuals = pairs.residuals(T_parent_child)[0][:, :, None]
-    push = (translation_b @ rotation.T)[:, :, None]
-    jacobian = [moved @ rotation, rotation @ se3.skew(translation_b), push, residuals]
-    products = excitation.weighted_products(weights, np.concatenate(jacobian, axis=2))
+    push = (pairs.Ts_childi_childj[:, :3, 3] @ rotation.T)[:, :, None]
+    jacobian = np.concatenate([by_xi, push, residuals], axis=2)
+    products = excitation.weighted_products(weights, jacobian)
     information, pushed = products[:6, :6].copy(), products[:6, 6]
-    turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
     information[3:, 3:] += 2 * excitation.weighted_products(weights, turned)
     by_scale = np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ pushed
     of_scale = max(float(products[6, 6] - pushed @ by_scale), 1e-30)

@@ -101,8 +101,8 @@ class LeverArms:
         """
         cov_rotation = np.zeros((3, 3)) if cov_rotation is None else cov_rotation
         noise = np.trace(cov_rotation) * np.eye(3) - cov_rotation + ROUNDING_ANGLE**2 * np.eye(3)
-        noise_powers = np.array([d @ noise @ d for d in self.directions.T])
-        least = np.maximum(_MIN_SIGNAL_TO_NOISE * noise_powers, least_share**2 * self.powers[-1])
+        of_noise = _MIN_SIGNAL_TO_NOISE * np.diag(self.directions.T @ noise @ self.directions)
+        least = np.maximum(of_noise, least_share**2 * self.powers[-1])
         return self.directions[:, self.powers < least]
 
     def hidden_axes(self, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:

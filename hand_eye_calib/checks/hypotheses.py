@@ -149,16 +149,9 @@ class Hypothesis:
         """Both streams without the mistakes."""
         if self is PLAIN:
             return streams
-        parent, child = (
-            trajectory.Trajectory(given.stamps_ns, self.corrected(stream, given.poses))
-            if way
-            else given
-            for stream, way, given in (
-                ("parent", self.parent, streams.parent),
-                ("child", self.child, streams.child),
-            )
-        )
-        return replace(streams, parent=parent, child=child)
+        given = (("parent", streams.parent), ("child", streams.child))
+        right = {name: replace(one, poses=self.corrected(name, one.poses)) for name, one in given}
+        return replace(streams, parent=right["parent"], child=right["child"])
 
     def inverted(self) -> "Hypothesis":
         """The one with both streams inverted besides, which fits as well."""
@@ -347,13 +340,10 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
     """
     if chosen.hypothesis.axes is not None:
         return chosen, True
-    scatters: list[list[float]] = []
-    for stream in (streams.parent, streams.child):
-        few = stream.poses[:: 1 + len(stream) // MAX_PAIRS]
-        scatters.append([])
-        for way in _WAYS:
-            right = Hypothesis(way).corrected("parent", few)
-            scatters[-1].append(trajectory.scatter_of_direction(right))
+    both = streams.parent, streams.child
+    few = [stream.poses[:: 1 + len(stream) // MAX_PAIRS] for stream in both]
+    right = [[Hypothesis(way).corrected("parent", each) for way in _WAYS] for each in few]
+    scatters = [[*map(trajectory.scatter_of_direction, each)] for each in right]
     scatter = dict(zip(_ALL_WAYS, np.maximum.outer(*scatters).flat, strict=True))
     of_chosen, least = scatter[chosen.hypothesis], min(scatter.values())
     if least < min(trajectory.STEADY, of_chosen / trajectory.CLEARLY):

@@ -39,14 +39,14 @@ _SMALLEST_VARIANCE = 1e-24
 # multiple of the squared error of a rotation, which looks like rotation itself.
 _UNDETERMINED = 8.0
 
-# Standard deviation that stands for "not determined" in the covariance (m, rad).
-_UNKNOWN = 1e3
-
 # Errors may last: over changes of the view (rad), beside a white share of their variance. The first
 # row is of errors that do not last, the second of those that come back with their place, the others
 # of those that last on the way from stop to stop. Within the smallest range stops that follow each
 # other count as one where outliers are looked for, as an arm that rests gives many.
 _LASTING = np.array([(0.03, 1.0), (0.05, 0.1), *((0.03 * 4.0**k, 0.1) for k in range(6))])
+
+# Distances to a target are too long by this share: a usual one, of its size or the focal length.
+_STRETCH = 0.03
 
 # So many stops at once are looked at.
 _AT_ONCE = 300
@@ -162,24 +162,21 @@ def solve(stops: Stops) -> RobotWorld:
             f"{len(stops)} stops are too few: at least {MIN_STOPS} of each sensor, with rotations "
             "about two axes, are necessary; 15 or more are better"
         )
-    starts, alone, fits = _starts(stops, counts), _alone(stops), []
+    starts, views = _starts(stops, counts), _views(stops)
+    alone, fits = _alone(views), []
     for in_world in (False, True):
         rough = _fit(stops, starts, in_world, _OUTLIER_TAILS, alone)
         kept, weights = rough.weights > 0.0, np.zeros(len(stops))
         begin = rough.Ts_parent_child, rough.Ts_world_world
         fit = _fit(stops[kept], begin, in_world, _TAILS, alone[kept])
         weights[kept] = fit.weights
-        fits.append((replace(fit, weights=weights), in_world))
-    best, in_world = max(fits, key=lambda each: _likelihood(each[0]))
+        # Each stop that is left out counts as an outlier at the limit.
+        levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
+        objective = fit.objective + 0.5 * float(np.sum(weights == 0.0)) * (levels + _OUTLIER)
+        fits.append((replace(fit, weights=weights, objective=objective), in_world))
+    best, in_world = min(fits, key=lambda each: each[0].objective)
     kept = best.weights > 0.0
-    return replace(best, covariance=_lasting(stops[kept], best, in_world, alone[kept]))
-
-
-def _likelihood(fit: RobotWorld) -> float:
-    """Log likelihood of a fit, in which each stop that it left out counts as _OUTLIER."""
-    left_out = float(np.sum(fit.weights == 0.0))
-    levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
-    return -fit.objective - 0.5 * left_out * (levels + _OUTLIER)
+    return replace(best, covariance=_widened(stops[kept], best, in_world, alone[kept], views[kept]))
 
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
@@ -262,41 +259,44 @@ def _linearise(
     (N, 6, 12) by the X and the Z of each.
     """
     predicted = se3.inverse(Zs[stops.world]) @ stops.Ts_world_parent @ Xs[stops.child]
-    errors = se3.log(se3.inverse(stops.Ts_world_child) @ predicted)
-    by_X = np.broadcast_to(np.eye(6), (len(stops), 6, 6))
-    jacobian = np.concatenate([by_X, -se3.adjoint(se3.inverse(predicted))], axis=2)
-    if in_world:
-        moved = se3.adjoint(stops.Ts_world_child)
-        errors, jacobian = se3.times(moved, errors), moved @ jacobian
-    return errors, jacobian
+    back = se3.inverse(stops.Ts_world_child)
+    errors = se3.log(predicted @ back if in_world else back @ predicted)
+    frames = stops.Ts_world_child if in_world else np.broadcast_to(np.eye(4), predicted.shape)
+    by_both = se3.adjoint(frames), -se3.adjoint(frames @ se3.inverse(predicted))
+    return errors, np.concatenate(by_both, axis=2)
 
 
-def _information(rows: FloatArray, columns: IntArray, n_values: int) -> FloatArray:
-    """Information (n_values, n_values) of rows (N, 6, 12), which have values at columns (N, 12)."""
-    cells = n_values * columns[:, :, None] + columns[:, None]
-    products = np.swapaxes(rows, 1, 2) @ rows
-    whole = np.bincount(cells.ravel(), products.ravel(), n_values**2).astype(float)
-    return whole.reshape(n_values, n_values)
+def _pairs(stops: Stops, n_children: int) -> list[tuple[IntArray, IntArray]]:
+    """The stops of each sensor with each of its worlds, and the columns (12,) of that X and Z."""
+    blocks = np.stack([stops.child, n_children + stops.world], axis=1)
+    pairs, pair_of = np.unique(blocks, axis=0, return_inverse=True)
+    columns = (6 * pairs[..., None] + np.arange(6)).reshape(-1, 12)
+    return [(np.flatnonzero(pair_of.ravel() == k), each) for k, each in enumerate(columns)]
+
+
+def _products(rows: FloatArray, pairs: list[tuple[IntArray, IntArray]], n: int) -> FloatArray:
+    """Products (n + 1, n + 1) of columns: of rows (N, 6, 13) by X and Z of a stop, and one more."""
+    whole = np.zeros((n + 1, n + 1))
+    for own, columns in pairs:
+        part, at = rows[own].reshape(-1, 13), np.append(columns, n)
+        whole[at[:, None], at] += part.T @ part
+    return whole
 
 
 def _views(stops: Stops) -> FloatArray:
-    """Views (N, 12) of the stops: rotations (rad), and places over a usual distance."""
+    """Views (N, 13) of the stops: change so far, rotations (rad), places over a usual distance."""
     A = stops.Ts_world_parent
     distances_m = np.linalg.norm(stops.Ts_world_child[:, :3, 3], axis=1)
     ways_m = np.linalg.norm(np.diff(A[:, :3, 3], axis=0), axis=1)
     usual_m = np.median(distances_m) + ways_m.sum() / len(A) + np.finfo(float).tiny
-    return np.concatenate([A[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0), A[:, :3, 3] / usual_m], 1)
+    turns = A[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
+    changes_rad = np.linalg.norm(np.diff(turns, axis=0), axis=1) + ways_m / usual_m
+    return np.c_[np.cumsum(np.r_[0.0, changes_rad]), turns, A[:, :3, 3] / usual_m]
 
 
-def _path_rad(views: FloatArray) -> FloatArray:
-    """How far the view changed up to each stop (N,)."""
-    turned, moved = np.split(np.diff(views, axis=0), [9], axis=1)
-    return np.cumsum(np.r_[0.0, np.linalg.norm(turned, axis=1) + np.linalg.norm(moved, axis=1)])
-
-
-def _alone(stops: Stops) -> FloatArray:
+def _alone(views: FloatArray) -> FloatArray:
     """Weights (N,) of 1 on average: stops that follow each other at one place count as one."""
-    path_rad = _path_rad(_views(stops))
+    path_rad = views[:, 0]
     first, end = (
         np.searchsorted(path_rad, path_rad + x) for x in (-_LASTING[0, 0], _LASTING[0, 0])
     )
@@ -304,57 +304,64 @@ def _alone(stops: Stops) -> FloatArray:
     return np.asarray(alone / alone.mean())
 
 
-def _kernels(stops: Stops) -> FloatArray:
+def _kernels(views: FloatArray) -> FloatArray:
     """Correlations (K, N, N) of the errors of stops in their order, for each row of _LASTING."""
-    views, (ranges_rad, white) = _views(stops), _LASTING.T[:, :, None, None]
-    path_rad = _path_rad(views)
-    places = np.linalg.norm(views[:, None] - views, axis=2)
-    way = np.abs(np.subtract.outer(path_rad, path_rad))
+    ranges_rad, white = _LASTING.T[:, :, None, None]
+    places = np.linalg.norm(views[:, None, 1:] - views[:, 1:], axis=2)
+    way = np.abs(np.subtract.outer(views[:, 0], views[:, 0]))
     apart = np.stack([places, places, *[way] * (len(_LASTING) - 2)]) / ranges_rad
     return np.asarray(white * np.eye(len(views)) + (1.0 - white) * np.exp(-apart))
 
 
-def _shares(kernels: FloatArray, errors: FloatArray, rows: FloatArray) -> FloatArray:
-    """Probability (K,) of each of the kernels times the variance that it finds, over that of none.
+def _shares(kernels: FloatArray, rows: FloatArray) -> FloatArray:
+    """Probability (K,) of each of the kernels times the variance that it finds, over that of none,
+    from derivatives by all values and errors, the last of the columns of rows (N, 6, M + 1).
 
     Restricted likelihood: D. A. Harville, *Maximum likelihood approaches to variance component
     estimation*, JASA 72, 1977.
     """
-    n, n_values = len(errors), rows.shape[2]
+    n, n_columns = len(rows), rows.shape[2]
     factors = np.linalg.cholesky(kernels)
-    columns = np.concatenate([errors[..., None], rows], axis=2).reshape(n, -1)
-    whitened = np.linalg.solve(factors, columns[None]).reshape(len(kernels), 6 * n, 1 + n_values)
+    whitened = np.linalg.solve(factors, rows.reshape(1, n, -1))
     # The last of the triangle's rows is what no values explain.
-    triangle = np.linalg.qr(np.roll(whitened, -1, axis=2), mode="r")
+    triangle = np.linalg.qr(whitened.reshape(len(kernels), 6 * n, n_columns), mode="r")
     sizes = np.abs(np.diagonal(triangle, 0, 1, 2)) + np.finfo(float).tiny
     levels = 2.0 * np.log(sizes[:, -1])
-    logs = -0.5 * (6 * n - n_values) * levels - np.log(sizes[:, :-1] + 1e-9).sum(axis=1)
+    logs = -0.5 * (6 * n + 1 - n_columns) * levels - np.log(sizes[:, :-1] + 1e-9).sum(axis=1)
     logs -= 6.0 * np.log(np.diagonal(factors, 0, 1, 2)).sum(axis=1)
     shares = np.exp(logs - logs.max())
     return np.asarray(shares / shares.sum() * np.exp(levels - levels[0]))
 
 
-def _lasting(stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray) -> FloatArray:
-    """Covariance of a fit, if errors of a sensor and one of its worlds last or come back."""
+def _widened(
+    stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray, views: FloatArray
+) -> FloatArray:
+    """Covariance of a fit, if errors last or come back, and targets may have another size."""
     errors, jacobian = _linearise(stops, fit.Ts_parent_child, fit.Ts_world_world, in_world)
-    levels = np.repeat([fit.level_m, fit.level_rad], 3)
-    weights = np.sqrt(fit.weights[fit.weights > 0.0])[:, None]
-    errors, rows = weights * errors / levels, jacobian / levels[:, None]
-    blocks = np.stack([stops.child, len(fit.Ts_parent_child) + stops.world], axis=1)
-    pairs, pair_of, counts = np.unique(blocks, axis=0, return_inverse=True, return_counts=True)
-    most = np.flatnonzero(pair_of.ravel() == np.argmax(counts))[:_AT_ONCE]
-    kernels = _kernels(stops[most])
-    shares = _shares(kernels, errors[most], weights[most, None] * rows[most])
+    T = stops.Ts_world_child if in_world else se3.inverse(stops.Ts_world_child)
+    longer = np.concatenate([T[:, :3, 3], np.zeros((len(T), 3))], axis=1)
+    rows = np.concatenate([jacobian, longer[..., None], errors[..., None]], axis=2)
+    rows /= np.repeat([fit.level_m, fit.level_rad], 3)[:, None]
+    told = rows * np.sqrt(fit.weights[fit.weights > 0.0])[:, None, None]
+    pairs = _pairs(stops, len(fit.Ts_parent_child))
+    most = max((own for own, _ in pairs), key=len)[:_AT_ONCE]
+    shares = _shares(_kernels(views[most]), told[most])
     more = np.zeros_like(fit.information)
-    for k, pair in enumerate(pairs):
-        columns = (6 * pair[:, None] + np.arange(6)).ravel()
-        own = np.flatnonzero(pair_of.ravel() == k)
+    for own, columns in pairs:
         for part in np.array_split(own, -(-len(own) // _AT_ONCE)):
-            kernel = np.tensordot(shares, _kernels(stops[part]), 1)
+            kernel = np.tensordot(shares, _kernels(views[part]), 1)
             kernel = alone[part, None] * kernel * alone[part] - np.diag(alone[part])
-            across = np.swapaxes(rows[part], 0, 1)
+            across = np.swapaxes(rows[part, :, :12], 0, 1)
             more[np.ix_(columns, columns)] += np.einsum("kni,knj->ij", across, kernel @ across)
     more *= (_TAILS + 6.0) / (_TAILS + 8.0)
+    larger = 1.0 + np.trace(more @ fit.covariance) / len(more)
+    for own, columns in pairs:
+        part = (np.sqrt(alone[own])[:, None, None] * told[own]).reshape(-1, 14)
+        products = part.T @ part + 1e-12 * np.sum(part**2) * np.eye(14)
+        of_one, of_errors = np.linalg.cholesky(products)[12:, 12]
+        known = of_one**2 / larger + _STRETCH**-2.0
+        square = (of_one * of_errors / larger / known) ** 2 + 1.0 / known
+        more[np.ix_(columns, columns)] += square * np.outer(products[:12, 12], products[:12, 12])
     return fit.covariance + fit.covariance @ more @ fit.covariance
 
 
@@ -364,38 +371,39 @@ def _fit(
     """Weights, levels and Gauss-Newton steps in turn."""
     Xs, Zs = starts
     n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
-    blocks = np.stack([stops.child, len(Xs) + stops.world], axis=1)
-    columns = (6 * blocks[..., None] + np.arange(6)).reshape(n, 12)
+    pairs = _pairs(stops, len(Xs))
     # Values that the errors are fitted with make them smaller.
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)
+    # What the weights sum to in the end; levels that count with it from the start settle sooner:
+    # C. Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
+    in_the_end = ((tails + 6.0) * n - 2.0 * n_free) / tails
     weights, converged = alone, False
     for _ in range(_ROUNDS):
         errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
-        variances = np.maximum(weights @ squared / n_free, _SMALLEST_VARIANCE)
+        means = in_the_end / weights.sum() * (weights @ squared) / n_free
+        variances = np.maximum(means, _SMALLEST_VARIANCE)
         distance = squared @ (1.0 / variances)
         weights = alone * (tails + 6.0) / (tails + distance)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
-        rows = scale[..., None] * jacobian
-        information = _information(rows, columns, n_values)
-        gradients = np.einsum("nki,nk->ni", rows, scale * errors)
-        gradient = np.bincount(columns.ravel(), gradients.ravel(), n_values)
-        step = -np.linalg.lstsq(information, gradient, rcond=1e-13)[0]
-        steps = step.reshape(-1, 6)
-        Xs, Zs = Xs @ se3.exp(steps[: len(Xs)]), Zs @ se3.exp(steps[len(Xs) :])
-        converged = bool(-step @ gradient < _SMALL_STEP**2)
+        rows = scale[..., None] * np.concatenate([jacobian, errors[..., None]], axis=2)
+        products = _products(rows, pairs, n_values)
+        # What is not determined stays where it is.
+        held = 1e-13 * np.trace(products[:-1, :-1]) * np.eye(n_values)
+        step = -np.linalg.solve(products[:-1, :-1] + held, products[:-1, -1])
+        steps = se3.exp(step.reshape(-1, 6))
+        Xs, Zs = Xs @ steps[: len(Xs)], Zs @ steps[len(Xs) :]
+        converged = bool(-step @ products[:-1, -1] < _SMALL_STEP**2)
         if converged:
             break
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
     # modeling using the t distribution*, JASA 84, 1989, section 4.
-    share = (tails + 6.0) / (tails + 8.0)
-    scale = np.sqrt(share * alone[:, None] * np.repeat(1.0 / variances, 3))
-    rows = scale[..., None] * jacobian
-    fisher = _information(rows, columns, n_values)
-    weak = np.diag(np.tile(np.repeat(1.0 / variances, 3), n_values // 6) / _UNKNOWN**2)
-    log_likelihood = -1.5 * n * np.log(variances).sum() - 0.5 * (tails + 6.0) * alone @ np.log1p(
-        distance / tails
-    )
+    rows *= np.sqrt((tails + 6.0) / (tails + 8.0) * alone / weights)[:, None, None]
+    fisher = _products(rows, pairs, n_values)[:-1, :-1]
+    # What is not determined is known to a thousand times the errors of a stop.
+    weak = np.diag(np.tile(np.repeat(1e-6 / variances, 3), n_values // 6))
+    objective = 1.5 * n * np.log(variances).sum()
+    objective += 0.5 * (tails + 6.0) * alone @ np.log1p(distance / tails)
     return RobotWorld(
         Ts_parent_child=Xs,
         Ts_world_world=Zs,
@@ -404,6 +412,6 @@ def _fit(
         weights=np.where(distance < _OUTLIER, np.minimum(weights / alone, 1.0), 0.0),
         level_m=float(np.sqrt(variances[0])),
         level_rad=float(np.sqrt(variances[1])),
-        objective=-float(log_likelihood),
+        objective=float(objective),
         converged=converged,
     )
