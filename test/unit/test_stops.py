@@ -13,7 +13,6 @@ from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.stops import read_arm_samples
-from hand_eye_calib.results.calibration import Verdict
 from hand_eye_calib.solvers.robot_world import Stops, solve
 
 NOISE = np.repeat([0.0005, 0.001], 3)
@@ -354,8 +353,6 @@ class TestUndetermined:
         along = np.eye(3) if motion == "no_rotation" else axis[None]
         assert np.linalg.norm(along @ unknown[:3], axis=1).min() > 0.98
         result = calibrate_stops(stops.Ts_world_parent, stops.Ts_world_child)
-        expected = (Verdict.DO_NOT_USE, "nothing_known")
-        if motion == "one_axis":
-            assert unknown.shape == (6, 1)
-            expected = (Verdict.USE_WITH_CARE, "unobservable")
-        assert (result.verdict, result.reasons[0].rule) == expected
+        assert (unknown.shape == (6, 1)) == (motion == "one_axis")
+        rule = "unobservable" if motion == "one_axis" else "nothing_known"
+        assert result.reasons[0].rule == rule
