@@ -17,7 +17,7 @@ from reproduction.coverage.page import page
 from reproduction.published import LEVELS, SIMULATED
 from reproduction.recordings import CYCLE, Rig, real_rigs
 from reproduction.runner import in_parallel
-from reproduction.writing import study_parser, write_csv
+from reproduction.writing import seed_of, study_parser, write_csv
 
 METHODS = tuple(scores.METHODS)
 TABLES = ("simulated", "levels", "known answer", "rig", "parts", "cycle", "refused")
@@ -33,21 +33,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--methods", nargs="+", choices=METHODS, default=METHODS, help="default: both")
     add("--tables", nargs="+", choices=TABLES, default=TABLES, help="default: all")
     add("--seeds", type=int, default=10, help="recordings per class. Default: 10")
+    add("--seed", type=int, help="of the first of them. Default: another one at every run")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     add("--rows", metavar="FILE", type=Path, help="write all rows there (CSV)")
     arguments = parser.parse_args(argv)
 
     def run() -> int:
-        folder = arguments.data_folder
+        folder, first = arguments.data_folder, seed_of(arguments.seed)
+        seeds = range(first, first + arguments.seeds)
         rigs, absent = real_rigs(folder) if folder else ([], ["every real recording"])
         tasks = [
             task
             for method in arguments.methods
-            for task in tasks_of(method, arguments.seeds, rigs, folder)
+            for task in tasks_of(method, seeds, rigs, folder)
             if task[0] in arguments.tables
         ]
         rows = measure(tasks, arguments.methods, arguments.jobs)
-        text = page(rows, absent, arguments.seeds)
+        text = page(rows, absent, seeds)
         print(text)
         if arguments.page:
             arguments.page.write_text(text, encoding="utf-8")
@@ -74,7 +76,7 @@ def _measured(function: Callable[..., Row], *arguments: Any) -> Row:
     return function(*arguments)
 
 
-def tasks_of(method: str, seeds: int, rigs: Sequence[Rig], folder: Path | None) -> list[_Task]:
+def tasks_of(method: str, seeds: range, rigs: Sequence[Rig], folder: Path | None) -> list[_Task]:
     """What is to be measured of a method."""
     tasks: list[_Task] = [("simulated", scores.class_row, name, method, seeds) for name in CLASSES]
     if folder is not None and (folder / "valimaki2023").is_dir():

@@ -68,7 +68,7 @@ GOALS = (
 )
 
 
-def page(rows: Sequence[Row], absent: Sequence[str], seeds: int) -> str:
+def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
     """The page in Markdown, from rows, folders of recordings that were not there, and the number of
     recordings per class. Tables of errors over the truth have a row for each recording, the others
     the pooled rows; ``--rows`` writes all.
@@ -95,7 +95,10 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: int) -> str:
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
             blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
-    about = f"{seeds} recordings of each class; `--rows FILE` writes the rows of every class."
+    about = (
+        f"{len(seeds)} recordings of each class, from seed {seeds.start} on; `--rows FILE` writes "
+        "the rows of every class."
+    )
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
 

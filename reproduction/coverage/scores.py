@@ -57,10 +57,10 @@ def _row(table: str, name: str, method: str, found: Mapping[str, Mapping[str, fl
     return Row(table, name, method, cases)
 
 
-def class_row(name: str, method: str, seeds: int) -> Row:
+def class_row(name: str, method: str, seeds: range) -> Row:
     """Errors over the bound, NEES and coverage of a simulated class."""
     found = {}
-    for seed in range(seeds):
+    for seed in seeds:
         recording = classes.make(name, seed)
         one = answer(recording.parent, recording.child, METHODS[method])
         found[f"{seed}"] = _class_case(name, recording, one)

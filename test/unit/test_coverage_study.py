@@ -136,7 +136,7 @@ def test_coverage_with_the_floor_is_told_apart():
 
 def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
-    rows = study.measure(study.tasks_of("dnlo", 2, [], None), ["dnlo"], 1)
+    rows = study.measure(study.tasks_of("dnlo", range(2), [], None), ["dnlo"], 1)
     found = {one.name: one for one in rows}
     assert 0.3 < found["hand_white"].value("bound") < 3.0
     assert found["flat_agv"].value("refused") == 1.0
