@@ -5,7 +5,8 @@ with known answers.
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from operator import call
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
 
     def run() -> int:
-        folder, first = arguments.data_folder, seed_of(arguments.seed)
-        seeds = range(first, first + arguments.seeds)
+        first = seed_of(arguments.seed)
+        folder, seeds = arguments.data_folder, range(first, first + arguments.seeds)
         rigs, absent = real_rigs(folder) if folder else ([], ["every real recording"])
         tasks = [
             task
@@ -65,15 +66,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(tasks: Sequence[_Task], methods: Sequence[str], jobs: int) -> list[Row]:
     """Rows of every class, level, rig and cycle, then the pooled ones."""
-    rows: list[Row] = [*in_parallel(_measured, [task[1:] for task in tasks], jobs)]
+    rows: list[Row] = [*in_parallel(call, [task[1:] for task in tasks], jobs)]
     rows += [
         pooled(table, name, method, rows) for method in methods for table, name in POOLED.items()
     ]
     return [row for row in rows if any(row.cases.values())]
-
-
-def _measured(function: Callable[..., Row], *arguments: Any) -> Row:
-    return function(*arguments)
 
 
 def tasks_of(method: str, seeds: range, rigs: Sequence[Rig], folder: Path | None) -> list[_Task]:

@@ -95,10 +95,7 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
             blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
-    about = (
-        f"{len(seeds)} recordings of each class, from seed {seeds.start} on; `--rows FILE` writes "
-        "the rows of every class."
-    )
+    about = f"{len(seeds)} of each class, from seed {seeds.start} on; `--rows FILE` writes all rows."
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
 
