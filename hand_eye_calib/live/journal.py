@@ -6,7 +6,6 @@ import fcntl
 import os
 import queue
 import threading
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -144,12 +143,8 @@ class SessionJournal:
 
     def _write(self, poses: list[_Pose], about: journal.About) -> None:
         if self._writer is not None:
-            # In tenths: all at once they would hold up messages, on a slow computer for 30 ms.
-            tenth = len(poses) // 10 + 1
-            for number, pose in enumerate(poses):
+            for pose in poses:
                 self._writer.add_pose(*pose)
-                if number % tenth == 0:
-                    time.sleep(FLUSH_PERIOD_S / 50)
             self._writer.flush()
             self._writer.describe(about)
 

@@ -95,7 +95,7 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
             blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
-    about = f"{len(seeds)} of each class, from seed {seeds.start} on; `--rows FILE` writes all rows."
+    about = f"{len(seeds)} of each class, from seed {seeds.start} on. All rows: `--rows FILE`."
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
 
