@@ -369,9 +369,9 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
             is_other, is_clear = paths + arms > 0.0, abs(paths + arms) > likely
         else:
             is_other = paths > (clear if looks_at_a_point else likely)
-            agrees = paths + arms > 0.0
-            is_doubtful = paths > -likely and agrees
-            is_clear = is_other and (paths > clear or (agrees and not _may_be_an_arm(right)))
+            is_doubtful = paths > -likely and paths + arms > clear
+            agrees = paths + arms > 0.0 and not _may_be_an_arm(right)
+            is_clear = is_other and (paths > clear or agrees)
             if (is_doubtful or is_other) and not is_clear:
                 found = finding("inverse_both", "both", Severity.WARNING)
                 return replace(explanation, findings=(found,))
