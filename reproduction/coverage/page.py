@@ -70,7 +70,7 @@ GOALS = (
 
 def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
     """The page in Markdown, from rows, folders of recordings that were not there, and the seeds of
-    the recordings per class. Tables of errors over the truth have a row for each recording, the others
+    the recordings per class. Tables of errors over the truth have a row for each recording, others
     the pooled rows; ``--rows`` writes all.
     """
     methods = list(dict.fromkeys(row.method for row in rows))

@@ -154,8 +154,7 @@ _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<H4xQ8x")
 
 class McapFile(Storage):
     """An mcap file, through the library mcap: by its index if it is whole, otherwise record by
-    record up to the first that is damaged; of a chunk that is cut off, what is there, unless it is
-    compressed.
+    record up to the first that is damaged; of a chunk that is cut off, what is there.
     """
 
     def _open(self, opened: ExitStack) -> None:
@@ -236,12 +235,19 @@ class McapFile(Storage):
             losses.append(f"it is cut off or damaged ({_reason_of(error)}), the rest is lost")
             if not isinstance(error, EOFError):
                 return
-            # Of a chunk that is cut off, the records before that, unless it is compressed.
+            # Of a chunk that is cut off, the records before that.
             with suppress(Exception), self._file.open("rb") as file:
                 file.seek(position)
                 if file.read(_RECORD.size)[0] == opcode.Opcode.CHUNK:
                     chunk = records.Chunk.read(data_stream.ReadDataStream(file))
-                    rest = _WholeReads(BytesIO(b"" if chunk.compression else chunk.data))
+                    if chunk.compression == "zstd":
+                        zstd = stream_reader.zstandard.ZstdDecompressor().decompressobj()
+                        chunk.data = zstd.decompress(chunk.data)
+                    elif chunk.compression == "lz4":
+                        # Before 1.6 the module has the package of that name instead of its part.
+                        lz4 = getattr(stream_reader.lz4, "frame", stream_reader.lz4)
+                        chunk.data = lz4.LZ4FrameDecompressor().decompress(chunk.data)
+                    rest = _WholeReads(BytesIO(chunk.data))
                     yield from stream_reader.StreamReader(rest, skip_magic=True).records
 
 
