@@ -143,7 +143,8 @@ def _as_they_are(
     offset = time_offset.offset_over(lag_s, *both, streams.max_gap_s, X, 2.0 * least_s)
     fit, left_s = offset.fit, offset.largest_s(streams.child.duration_s)
     explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
-    if fit and explains and left_s < least_s:
+    # Poses too far apart to interpolate are compared where they have stamps in common.
+    if fit and explains and left_s < least_s and streams.interval_s <= streams.max_gap_s:
         found = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), streams, lag_s)
         return (None, None) if found.findings else (found, offset)
     return None, None
