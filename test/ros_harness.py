@@ -26,6 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 import hand_eye_calib
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.messages import ns_of
 from hand_eye_calib.ros import conversions
 
 # Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
@@ -340,7 +341,7 @@ class Peer:
         def solved():
             answers.append(self.trigger("solve"))
             self._executor.spin_once(timeout_sec=0.05)
-            return extrinsics and conversions.to_ns(extrinsics[-1].header.stamp) >= stamps_ns[-1]
+            return extrinsics and ns_of(extrinsics[-1].header.stamp) >= stamps_ns[-1]
 
         self.spin_until(solved, "a result with the last pose")
         return answers[-1], extrinsics[-1]

@@ -8,10 +8,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import turned
-from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.results.calibration import Calibration
 
 # Messages that may wait in a queue: seconds of a fast stream, and every publisher's last message.
@@ -40,27 +38,10 @@ def message_class(type_name: str) -> type[Any]:
     return getattr(import_module(f"{package}.msg"), name)
 
 
-def to_ns(stamp: Time) -> int:
-    """Nanoseconds (int) of a builtin_interfaces/Time."""
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
-
-
 def to_time(stamp_ns: int) -> Time:
     """builtin_interfaces/Time of nanoseconds (int)."""
     sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
     return Time(sec=sec, nanosec=nanosec)
-
-
-def from_transform(message: TransformStamped) -> PoseFields:
-    """A transform as the engine takes it."""
-    place, rotation = message.transform.translation, message.transform.rotation
-    return PoseFields(
-        to_ns(message.header.stamp),
-        printable(message.header.frame_id).lstrip("/"),
-        printable(message.child_frame_id).lstrip("/"),
-        (place.x, place.y, place.z),
-        (rotation.x, rotation.y, rotation.z, rotation.w),
-    )
 
 
 def to_transform(calibration: Calibration, is_mounting: bool = False) -> TransformStamped:

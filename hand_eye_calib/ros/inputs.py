@@ -13,12 +13,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hand_eye_calib.config import POSE_TYPES, CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.bags.messages import MALFORMED, MessageReader, unpack_stamp_ns
+from hand_eye_calib.io.bags import messages
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.live.input import PoseInput, with_stamp
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.ros.conversions import LISTENING, from_transform, message_class, quick
+from hand_eye_calib.ros.conversions import LISTENING, message_class, quick
 from hand_eye_calib.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
 from hand_eye_calib.text import counted, listing
 
@@ -108,7 +108,7 @@ class TopicInput(RosInput):
     def _subscribe(self, type_name: str) -> None:
         measures = self.measures_as(type_name)
         self._session.set_measures(self.name, measures)
-        self._read = MessageReader(type_name, measures, self._session.origin(self.name))
+        self._read = messages.MessageReader(type_name, measures, self._session.origin(self.name))
         # With two arguments, rclpy passes the info as well, which its annotations do not know.
         callback: Any = self._receive
         try:
@@ -133,8 +133,8 @@ class TopicInput(RosInput):
         # With several publishers, or none any more, the numbers of lost messages are not known.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
-            stamp_ns = unpack_stamp_ns(data)
-        except MALFORMED as error:
+            stamp_ns = messages.unpack_stamp_ns(data)
+        except messages.MALFORMED as error:
             received_s = info["received_timestamp"] * 1e-9
             self.refuse(f"received at {received_s:.3f} s", "malformed", str(error))
             return
@@ -162,7 +162,7 @@ class TfInput(RosInput):
         self.problem = self._stream.describe_missing()
 
     def _hear(self, topic: str, message: Any, info: dict[str, Any]) -> None:
-        for transform in map(from_transform, message.transforms):
+        for transform in map(messages.transform_of, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
                     self.accept(pose.stamp_ns, partial(PoseFields, *pose))

@@ -4,7 +4,6 @@ the middleware, for ``demo``.
 
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import rclpy
 from geometry_msgs.msg import TransformStamped
@@ -17,10 +16,8 @@ from std_srvs.srv import Trigger
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import HandEyeCalibError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.ros.conversions import LATCHED, from_transform, to_time
-
-if TYPE_CHECKING:  # what reads bags is not needed to play poses
-    from hand_eye_calib.io.bags.messages import PoseTable
+from hand_eye_calib.io.bags.messages import PoseTable, transform_of
+from hand_eye_calib.ros.conversions import LATCHED, to_time
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -28,7 +25,7 @@ _SPIN_S, _PATIENCE_S = 0.02, 120.0
 
 
 def play(
-    poses: "PoseTable",
+    poses: PoseTable,
     topics: Mapping[str, str],
     speed: float,
     until_ns: int,
@@ -72,7 +69,7 @@ def play(
         # Poses and service calls share no order, so one call of ~/solve would not be enough.
         if asked[-1].done():
             asked.append(solve.call_async(Trigger.Request()))
-        return from_transform(heard[-1]).stamp_ns >= until_ns
+        return transform_of(heard[-1]).stamp_ns >= until_ns
 
     try:
         wait(lambda: all(each.get_subscription_count() for each in publishers.values()), "listen")
@@ -88,11 +85,11 @@ def play(
         executor.shutdown()
         node.destroy_node()
         context.try_shutdown()
-    found = from_transform(heard[-1])
+    found = transform_of(heard[-1])
     return se3.from_quat_xyzw(found.position, found.quat_xyzw)
 
 
-def _odometry(poses: "PoseTable", row: int) -> Odometry:
+def _odometry(poses: PoseTable, row: int) -> Odometry:
     message = Odometry()
     message.header.stamp = to_time(int(poses.stamps_ns[row]))
     message.header.frame_id = poses.world_frames[row]

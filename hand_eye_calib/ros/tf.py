@@ -17,12 +17,13 @@ from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.se3 import Extrinsic, turned
+from hand_eye_calib.io.bags.messages import transform_of
 from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.records import AXES, ROTATIONS
-from hand_eye_calib.ros.conversions import LATCHED, LISTENING, from_transform, quick, to_transform
+from hand_eye_calib.ros.conversions import LATCHED, LISTENING, quick, to_transform
 from hand_eye_calib.session.together import with_comparison
 from hand_eye_calib.text import axes_in_words
 
@@ -85,7 +86,7 @@ class RobotTree(FrameTree):
         for each in message.transforms:
             if each in self.own:
                 continue
-            edge = from_transform(each)
+            edge = transform_of(each)
             frame = edge.sensor_frame or ""
             try:
                 known = self.add(edge.world_frame, frame, None, is_static=topic == STATIC_TOPIC)

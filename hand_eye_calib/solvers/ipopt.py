@@ -10,18 +10,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import MissingDependencyError
+from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.solvers import dnlo
 from hand_eye_calib.solvers.all_pairs import Solution, pair_costs
 
-try:
-    import casadi
-except ImportError as error:
-    raise MissingDependencyError(
-        "backend ipopt needs CasADi, which is not installed: pip install casadi"
-    ) from error
+casadi = required("casadi", "backend ipopt", "casadi")
 
 # CasADi has no annotations.
 _Expression: TypeAlias = Any

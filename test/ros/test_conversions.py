@@ -13,7 +13,7 @@ from hand_eye_calib import config
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import turned
-from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader
+from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader, ns_of
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.ros import conversions
 from hand_eye_calib.ros.outputs import ResultTopics
@@ -70,7 +70,7 @@ def test_a_message_without_what_is_measured_is_refused(kind, measures):
 def test_messages_carry_frames_stamp_and_transform():
     transform = conversions.to_transform(calibration(np.eye(6)))
     assert (transform.header.frame_id, transform.child_frame_id) == ("lidar", "camera")
-    assert conversions.to_ns(transform.header.stamp) == 1_700_000_000_123_456_789
+    assert ns_of(transform.header.stamp) == 1_700_000_000_123_456_789
     pose = conversions.to_pose_with_covariance(calibration(np.eye(6)))
     assert pose.header == transform.header
     total = calibration(np.eye(6), floor=np.eye(6))

@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from motions import geodetic
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_harness import LATCHED, RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix, message
+from ros_harness import LATCHED, RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix, message, ns_of
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib.geometry import se3
@@ -88,7 +88,7 @@ def test_an_imu_as_child(start_node, peer):
     found = peer.listen(TransformStamped, "extrinsic")
     with_covariance = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
     peer.spin_until(
-        lambda: found and conversions.to_ns(found[-1].header.stamp) >= stamps_ns[-2],
+        lambda: found and ns_of(found[-1].header.stamp) >= stamps_ns[-2],
         "a result with the last poses",
     )
     assert found[-1].child_frame_id == "imu_link"

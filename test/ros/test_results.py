@@ -6,13 +6,12 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from motions import disturbed
 from nav_msgs.msg import Odometry
 from published_data import kitti_short
-from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix
+from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, ns_of
 from std_msgs.msg import String
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import absolute_errors
 from hand_eye_calib.ros import conversions
 
 FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
@@ -25,7 +24,7 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     peer.node.create_subscription(String, "calibrator/progress", told.append, conversions.LISTENING)
     peer.feed(peer.publishers(), *drive())
     last_ns = drive()[0][-1]
-    stamp_ns = lambda: conversions.to_ns(extrinsics[-1].header.stamp)  # noqa: E731
+    stamp_ns = lambda: ns_of(extrinsics[-1].header.stamp)  # noqa: E731
     peer.spin_until(lambda: extrinsics and stamp_ns() == last_ns and poses, "a result of all")
     np.testing.assert_allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=1e-3)
     assert (extrinsics[-1].header.frame_id, extrinsics[-1].child_frame_id) == ("lidar", "camera")
@@ -124,12 +123,12 @@ def test_kitti_through_the_node_equals_the_engine_fed_directly(start_node, peer)
         peer.publishers(), case.stamps_ns, case.parent.poses, case.child.poses
     )
     np.testing.assert_allclose(matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9)
-    assert conversions.to_ns(extrinsic.header.stamp) == offline.stamp_ns
+    assert ns_of(extrinsic.header.stamp) == offline.stamp_ns
     assert (
         f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
         in answer.message
     )
-    metres, radians = absolute_errors(matrix(extrinsic), case.T_parent_child)
+    metres, radians = se3.absolute_errors(matrix(extrinsic), case.T_parent_child)
     assert (metres, np.degrees(radians)) == pytest.approx((0.20, 0.23), abs=0.01)
 
 

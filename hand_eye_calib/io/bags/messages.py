@@ -308,6 +308,19 @@ def pose_row(position: Any, orientation: Any) -> tuple[float, ...]:
     return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
+def transform_of(message: Any) -> PoseFields:
+    """A transform of ROS or of Foxglove; its frames without a leading slash."""
+    if is_ros := hasattr(message, "header"):
+        stamp, parent = message.header.stamp, message.header.frame_id
+    else:
+        stamp, parent = message.timestamp, message.parent_frame_id
+    names = (each[:LONGEST_NAME].lstrip("/") for each in (parent, message.child_frame_id))
+    parent, frame = map(printable, names)
+    pose = message.transform if is_ros else message
+    row = pose_row(pose.translation, pose.rotation)
+    return PoseFields(ns_of(stamp) or 0, parent, frame, row[:3], row[3:])
+
+
 class Run(NamedTuple):
     """Messages of one kind that follow each other, and their bag times (N,)."""
 
@@ -326,21 +339,11 @@ class Run(NamedTuple):
             yield message
 
     def transforms(self) -> Iterator[tuple[int, PoseFields]]:
-        """Bag times, and the transforms of all messages, which are of one of TF_TYPES; frames
-        without a leading slash.
-        """
+        """Bag times, and the transforms of all messages, which are of one of TF_TYPES."""
         for message, bag_ns in zip(self.decoded(), self.bag_ns.tolist(), strict=True):
             try:
                 for each in getattr(message, "transforms", [message]):
-                    if is_ros := hasattr(each, "header"):
-                        stamp, parent = each.header.stamp, each.header.frame_id
-                    else:  # of Foxglove
-                        stamp, parent = each.timestamp, each.parent_frame_id
-                    pose = each.transform if is_ros else each
-                    names = (x[:LONGEST_NAME].lstrip("/") for x in (parent, each.child_frame_id))
-                    parent, frame = map(printable, names)
-                    row = pose_row(pose.translation, pose.rotation)
-                    yield bag_ns, PoseFields(ns_of(stamp) or 0, parent, frame, row[:3], row[3:])
+                    yield bag_ns, transform_of(each)
             except (AttributeError, TypeError) as error:  # JSON may have anything
                 raise self.unreadable(error) from error
 
