@@ -58,7 +58,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
         return yaml.load(text, Loader=_Loader)
     # A loader raises nearly anything at values that are not what their tags say.
     except Exception as error:
-        reason = shortened(" ".join(str(error).split()), LONGEST_NAME) or type(error).__name__
+        reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
         raise InputError(f"{path} is not YAML that can be read: {reason}") from None
 
 

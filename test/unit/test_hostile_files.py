@@ -41,6 +41,7 @@ HOSTILE_YAML = {
     "float": ("n: !!float abc", "is not YAML"),
     "empty integer": ("n: !!int ''", "is not YAML"),
     "empty date": ("n: !!timestamp ''", "the tag"),
+    "long tag": (f"n: !{'t' * 100_000} 1", "for the tag '!ttt"),
     "object": ("n: !!python/object/apply:os.system ['true']", "the tag"),
     "binary": ("n: !!binary '='", "the tag"),
     "set": ("n: !!set {a, b}", "the tag"),

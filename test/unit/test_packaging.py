@@ -104,6 +104,8 @@ def third_party_imports(folder):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 names.add(node.module.split(".")[0])
+            elif isinstance(node, ast.Call) and ast.unparse(node.func) == "import_module":
+                names |= set(re.findall(r"'(\w+)\.", ast.unparse(node.args[0])))
     return names - set(sys.stdlib_module_names) - {PACKAGE}
 
 

@@ -314,10 +314,10 @@ class TestMessages:
         assert columns.poses[2, 1] == pytest.approx(111.4, abs=0.3)
         assert columns.sensor_frames[0] == "imu_link"
 
-    def test_a_latitude_beyond_the_pole_is_refused_and_named(self):
-        reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
-        with pytest.raises(InputError, match="latitude 139.7 and longitude 25.*swapped"):
-            reader.columns([fix(0), fix(0, latitude=139.7)], is_ros1=False)
-        read = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
-        with pytest.raises(InputError, match="^found latitude 139.7"):
-            read(fix(0, latitude=139.7))
+    def test_a_place_that_is_not_on_earth_is_refused_and_named(self):
+        for place in ({"latitude": 139.7}, {"longitude": 1e300}):
+            reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
+            with pytest.raises(InputError, match="^found latitude .*swapped"):
+                reader.columns([fix(0), fix(0, **place)], is_ros1=False)
+            with pytest.raises(InputError, match="^found latitude .*swapped"):
+                reader(fix(0, **place))

@@ -140,18 +140,8 @@ def test_the_page_shows_what_comes_and_says_when_nothing_comes():
     assert title[1:4] == ["▶ GO ON", "MOUNT MOVED", "MOUNT MOVED"]
     assert [each["shaken"] for each in states][:9] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
     assert [each["footer"] for each in states][1:3] == [False, True]
-    assert [each["locks"] for each in states][8:] == [
-        1,
-        1,
-        2,
-    ]  # while it is seen, the screen stays on
-    assert [each["disabled"] for each in states][:9] == [False] * 4 + [
-        True,
-        True,
-        False,
-        True,
-        True,
-    ]
+    assert [each["locks"] for each in states][8:] == [1, 1, 2]  # while seen, it stays on
+    assert [each["disabled"] for each in states][:9] == [k in (4, 5, 7, 8) for k in range(9)]
     assert said[3] == said[6] == "✓ connected"
     assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d( [AP]M)?, trying again ...", said[4])
     assert said[5] == said[4]

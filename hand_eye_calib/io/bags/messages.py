@@ -426,7 +426,7 @@ class MessageReader:
     def columns(self, messages: Sequence[bytes], is_ros1: bool) -> tuple[PoseTable, BoolArray]:
         """The next messages, and which of them have what is measured; the others are not finite.
 
-        Raises as :func:`unpack_poses`, and InputError at a latitude beyond 90 deg.
+        Raises as :func:`unpack_poses`, and InputError at a place that is not on earth.
         """
         columns = unpack_poses(messages, self._row.name, is_ros1)
         if self._are_poses:
@@ -450,11 +450,11 @@ class MessageReader:
             return se3.to_quat_xyzw(self._rates.rotations(stamps_ns[rows], values[rows]))
         if self._row.unpack is not _fix:
             return values[rows]
-        beyond = values[np.abs(values[:, 0]) > 90]
+        beyond = values[(np.abs(values[:, :2]) > (90, 360)).any(axis=1)]
         if len(beyond):
             raise InputError(
-                "found latitude {:.7g} and longitude {:.7g}: no latitude is beyond 90 deg; they "
-                "seem to be swapped, swap them at their source".format(*beyond[0])
+                "found latitude {:.7g} and longitude {:.7g}: no latitude is beyond 90 deg, no "
+                "longitude beyond 360; if they are swapped, mend their source".format(*beyond[0])
             )
         lat, lon = np.radians(values[rows, :2]).T
         return self._origin.local(lat, lon, values[rows, 2])
