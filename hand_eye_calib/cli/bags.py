@@ -79,8 +79,7 @@ def read_sources(
     for source, kind in measures:
         with waiting_for(f"reading {source}"):
             found.append(bag.trajectory(source, kind))
-    for text in bag.warnings:
-        note(text)
+    note(*bag.warnings)
     return [poses for poses, _ in found], [text for _, notes in found for text in notes]
 
 
@@ -98,8 +97,7 @@ def _read_bags(
         for stream, source in sources.items():
             if not calibrator.frame(stream):
                 calibrator.set_frame(stream, str(source).strip("/"))
-        for text in bag.warnings:
-            note(text)
+        note(*bag.warnings)
         inputs = {"bag": str(bag), **calibrator.inputs(sources)}
         return Recording(calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings))
 

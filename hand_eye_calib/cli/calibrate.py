@@ -198,8 +198,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         document: dict[str, Any] = {"bag": str(bag), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
         document |= {"duration_s": bag.duration_s, "topics": topics, "warnings": bag.warnings}
     document = as_given(document)
-    for text in document["warnings"]:
-        note(text)
+    note(*document["warnings"])
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
     lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
     for topic in topics:

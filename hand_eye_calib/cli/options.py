@@ -119,9 +119,10 @@ def as_typed(text: str) -> str:
     return _NAMES.sub(typed, text)
 
 
-def note(text: object) -> None:
-    """Print something that is good to know, in one line."""
-    print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
+def note(*texts: object) -> None:
+    """Print what is good to know, each in one line."""
+    for text in texts:
+        print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
 def fail(error: object, code: int = Exit.FAILED) -> int:

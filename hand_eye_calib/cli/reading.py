@@ -74,8 +74,7 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
 def read_pair(arguments: Namespace, options: Mapping[str, Any]) -> Recording:
     """The recording of the trajectory files of parent and child."""
     (parent, child), repairs = read_files(arguments, arguments.paths, options)
-    for text in repairs:
-        note(text)
+    note(*repairs)
     inputs: dict[str, Any] = {}
     for path, stream, poses in zip(arguments.paths, STREAMS, (parent, child), strict=True):
         first_ns, last_ns = poses.stamps_ns[[0, -1]].tolist()

@@ -42,8 +42,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         names = [*map(str, arguments.paths)]
         trajectories, notes = read_files(arguments, arguments.paths, {})
         inputs = {"files": names}
-    for text in notes:
-        note(text)
+    note(*notes)
     frames = [each.sensor_frame or name for each, name in zip(trajectories, names, strict=True)]
     if twice := [each for each in frames if frames.count(each) > 1]:
         raise ConfigError(

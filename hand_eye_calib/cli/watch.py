@@ -63,8 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
             server = WebServer(board, requests.put, arguments.web)
             stack.callback(server.stop)
             addresses = server.addresses()
-            for address in addresses:
-                note(f"open {address} in a browser")
+            note(*(f"open {address} in a browser" for address in addresses))
         session = Session(board, requests, stack.enter_context(_keyboard()))
         show = stack.enter_context(_display(addresses[0]))
         while not came and not session.is_over:

@@ -191,7 +191,7 @@ class Trajectory(WithArrays):
                 f"stamps must increase: pose {index} has stamp {stamps_ns[index]} ns "
                 f"after {stamps_ns[index - 1]} ns; sort the poses and drop repeated stamps"
             )
-        _check_poses(poses)
+        check_poses(poses)
         object.__setattr__(self, "stamps_ns", stamps_ns)
         object.__setattr__(self, "poses", poses)
 
@@ -397,7 +397,7 @@ def _check_finite(what: str, rows: FloatArray) -> None:
         )
 
 
-def _check_poses(poses: FloatArray) -> None:
+def check_poses(poses: FloatArray) -> None:
     """Raise InputError at the first pose (N, 4, 4) that is no rigid transform."""
     _check_finite("pose", poses.reshape(-1, 16))
     is_far = (np.abs(poses[:, :3, 3]) > FARTHEST_M).any(axis=1)

@@ -101,13 +101,28 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
 
 
 def read_text(path: str | Path, expected: str, largest: int = LARGEST) -> str:
-    """Read a whole text file in UTF-8, with or without a byte order mark; ``expected`` is what an
-    error says that it should be. Raises as :func:`read_bytes`.
+    """Read a whole text file; see :func:`decoded`. Raises as :func:`read_bytes`."""
+    return decoded(path, read_bytes(path, largest), expected)
+
+
+def decoded(path: str | Path, data: bytes, expected: str) -> str:
+    """The text of a file in UTF-8, with or without a byte order mark; ``expected`` is what an error
+    says that it should be.
     """
     try:
-        return read_bytes(path, largest).decode("utf-8-sig")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected {expected}") from None
+
+
+@contextmanager
+def writing(path: str | Path) -> Iterator[None]:
+    """Turns what the system says of a file at or below a path into an InputError that names it."""
+    try:
+        yield
+    except OSError as error:
+        name = error.filename or path
+        raise InputError(f"cannot write {name}: {error.strerror}; choose another place") from None
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from hand_eye_calib.errors import InputError, located, printable
-from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically
+from hand_eye_calib.io.files import open_regular, read_bytes, write_atomically, writing
 from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import transform_arguments, usable_angles, usable_numbers
@@ -104,16 +104,11 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     returns the last file.
     """
     kept = {directory / name: text for name, text in texts.items() if text is not None}
-    try:
+    with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
         write_atomically(kept)
         for path in {directory / name for name in texts} - kept.keys():
             path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {error.filename or directory}: {error.strerror}; choose another "
-            "directory"
-        ) from None
     return [*kept][-1]
 
 
@@ -138,12 +133,10 @@ def keep_earlier_results(directory: str | Path) -> str:
     """
     previous, names = Path(directory, "previous"), (*_NAMES, "report.html")
     found = [path for name in names if (path := Path(directory, name)).exists()]
-    try:
+    with writing(previous):
         if found:
             previous.mkdir(exist_ok=True)
         write_atomically({previous / path.name: read_bytes(path) for path in found})
-    except OSError as error:
-        raise InputError(f"cannot keep {error.filename} in {previous}: {error.strerror}") from None
     return f"; the files that were there are in {previous}" if found else ""
 
 

@@ -13,7 +13,7 @@ from hand_eye_calib.config import METHODS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_rpy, sigmas_translation
-from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE
+from hand_eye_calib.geometry.trajectory import check_poses
 from hand_eye_calib.plain import Document, from_plain, plain
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.result import Result
@@ -292,10 +292,7 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 def _transform_of(data: Mapping[str, Any]) -> FloatArray:
     """Transform (4, 4) of a document."""
     matrix = _matrix(data, 4)
-    rotation = matrix[:3, :3]
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
-    if not (is_rotation and np.isfinite(matrix).all() and np.linalg.det(rotation) > 0):
-        raise ValueError("a matrix is not a transform")
+    check_poses(matrix[None])
     return matrix
 
 

@@ -344,7 +344,7 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
 
 def test_writing_refuses_what_it_cannot_do(tmp_path, new_bag):
     path = new_bag()
-    with pytest.raises(InputError, match="cannot write bag"):
+    with pytest.raises(InputError, match="cannot write .*bag"):
         write_bag(storage_file(path) / "new", STREAMS)
     assert not {*tmp_path.iterdir()} - {path}
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.storage import rosbags
+from hand_eye_calib.io.files import writing
 
 STORAGES = ("mcap", "sqlite3", "rosbag1")
 
@@ -30,13 +30,10 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
     about: dict[str, Any] = {}
     if storage != "rosbag1":
         about = {"version": 9, "storage_plugin": library.StoragePlugin[storage.upper()]}
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer = library.Writer(path, **about)
-        with writer:
+        with library.Writer(path, **about) as writer:
             write_streams(writer, streams, storage)
-    except OSError as error:
-        raise InputError(f"cannot write bag {path}: {error.strerror}") from None
 
 
 def write_streams(writer: Any, streams: Streams, storage: str) -> None:

@@ -20,7 +20,7 @@ from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory, TrajectoryLike
-from hand_eye_calib.io.files import LONGEST_LINE, read_bytes, read_text
+from hand_eye_calib.io.files import LONGEST_LINE, decoded, read_bytes, read_text
 from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
 from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import (
@@ -53,6 +53,10 @@ _FORMATS: dict[str, tuple[Sequence[str], str]] = {
     ),
 }
 # A stamp, a position and a quaternion, whose order is to be found.
+_EXPECTED = (
+    "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
+    "autopilots as csv, a model of COLMAP as text"
+)
 _UNNAMED = ("t", *POSITION, *UNNAMED)
 # Rows of numbers that have a matrix, all or the first three rows of it, by how many there are.
 _LAST_ROW = tuple(f"m4{column}" for column in "1234")
@@ -321,7 +325,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     for pattern, read in PROGRAMS.items():
         if re.search(pattern, head):
             return foreign_table(path, data, read, options.columns, options.measures)
-    text = _decoded(path, data)
+    text = decoded(path, data.replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
     number, cells, names, format, header = _beginning(path, text)
     columns, times, guesses = options.columns, options.times, list[str]()
     if options.format != AUTO or columns or times:
@@ -358,16 +362,6 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     if format == "kitti" and times is not None:
         table.stamps = _stamps_of(times, table)
     return table
-
-
-def _decoded(path: str | Path, data: bytes) -> str:
-    try:
-        return data.replace(b"\0", b"\xff").decode("utf-8-sig")  # no text has a zero
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: not a text file; expected lines of a trajectory: save the poses of MATLAB, "
-            "HDF5, Arrow, spreadsheets, receivers and autopilots as csv, a model of COLMAP as text"
-        ) from None
 
 
 def _lines(path: str | Path, text: str, after: int | None = None) -> Iterator[tuple[int, str]]:

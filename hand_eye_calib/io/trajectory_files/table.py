@@ -18,7 +18,7 @@ from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.files import LONGEST_NAME, write_atomically
+from hand_eye_calib.io.files import LONGEST_NAME, write_atomically, writing
 from hand_eye_calib.text import shortened, shown_value
 
 POSITION = ("x", "y", "z")
@@ -374,12 +374,9 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     --------
     >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
     """
-    try:
-        poses = se3.to_rows(trajectory.poses).tolist()
-        lines = map(tum_line, trajectory.stamps_ns.tolist(), poses)
+    lines = map(tum_line, trajectory.stamps_ns.tolist(), se3.to_rows(trajectory.poses).tolist())
+    with writing(path):
         write_atomically({Path(path): "\n".join([f"# {TUM_COLUMNS}", *lines, ""])})
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
