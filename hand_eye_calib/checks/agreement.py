@@ -114,8 +114,8 @@ def check_agreement(
     }
     if change:
         tried["moved"] = lambda: _moved_mount(change, int(pose_pairs.stamps_ns[0]))
-    most = max(tried, key=slow.share)
-    suspects: list[_Suspect] = [(slow.share(most), tried[most]())]
+    share, most = max((slow.share(name), name) for name in tried)
+    suspects: list[_Suspect] = [(share, tried[most]())]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
     if fast := delays(pose_pairs, motions, X):
         suspects += _delays(fast, pose_pairs, speed, offset_s)
@@ -199,13 +199,13 @@ def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
 
 def _axis_gain(slow: Regression, stream: str) -> Finding | None:
     """A coordinate of a stream that has another scale than the others."""
-    fitted = slow.fit(f"axes_{stream}")
-    k, off, sigma = _odd_one(fitted)
-    of_noise = slow.biases(f"axes_{stream}")[k]
+    group = f"axes_{stream}"
+    k, off, sigma = _odd_one(slow.fit(group))
+    of_noise = slow.biases(group)[k]
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
     if abs(off) < _BIASES * (of_noise + of_drift):
         return None
-    size = off if fitted.share > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
+    size = off if slow.share(group) > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
     values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
     return graded("axis_scale", stream, size, sigma, **values)
 
@@ -246,26 +246,28 @@ def _delays(
     """
     for stream, Ts in zip(_STREAMS, (pairs.Ts_cw_c, pairs.Ts_pw_p), strict=True):
         beside = [f"{part}_{stream}" for part in _SMOOTHING_S2]
-        whole, by_axis = (fast.fit(f"late_{each}{stream}", *beside) for each in ("", "axes_"))
+        groups = f"late_{stream}", f"late_axes_{stream}"
+        whole, by_axis = (fast.fit(group, *beside) for group in groups)
         k, off_s, off_sigma_s = _odd_one(by_axis)
         delay_s, along = float(whole.values[0]), usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
         of_axis = (f"{'xyz'[k]} coordinates", "others")
-        for fitted, late_s, sigma_s, speed_m_s, code, (part, others) in (
-            (whole, abs(delay_s), whole.sigmas[0], speed, "position_clock", parts),
+        for group, late_s, sigma_s, speed_m_s, code, (part, others) in (
+            (groups[0], abs(delay_s), whole.sigmas[0], speed, "position_clock", parts),
             # The other stream's coordinate cannot be early.
-            (by_axis, off_s, off_sigma_s, along, "axis_lag", of_axis),
+            (groups[1], off_s, off_sigma_s, along, "axis_lag", of_axis),
         ):
             if late_s > _DELAY_S:
+                share = fast.share(group, *beside)
                 shift_m, sigma_m = late_s * speed_m_s, sigma_s * speed_m_s
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
                 if is_expected := abs(late_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED:
                     sigma_m *= _EXPECTED
-                if is_expected or late_s < _GRAVE * _DELAY_S or fitted.share < _SOME:
+                if is_expected or late_s < _GRAVE * _DELAY_S or share < _SOME:
                     least = min(1.0, LIMITS["late"][-1] / max(shift_m, 1e-9))
                     shift_m, sigma_m = least * shift_m, least * sigma_m
                 values |= {"part": part, "others": others}
-                yield fitted.share, graded("late", stream, shift_m, sigma_m, **values)
+                yield share, graded("late", stream, shift_m, sigma_m, **values)
 
 
 def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Suspect]:
@@ -274,14 +276,15 @@ def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Susp
     """
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
-            fitted = fast.fit(f"{part}_{stream}", f"late_{stream}")
+            groups = f"{part}_{stream}", f"late_{stream}"
+            fitted = fast.fit(*groups)
             value_s2, sigma_s2 = float(fitted.values[0]), float(fitted.sigmas[0])
             if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
                 smoothing_s = value_s2**0.5
-                displaced_m = value_s2 * float(fast.displaced(f"{part}_{stream}")[0])
+                displaced_m = value_s2 * float(fast.displaced(groups[0])[0])
                 shift_m = max(displaced_m, min(smoothing_s * speed, LIMITS["smoothed"][-1]))
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": displaced_m}
-                yield fitted.share, graded("smoothed", stream, shift_m, **values)
+                yield fast.share(*groups), graded("smoothed", stream, shift_m, **values)
 
 
 def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory) -> list[Finding]:

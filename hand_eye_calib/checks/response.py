@@ -47,12 +47,11 @@ _Where: TypeAlias = Mapping[str, list[int]]
 @dataclass(frozen=True)
 class Fitted:
     """What a group of m columns is fitted with: values and standard deviations (m,), by the
-    jackknife over blocks of time; and the share of the squared residuals that the group takes away.
+    jackknife over blocks of time.
     """
 
     values: FloatArray
     sigmas: FloatArray
-    share: float
 
 
 class Regression:
@@ -121,7 +120,7 @@ class Regression:
         _, *parts = np.split(solved, [1, 1 + _BLOCKS])
         variances = [(len(values) - 1) * values.var(axis=0) for values in parts]
         sigmas = np.sqrt(np.max(variances, axis=0))
-        return Fitted(values=solved[0], sigmas=sigmas, share=self.share(group, *beside))
+        return Fitted(values=solved[0], sigmas=sigmas)
 
 
 def _solved(products: FloatArray, columns: list[int]) -> FloatArray:
