@@ -59,13 +59,12 @@ class Body:
         return se3.from_rotation_translation(self.turn(times).as_matrix(), self.place(times))
 
 
-def scans(body, T_body_lidar, count, rng):
+def scans(body, T_body_lidar, too_far, count, rng):
     """Per scan: points (N, 3) and times (N,) since its first ray."""
     azimuth = -2.0 * np.pi * np.arange(COLUMNS) / COLUMNS
     level = np.cos(ELEVATIONS)
     x, y = np.outer(np.cos(azimuth), level), np.outer(np.sin(azimuth), level)
     rays = np.stack([x, y, np.tile(np.sin(ELEVATIONS), (COLUMNS, 1))], axis=-1)
-    too_far = 0.005 * rng.standard_normal(len(ELEVATIONS))
     since = np.arange(COLUMNS) / COLUMNS / RATE
     for number in range(count):
         Ts = body.poses(number / RATE + since) @ T_body_lidar
@@ -107,8 +106,9 @@ def test_two_lidars_from_their_points(tmp_path, capsys):
     rng = np.random.default_rng(11)
     count, body = 70, Body(7.0, rng)
     X, messages = se3.exp([0.6, -0.3, 0.2, 0.1, -0.2, 0.9]), []
-    for topic, T, of_time in (("/front", np.eye(4), "time"), ("/rear", X, "t")):
-        for number, scan in enumerate(scans(body, T, count, rng)):
+    too_far = 0.005 * rng.standard_normal((2, len(ELEVATIONS)))
+    for k, (topic, T, of_time) in enumerate((("/front", np.eye(4), "time"), ("/rear", X, "t"))):
+        for number, scan in enumerate(scans(body, T, too_far[k], count, rng)):
             stamp_ns = START_NS + round(number / RATE * 1e9)
             make = partial(cloud, stamp_ns=stamp_ns, frame=topic[1:], of_time=of_time)
             make = partial(make, points=scan[0], times=scan[1])
@@ -123,13 +123,15 @@ def test_two_lidars_from_their_points(tmp_path, capsys):
     assert (result.parent_frame, result.child_frame) == ("front", "rear")
     # A pose is that of the middle of its scan. With a constant motion in each, 0.016 deg.
     middle_s = (np.arange(count) + 0.5 - 0.5 / COLUMNS) / RATE
-    for name, T_body_lidar in (("front", np.eye(4)), ("rear", X)):
+    rings = np.round(180.0 + 2.0 * np.degrees(ELEVATIONS)).astype(int)
+    for name, T_body_lidar, k in (("front", np.eye(4), 0), ("rear", X, 1)):
         kept = tmp_path / f"drive.{name}.odometry.npz"
         found, truth = np.load(kept), body.poses(middle_s) @ T_body_lidar
         np.testing.assert_allclose(found["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
         poses = se3.from_quat_xyzw(found["poses"][:, :3], found["poses"][:, 3:])
         turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]
         assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0135
+        assert np.std(found["too_far_m"][rings] - too_far[k]) < 0.6 * np.std(too_far[k])  # or 1
     # The second time, what is kept is read.
     before = kept.stat().st_mtime_ns
     with PoseBag(bag) as opened:

@@ -68,7 +68,7 @@ class Tuning:
 
 TUNING = Tuning()
 
-_KEPT = ("poses", "stamps_ns", "bag_ns", "frame", "n_failed")
+_KEPT = ("poses", "stamps_ns", "bag_ns", "frame", "n_failed", "too_far_m")
 
 
 class Scan(NamedTuple):
@@ -121,7 +121,7 @@ class ScanReading(Reading):
     """The points of a lidar, as odometry: its scans are registered one after the other. What is
     found is kept beside the bag, and read again for files of the same sizes and times: poses (N, 7)
     in the frame of the first scan, each of the middle of its scan, stamps and bag times (N,), the
-    lidar's frame, and how many scans could not be registered.
+    lidar's frame, how many scans could not be registered, and what rings measure too far (m).
     """
 
     def __init__(self, stream: str, topic: str, bag: Path, files: Sequence[Path]) -> None:
@@ -137,7 +137,7 @@ class ScanReading(Reading):
         self._gicp = required(
             "small_gicp", "odometry from the points of a lidar", "hand_eye_calib[lidar]"
         )
-        self._voxel_m, self._n_failed = 0.0, 0
+        self._voxel_m, self._has_failed = 0.0, [False]
         self._maps: list[Any] = []
         # Of all scans, and the newest three of them.
         self._poses, self._stamps_ns, self._bag_ns = [np.eye(4)], list[int](), list[int]()
@@ -154,18 +154,19 @@ class ScanReading(Reading):
 
     def table(self) -> PoseTable:
         if not self._kept:
-            if 2 * self._n_failed >= len(self._bag_ns):
+            n_failed = sum(self._has_failed)
+            if 2 * n_failed >= len(self._bag_ns):
                 raise InputError(
-                    f"{self.topics[0]}: of {len(self._bag_ns)} scans with points, {self._n_failed} "
+                    f"{self.topics[0]}: of {len(self._bag_ns)} scans with points, {n_failed} "
                     "could not be registered; use the odometry of a lidar SLAM"
                 )
             self._register(-1, 1)
             found = se3.to_rows(np.array(self._poses)), self._stamps_ns, self._bag_ns
-            self._kept = [*found, self._scans[-1].frame, self._n_failed]
+            self._kept = [*found, self._scans[-1].frame, n_failed, self._too_far_m]
             with suppress(OSError):  # the folder may be read-only
                 kept = dict(zip(_KEPT, self._kept, strict=True))
                 np.savez(self._place, bag_files=self._state, **kept)
-        poses, stamps_ns, bag_ns, frame, n_failed = self._kept
+        poses, stamps_ns, bag_ns, frame, n_failed, _ = self._kept
         lost = f", {n_failed} of which could not be registered" if n_failed else ""
         self.notes.append(f"odometry from {len(poses)} scans{lost}; it is kept in {self._place}")
         return PoseTable.of(stamps_ns, poses, "scans", str(frame)).recorded(self.stream, bag_ns)
@@ -183,6 +184,7 @@ class ScanReading(Reading):
         else:
             last = self._poses[-1]
             self._poses.append(last @ se3.inverse(self._poses[-2:][0]) @ last)
+            self._has_failed.append(True)
             self._register(-1, 0)
         if count <= 3:  # the first scan needs the motion during it
             self._start()
@@ -211,11 +213,10 @@ class ScanReading(Reading):
             pose = np.array(found.T_target_source)
             # Rounding must not grow from scan to scan.
             pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
-            self._poses[index] = pose
+            self._poses[index], self._has_failed[index] = pose, False
         elif not step:
             self._poses[index] = self._poses[index - 1]  # rather than on and away from the map
-            self._n_failed += 1
-        if step and self._poses[index] is not self._poses[index - 1 :][0]:  # nor that of one scan
+        if step and not self._has_failed[index]:
             if len(self._poses) % TUNING.look_every == 0:
                 self._look_at_rings(self._scans[index], still, self._poses[index])
             for each in self._maps:
