@@ -57,11 +57,13 @@ def deliver(
         note(f"wrote {save_result(calibration, arguments.out, inputs)}{kept}")
     steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
-    print_result(as_lines(calibration, steps, arguments.verbose), document)
-    if arguments.out and calibration.motion_residuals:
-        from hand_eye_calib.cli.reporting import write_report
+    try:
+        print_result(as_lines(calibration, steps, arguments.verbose), document)
+    finally:  # even if the reader of what is printed has gone
+        if arguments.out and calibration.motion_residuals:
+            from hand_eye_calib.cli.reporting import write_report
 
-        write_report(arguments.out, calibration, snapshot, inputs)
+            write_report(arguments.out, calibration, snapshot, inputs)
     for one in calibration.reasons[:1] if calibration.status.failure else ():
         fail(f"{one.sentence}; do not use this result, {one.what_to_do}")
     return exit_code(calibration)
@@ -97,8 +99,8 @@ def exit_code(calibration: Calibration) -> int:
     """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
     if calibration.status.failure:
         return Exit.FAILED
-    hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
-    return Exit.NOT_ALL if hidden or calibration.verdict is Verdict.DO_NOT_USE else Exit.GOOD
+    is_whole = not calibration.hidden and calibration.verdict is not Verdict.DO_NOT_USE
+    return Exit.GOOD if is_whole else Exit.NOT_ALL
 
 
 def as_lines(
@@ -181,9 +183,7 @@ def next_steps(
 
             motion = what_is_missing(excitation(snapshot.pose_pairs), calibration)
             steps += [motion] if motion else []
-        reach = calibration.out_of_reach
-        hidden = [axis for axis in calibration.unobservable() if axis not in reach]
-        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in hidden[:3]]
+        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.hidden[:3]]
     if extra:
         typed = shlex.join(arguments.typed)
         steps.append(f"hand_eye_calib {typed} {' '.join(dict.fromkeys(extra))}")

@@ -55,9 +55,11 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         rig = of_rig.calibrate_rig(sensors, inputs["options"])
     if arguments.out:
         note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
-    print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
-    if arguments.out:
-        write_rig_report(arguments.out, rig, names)
+    try:
+        print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
+    finally:  # even if the reader of what is printed has gone
+        if arguments.out:
+            write_rig_report(arguments.out, rig, names)
     failed = [each for each in rig.calibrations if each.status.failure]
     for each in failed:
         fail(f"{each.child_frame}: {each.headline}", 1)

@@ -453,14 +453,15 @@ def test_interrupt_ends_quietly(tmp_path):
     assert (process.returncode, out, err) == (130, "", "")
 
 
-def test_a_reader_that_goes_away_is_no_error(tmp_path):
-    hec.save(solved(), tmp_path)
+def test_a_reader_that_goes_away_is_no_error_and_files_are_written(tmp_path, new_bag):
     readable, writable = os.pipe()
     os.close(readable)
-    process = start("info", tmp_path, stdout=writable)
-    err = process.communicate()[1]
+    process = start("replay", new_bag(), *TOPICS, "--out", tmp_path / "out", stdout=writable)
+    told = process.communicate()[1].splitlines()
     os.close(writable)
-    assert (process.returncode, err) == (141, "")
+    assert (process.returncode, len(told)) == (141, 2)
+    assert all(line.startswith("hand_eye_calib: note: wrote ") for line in told)
+    assert (tmp_path / "out" / "report.html").exists()
 
 
 class Terminal(io.StringIO):
@@ -484,8 +485,8 @@ def test_progress_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
 
 
 def test_messages_name_options_as_they_are_typed(capsys):
-    note("raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3")
-    note("give `scale` or `child_columns`, not `this`")
+    told = "raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3"
+    note(told, "give `scale` or `child_columns`, not `this`")
     fail("keyframe.min_interval: no scale", 1)
     assert capsys.readouterr().err == (
         "hand_eye_calib: note: raise --max-gap, or give --prior z; see 'max_gap' in "
