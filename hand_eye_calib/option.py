@@ -114,6 +114,11 @@ class OptionSet:
             object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
 
     @classmethod
+    def by_name(cls) -> dict[str, OptionField]:
+        """The options' fields by their public names."""
+        return {option_name(field): field for field in dataclasses.fields(cls)}
+
+    @classmethod
     def from_options(cls, options: Mapping[str, object]) -> Self:
         """Build from a mapping of public names to values.
 
@@ -122,15 +127,15 @@ class OptionSet:
         ConfigError
             If a name is unknown, with a list of the known ones, or a value is not allowed.
         """
-        known = {option_name(field): field.name for field in dataclasses.fields(cls)}
+        known = cls.by_name()
         unknown = [name for name in options if name not in known]
         if unknown:
             raise ConfigError(
                 f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], known)}; known are "
                 f"{', '.join(sorted(known))}"
             )
-        return cls(**{known[name]: value for name, value in options.items()})
+        return cls(**{known[name].name: value for name, value in options.items()})
 
     def to_options(self) -> dict[str, OptionValue]:
         """Mapping of public names to values."""
-        return {option_name(field): getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: getattr(self, field.name) for name, field in self.by_name().items()}

@@ -67,11 +67,11 @@ def robust_sigma(vectors: FloatArray) -> FloatArray:
     return medians(np.linalg.norm(vectors, axis=-1)) / MEDIAN_LENGTH
 
 
-def student_weights(squared: FloatArray, dimension: int = 6) -> FloatArray:
-    """Weights of vectors of a dimension, with these squared lengths in standard deviations, as of
+def student_weights(squared: FloatArray) -> FloatArray:
+    """Weights of vectors of six values, with these squared lengths in standard deviations, as of
     Student's t distribution: 1 on average, small for outliers.
     """
-    return (STUDENT + dimension) / (STUDENT + squared)
+    return (STUDENT + 6.0) / (STUDENT + squared)
 
 
 def chi_square_quantile(tail: float) -> float:

@@ -215,7 +215,7 @@ def seconds_of_motion(pose_pairs: PosePairs) -> float:
 
 
 def what_is_missing(seen: Excitation, calibration: Calibration | None = None) -> str:
-    """What the motion so far does not show, and the motion that would, in one sentence.
+    """What cannot be determined from the motion so far, and the motion that would show it.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     """
     axes, what = [*seen.hidden_axes()], "cannot be determined from"
     if calibration:
-        axes = [each for each in calibration.unobservable() if each not in calibration.out_of_reach]
+        axes = calibration.hidden
         if not axes:
             known, what = calibration.observability, "still uncertain after"
             axes = [dof.name for dof in known if dof.verdict is DofVerdict.WEAK]

@@ -1,12 +1,10 @@
 """``calibrator``: the node."""
 
 import argparse
-import dataclasses
 import json
 import textwrap
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.option import option_name
 
 _INTERFACE = """\
 examples:
@@ -37,10 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments: all are the node's, and passed on to it."""
     parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
     epilog = _INTERFACE
-    for field in (*dataclasses.fields(CalibratorConfig), *dataclasses.fields(NodeConfig)):
+    for name, field in (CalibratorConfig.by_name() | NodeConfig.by_name()).items():
         value = " ".join(filter(None, (json.dumps(field.default), field.metadata["unit"])))
         doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), 6 * " ")
-        epilog += f"  {option_name(field)} ({value})\n{doc}\n"
+        epilog += f"  {name} ({value})\n{doc}\n"
     parser.epilog = epilog.replace("%", "%%")
 
 

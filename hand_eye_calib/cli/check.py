@@ -35,29 +35,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
-    from hand_eye_calib.checks.check import check_streams
-    from hand_eye_calib.checks.findings import answered, finding, gravest_first
+    from hand_eye_calib.checks.findings import finding, gravest_first
     from hand_eye_calib.checks.streams import summarise
     from hand_eye_calib.engine.run import check
     from hand_eye_calib.engine.snapshot import whole_snapshot
+    from hand_eye_calib.plain import plain
 
     given = options.options_from(arguments)
     sources, (first, second), repairs = _opened(arguments, given)
     snapshot = whole_snapshot(first, second, given)
     config, parent, child = snapshot.config, snapshot.parent, snapshot.child
-    # What is to be estimated is not known yet: the checks say what it is.
-    offset_s = config.time_offset if isinstance(config.time_offset, float) else 0.0
-    scale = config.scale if isinstance(config.scale, float) else 1.0
     with waiting_for("checking the streams"):
-        if config.measured == "poses":
-            checked = check_streams(parent, child, offset_s, scale, config.max_gap)
-        else:
-            checked = check(snapshot, snapshot.estimate())
+        checked = check(snapshot, None if config.measured == "poses" else snapshot.estimate())
     of_files = [finding("disorder", text=text) for text in repairs]
-    findings = gravest_first(answered([*checked.findings, *of_files], config))
+    findings = gravest_first([*checked.findings, *of_files])
     both = zip(STREAMS, (parent, child), strict=True)
     streams = {name: summarise(one) for name, one in both if len(one) > 1}
-    summaries = {name: {"source": sources[name], **vars(streams[name])} for name in streams}
+    summaries = {name: {"source": sources[name]} | plain(streams[name]) for name in streams}
     document = {"streams": summaries, "findings": findings} if arguments.json else None
     lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
     print_result(lines, document)

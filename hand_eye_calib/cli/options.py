@@ -8,7 +8,6 @@ Nothing here loads a library: ``--help`` is quick.
 """
 
 import argparse
-import dataclasses
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,16 +19,16 @@ from typing import Any, TypeVar
 
 import hand_eye_calib.config as config
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.option import check_value, did_you_mean, option_name
+from hand_eye_calib.option import OptionField, check_value, did_you_mean
 
 _Item = TypeVar("_Item")
 
 STREAMS = ("parent", "child")
-OPTION_FIELDS = {option_name(field): field for field in dataclasses.fields(config.CalibratorConfig)}
+OPTION_FIELDS = config.CalibratorConfig.by_name()
 
 Options = dict[str, Any]
 
-_NODE_OPTIONS = {option_name(field) for field in dataclasses.fields(config.NodeConfig)}
+_NODE_OPTIONS = config.NodeConfig.by_name()
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NODES = ("calibrator", "**", "*", "")
 _OF_ROS = "ros__parameters"
@@ -249,7 +248,7 @@ def _prior(text: str) -> tuple[str, Any]:
     return name, check_value(OPTION_FIELDS[name], value)
 
 
-def _value(field: dataclasses.Field[Any], value: Any) -> Any:
+def _value(field: OptionField, value: Any) -> Any:
     """The value of an option, from text or as YAML has it."""
     kind = type(field.default)
     if isinstance(value, str) and kind in (int, float):

@@ -18,7 +18,6 @@ from hand_eye_calib.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
-from hand_eye_calib.results.records import AXES
 
 #: Called with the share that is done, 0 to 1, and the step that begins.
 Progress: TypeAlias = Callable[[float, str], None]
@@ -332,9 +331,7 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
     parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
         found += checking.check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)
-    hidden = set()
-    if calibration:
-        hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
+    hidden = calibration.hidden if calibration else []
     if len(hidden) == 3 or any(each.code == "unrelated" for each in found):
         of_speed, max_gap_s = snapshot.config.measured == "positions", snapshot.config.max_gap
         correlation = correlate_rates(parent, child.shifted(known_s), max_gap_s, of_speed)
@@ -343,5 +340,5 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
             offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
             found += checking.check_offset(offset, known_s)
     if hidden and not any(each.makes_unusable for each in found):
-        found.append(checking.unseen([axis for axis in AXES if axis in hidden]))
+        found.append(checking.unseen(hidden))
     return [each for index, each in enumerate(found) if each not in found[:index]]

@@ -388,7 +388,9 @@ def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (6,) along and about the parent's axes."""
+    """Standard deviations (6,) along and about the parent's axes; infinite if the covariance is."""
+    if not np.isfinite(covariance).all():
+        return np.full(6, np.inf)
     variances = np.diag(turned(rotation_parent_child, covariance))
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
@@ -428,17 +430,6 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     if np.hypot(rotation[0, 0], rotation[1, 0]) < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE):
         sigmas[[0, 2]] = np.inf
     return sigmas
-
-
-def sigmas_translation(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (3,) of the translation along the axes of the target frame, m, of a
-    transform (4, 4) and a covariance (6, 6) as for :func:`sigmas_rpy`.
-    """
-    rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
-    covariance = np.asarray(covariance, dtype=float)[:3, :3]
-    if not np.isfinite(covariance).all():
-        return np.full(3, np.inf)
-    return np.sqrt(np.maximum(np.diag(rotation @ covariance @ rotation.T), 0.0))
 
 
 def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:

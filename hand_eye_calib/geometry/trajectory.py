@@ -1,10 +1,9 @@
 """Trajectories: stamped poses of one sensor in a fixed frame of its own."""
 
-import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from os import PathLike
-from typing import Any, Protocol, Self, TypeAlias
+from typing import Any, ClassVar, Protocol, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -166,6 +165,9 @@ class Trajectory(WithArrays):
     world_frame: str = ""
     measures: str = "poses"
 
+    # One that has the same bends: this one is it at another time.
+    _alike: ClassVar[Self | None] = None
+
     def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
         poses = np.ascontiguousarray(self.poses, dtype=float)
@@ -299,7 +301,7 @@ class Trajectory(WithArrays):
         stamps_ns = self.stamps_ns + np.int64(round(offset_s * 1e9))
         if rate:
             stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
-        return self._unchecked("stamps_ns", stamps_ns, keeps_bends=not rate)
+        return self._unchecked("stamps_ns", stamps_ns, None if rate else self._alike or self)
 
     def scaled(self, scale: float) -> Self:
         """The same rotations with every translation multiplied by ``scale``."""
@@ -309,21 +311,17 @@ class Trajectory(WithArrays):
         poses[:, :3, 3] *= scale
         return self._unchecked("poses", poses)  # in another unit, they may be farther away
 
-    def _unchecked(
-        self, name: str, value: IntArray | FloatArray, keeps_bends: bool = False
-    ) -> Self:
-        changed = copy.copy(self)
-        object.__setattr__(changed, name, value)
-        alike = changed.__dict__.pop("_alike", self)  # the bends are the same
-        changed.__dict__.pop("_bends", None)
-        if keeps_bends:
-            changed.__dict__["_alike"] = alike
+    def _unchecked(self, name: str, value: NDArray[Any], alike: Self | None = None) -> Self:
+        changed = object.__new__(type(self))
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        for key, each in (values | {name: value, "_alike": alike}).items():
+            object.__setattr__(changed, key, each)
         return changed
 
     @cached_property
     def _bends(self) -> tuple[FloatArray, FloatArray]:
-        alike = self.__dict__.get("_alike")
-        return alike._bends if alike else bends(self.stamps_ns, self.poses)
+        alike = self._alike
+        return bends(self.stamps_ns, self.poses) if alike is None else alike._bends
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False

@@ -12,7 +12,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import METHODS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_rpy, sigmas_translation
+from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.geometry.trajectory import check_poses
 from hand_eye_calib.plain import Document, from_plain, plain
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand
@@ -113,7 +113,7 @@ def transforms_of(result: Result) -> dict[str, Notation]:
     found = {}
     for name, T, source, target, covariances, sigmas_m in rows:
         sigmas, of_floor = (sigmas_rpy(T, each) for each in covariances)
-        along, floor_m = (sigmas_translation(T, each) for each in covariances)
+        along, floor_m = (sigmas_in_parent(T[:3, :3], each)[:3] for each in covariances)
         if sigmas_m is None:
             is_unsure = bool(hidden) or name == "T_world_world"
             sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)

@@ -270,6 +270,11 @@ class Result:
         ]
 
     @property
+    def hidden(self) -> list[str]:
+        """Names of the axes that the recording does not determine, though its streams could."""
+        return [axis for axis in self.unobservable() if axis not in self.out_of_reach]
+
+    @property
     def out_of_reach(self) -> tuple[str, ...]:
         """Axes that streams of this kind say nothing about, and no prior either."""
         silent = {"rotations": records.AXES[:3], "positions": records.AXES[3:]}.get(

@@ -50,8 +50,7 @@ class ResultTopics:
         if calibration is None:
             self._withdraw()
             return
-        hidden = {*calibration.unobservable()} - {*calibration.out_of_reach}
-        if hidden.isdisjoint(ROTATIONS) and len(hidden) <= 1:
+        if len(calibration.hidden) <= 1 and {*calibration.hidden}.isdisjoint(ROTATIONS):
             self._transform.publish(to_transform(calibration))
             self._is_told = True
         elif self._is_told:

@@ -1,6 +1,5 @@
 """The node's parameters, made from the option dataclasses."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -10,14 +9,10 @@ from rclpy.parameter import Parameter
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.option import OptionField, check_value, did_you_mean, option_name
+from hand_eye_calib.option import OptionField, check_value, did_you_mean
 
-FIELDS: dict[str, OptionField] = {
-    option_name(field): field
-    for config in (CalibratorConfig, NodeConfig)
-    for field in dataclasses.fields(config)
-}
-_OF_NODE = {option_name(field) for field in dataclasses.fields(NodeConfig)}
+_OF_NODE = NodeConfig.by_name()
+FIELDS = CalibratorConfig.by_name() | _OF_NODE
 
 # Declared by rclpy itself.
 _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")

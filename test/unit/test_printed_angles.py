@@ -6,7 +6,7 @@ from result_making import calibration as made
 from result_making import dofs
 
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_rpy, sigmas_translation
+from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.results.calibration import SolveStatus
 from hand_eye_calib.results.document import printed_numbers, transforms_of
 
@@ -47,7 +47,7 @@ def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
     inverse = se3.inverse(T), se3.inverse(drawn), inverse_covariance(T, covariance)
     for of, samples, stated in ((T, drawn, covariance), inverse):
         along = samples[:, :3, 3].std(axis=0)
-        np.testing.assert_allclose(sigmas_translation(of, stated), along, rtol=0.03)
+        np.testing.assert_allclose(sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03)
         found = sigmas_rpy(of, stated)
         if np.isfinite(found).all():  # the inverse of one is locked
             angles = se3.rotation_to_rpy(samples[:, :3, :3])
@@ -71,17 +71,14 @@ def test_an_unknown_rotation_has_no_sigma():
     covariance = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, np.pi**2])
     assert sigmas_rpy(np.eye(4), covariance).tolist() == pytest.approx([1e-3, 1e-3, np.inf])
     assert np.isinf(sigmas_rpy(np.eye(4), np.full((6, 6), np.inf))).all()
-    assert np.isinf(sigmas_translation(np.eye(4), np.full((6, 6), np.inf))).all()
+    assert np.isinf(sigmas_in_parent(np.eye(3), np.full((6, 6), np.inf))).all()
 
 
 def calibration(rotation, sigmas_deg):
     T, covariance = transform(rotation), covariance_about_parent(rotation, sigmas_deg)
     sigmas = np.r_[0.01, 0.02, 0.03, np.radians(sigmas_deg)]
     return made(
-        T_parent_child=T,
-        covariance=covariance,
-        status=SolveStatus.OK,
-        observability=dofs(sigmas),
+        T_parent_child=T, covariance=covariance, status=SolveStatus.OK, observability=dofs(sigmas)
     )
 
 
