@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import islice
 from typing import Any
 
 from rclpy.exceptions import ParameterException
@@ -43,14 +44,10 @@ class RosInput(PoseInput):
     def take_waiting(self) -> bool:
         """Take the messages that wait in the queues; whether there were any."""
         before = self._arrived
-        for subscription, callback in self._subscribed:
-            with subscription.handle:
-                for _ in range(subscription.qos_profile.depth):
-                    taken = subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    )
-                    if taken is None:
-                        break
+        for one, callback in self._subscribed:
+            take = partial(one.handle.take_message, one.msg_type, one.raw)
+            with one.handle:
+                for taken in islice(iter(take, None), one.qos_profile.depth):
                     callback(*taken)
         return self._arrived > before
 
@@ -63,8 +60,7 @@ class TopicInput(RosInput):
     def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
         self._relative_topic = f"{name}_odom"
         super().__init__(name, node.resolve_topic_name(self._relative_topic), parts)
-        self._node, self._wanted_type = node, wanted_type
-        self._n_publishers = 0
+        self._node, self._wanted_type, self._n_publishers = node, wanted_type, 0
 
     def discover(self) -> None:
         """Subscribe as soon as the type is known; to be called often.
@@ -133,7 +129,7 @@ class TopicInput(RosInput):
         # With several publishers, or none any more, the numbers of lost messages are not known.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
-            stamp_ns = messages.unpack_stamp_ns(data)
+            stamp_ns = messages.Cursor(data, is_ros1=False).stamp_ns()
         except messages.MALFORMED as error:
             received_s = info["received_timestamp"] * 1e-9
             self.refuse(f"received at {received_s:.3f} s", "malformed", str(error))

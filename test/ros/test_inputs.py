@@ -122,9 +122,8 @@ def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, pee
     os.kill(solver, signal.SIGCONT)
     peer.spin_until(answer.done, "the answer of solve")
     assert not answer.result().success
-    assert (
-        answer.result().message == "the session was reset during the solve: its result is dropped"
-    )
+    dropped = "the session was reset during the solve: its result is dropped"
+    assert answer.result().message == dropped
     assert len(heard) == n_heard
 
 

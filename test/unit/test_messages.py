@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_eye_calib.errors import printable
+from hand_eye_calib.io.bags import messages as unpacking
 from hand_eye_calib.io.bags.messages import MALFORMED, MESSAGE_TYPES, POSE_TYPES, Run, unpack_poses
 from hand_eye_calib.io.bags.storage import MessageKind
 
@@ -71,6 +72,11 @@ def test_poses_at_once_whether_their_frames_are_alike_or_not(encoding, message_t
     if encoding == "ros1":  # its sequence numbers differ
         messages = [k.to_bytes(4, "little") + data[4:] for k, data in enumerate(messages)]
     assert_unpacked(unpack_poses(messages, message_type, encoding == "ros1"), drawn, message_type)
+    if encoding == "cdr":  # one by one, as the node does
+        read = unpacking.MessageReader(message_type, "poses")
+        stamps, worlds, sensors, *values = zip(*map(read, messages), strict=True)
+        table = unpacking.PoseTable.of(stamps, np.hstack(values), worlds, sensors)
+        assert_unpacked(table, drawn, message_type)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

@@ -219,6 +219,7 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(tmp_path, he
     ("lat", "lon", "message"),
     [
         ([139.7, 139.8], [35, 35], "line 2: found latitude 139.7 deg, .* perhaps they are swapped"),
+        ([60.0, 60.0], [1, 361], "line 3: found latitude 60 deg, longitude 361 deg"),
         ([60.0, 91.0], [1, 1], "line 3: found latitude 91 deg, longitude 1 deg; expected no lat"),
         ([60.0, 60.0], [1, 1e300], r"line 3: found angle 1e\+300; repair"),
     ],

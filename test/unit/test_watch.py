@@ -224,10 +224,8 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         for has_ended, told in ((False, tone), (True, Tone.ACT)):  # who comes later hears nothing
             line = view_of(replace(state(extrinsic=extrinsic), has_ended=has_ended)).result[2]
             assert (line.tone, line.name) == (told, "on /tf_static")
-            assert ("nothing" in line.text, f"{broadcast.value}: why" == line.text) == (
-                has_ended,
-                not has_ended,
-            )
+            said = "nothing" in line.text, f"{broadcast.value}: why" == line.text
+            assert said == (has_ended, not has_ended)
 
 
 def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
@@ -276,11 +274,8 @@ def test_an_alarm_that_somebody_knows_of_is_quiet_until_the_next():
     board.take(mount(**ERROR, text="moved", since_ns=10**18), 0.0)
     board.acknowledge()
     view = board.view(0.5)
-    assert (view.word, view.tone, view.buttons) == (
-        "MOUNT MOVED",
-        Tone.ACT,
-        ("recalibrate", "reset"),
-    )
+    quiet = "MOUNT MOVED", Tone.ACT, ("recalibrate", "reset")
+    assert (view.word, view.tone, view.buttons) == quiet
     assert view.facts.endswith("; acknowledged")
     assert view.sentence.endswith("then recalibrate.")
     board.take(mount(**ERROR, text="moved", since_ns=2 * 10**18), 1.0)

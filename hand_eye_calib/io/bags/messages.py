@@ -52,7 +52,7 @@ class Cursor:
         self._data, self._is_ros1, self.position = data, is_ros1, _START
 
     def read(self, format_: str) -> tuple[Any, ...]:
-        """Read numbers of one kind, by their format in struct."""
+        """Read numbers of one size, by their format in struct."""
         if not self._is_ros1:
             self.position += (_START - self.position) % struct.calcsize(format_[-1])
         values = struct.unpack_from(f"<{format_}", self._data, self.position)
@@ -61,7 +61,7 @@ class Cursor:
 
     def stamp_ns(self) -> int:
         """Read a stamp."""
-        (seconds,), (nanoseconds,) = self.read("I" if self._is_ros1 else "i"), self.read("I")
+        seconds, nanoseconds = self.read("II" if self._is_ros1 else "iI")
         if nanoseconds >= _NS_PER_S:
             raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
         return int(seconds * _NS_PER_S + nanoseconds)
@@ -358,11 +358,6 @@ class Run(NamedTuple):
 # ---- messages that are unpacked from their bytes
 
 
-def unpack_stamp_ns(data: bytes) -> int:
-    """Unpack the stamp of a message in CDR that begins with a header; raises MALFORMED."""
-    return Cursor(data, is_ros1=False).stamp_ns()
-
-
 _Unpacked = tuple[int, str, str | None, Sequence[float], int]
 
 
@@ -420,6 +415,8 @@ class MessageReader:
         self._row, self._measures = MESSAGE_TYPES[message_type], measures
         self._are_poses = message_type in POSE_TYPES and measures == "poses"
         self._rates = RateIntegrator()
+        # Of the pose before: the bytes of its frames, where they end, and the frames.
+        self._frames: tuple[bytes, int, str, str | None] = b" ", 0, "", None
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
@@ -465,8 +462,13 @@ class MessageReader:
         """
         try:
             if self._are_poses:
-                stamp_ns, world, sensor, of_pose, _ = _unpack(self._row, False, data)
-                return PoseFields(stamp_ns, world, sensor, of_pose[:3], of_pose[3:])
+                names, start, world, sensor = self._frames
+                if data[12:start] != names:  # behind encoding and stamp
+                    _, world, sensor, _, end = _unpack(self._row, False, data)
+                    start = end - _POSE_SIZE
+                    self._frames = data[12:start], start, world, sensor
+                pose = struct.unpack_from("<7d", data, start)
+                return PoseFields(Cursor(data, False).stamp_ns(), world, sensor, pose[:3], pose[3:])
             columns, is_usable = self.columns([data], is_ros1=False)
         except InputError:
             raise
