@@ -302,15 +302,15 @@ def _bar(axis: str, state: NodeState) -> Bar:
     assert at is not None
     known = at.progress.axes[axis]
     share = min(1.0, (known.target / known.sigma) ** 2) if known.sigma > 0 else 1.0
-    left = "not with this motion"
-    if math.isfinite(known.seconds_left):
-        left = f"{duration(known.seconds_left)} left"
+    has_end = math.isfinite(known.seconds_left)
+    left = f"{duration(known.seconds_left)} left" if has_end else "not with this motion"
     tone, word = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, left
     wanted = amount(axis, known.target)
     sigma = amount(axis, known.sigma).removesuffix(f" {wanted.rpartition(' ')[2]}")
     against = f"± {sigma} of {wanted}"
     if not math.isfinite(known.sigma):
-        tone, word, against = Tone.UNKNOWN, "not seen yet", f"wanted: {wanted}"
+        tone, word = Tone.UNKNOWN, "out of reach" if has_end else "not seen yet"
+        against = "" if has_end else f"wanted: {wanted}"
     elif at.progress.is_faulty:
         tone, word = Tone.UNKNOWN, "of faulty streams"
     elif known.seconds_left == 0:

@@ -54,11 +54,9 @@ def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, t
     peer.solve(peer.publishers(), *noisy(*drive(400)))
 
     def is_told(each):
-        told = values_of(each)
+        of = values_of(each)
         # Not the one of an early solve, of a few poses.
-        return (
-            told.get("comparison.verdict") == "moved" and float(told["comparison.sigma.z"]) < 0.02
-        )
+        return of.get("comparison.verdict") == "moved" and float(of["comparison.sigma.z"]) < 0.02
 
     _, values = status("progress", is_told)
     assert float(values["comparison.difference.z"]) == pytest.approx(-0.2, abs=0.02)
