@@ -256,7 +256,7 @@ LIMITS = {
     "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
     "frozen": (0.0, 0.02, 0.02, 0.02),  # share of the time
     "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m
-    "inverse_both": (0.0, 0.12, 0.12, 0.5),  # logarithm of lengths
+    "inverse_both": (0.0, 0.06, 0.06, 0.5),  # logarithm of lengths
     # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
     # smoothing does not contain noise of the columns. Both by the shift of positions, m.
     "late": (4.5, 0.008, 0.008, 0.05),

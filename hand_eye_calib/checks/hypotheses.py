@@ -31,7 +31,7 @@ from hand_eye_calib.checks.findings import (
     conventions,
     finding,
 )
-from hand_eye_calib.checks.streams import PATH_STEP_S, coarse
+from hand_eye_calib.checks.streams import coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3, trajectory
 from hand_eye_calib.pairing import motion_pairs
@@ -200,7 +200,7 @@ _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child
 PLAIN = _ALL_WAYS[0]
 
 
-# Those that invert both streams besides fit as well, over longer paths.
+# Those that invert both streams besides fit about as well.
 _USUAL = [
     *(each for each in _ALL_WAYS[1:] if ("inverse", "both") not in each.mistakes),
     Hypothesis(child=("left_handed",), axes=_MIRROR),
@@ -318,10 +318,10 @@ def _fitted(
 def _or_axes(
     chosen: Explanation, streams: StreamPair, lag_s: float
 ) -> tuple[Explanation, list[Finding]]:
-    """The explanation, but for inverted orientations wrong axes that explain clearly more, or the
+    """The explanation, but for other orientations wrong axes that explain clearly more, or the
     finding that wrong axes would explain about as much.
     """
-    if "inverse_orientation" not in dict(chosen.hypothesis.mistakes):
+    if chosen.hypothesis.axes is not None or {*dict(chosen.hypothesis.mistakes)} <= {"inverse"}:
         return chosen, []
     unexplained = chosen.fit.unexplained
     rivals = _below(_ABOUT_EQUAL * unexplained, _axes(), streams, lag_s)
@@ -406,31 +406,34 @@ def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float,
     A body moves little beside some point of its own, such as an axle. The inverse of its path is
     that of some point of the world, seen from the body.
     """
-    paths = []
+    logs = []
     for stream in (right.parent, right.child):
-        poses = coarse(stream, PATH_STEP_S).poses
-        shortest, path = _shortest_path(poses)
-        paths.append(np.log([shortest / _shortest_path(se3.inverse(poses))[0], shortest / path]))
-    shorter, around = np.mean(paths, axis=0)
+        poses = coarse(stream, LAGS_S[-1]).poses
+        # Of stops only their places are known, not how it moves between them.
+        order = 2 if stream.interval_s < LAGS_S[-1] else 1
+        least, of_origin = _least(poses, order)
+        logs.append(np.log([least / _least(se3.inverse(poses), order)[0], least / of_origin]))
+    smoother, around = np.mean(logs, axis=0)
     pairs = right.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
     arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)
     is_same = np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])).min() <= _SAME_FRAME
     arms = 0.0 if is_same else 0.5 * np.log(arms_m[0] / arms_m[1])
-    return float(shorter), float(arms), bool(around < np.log(0.5))
+    return float(smoother), float(arms), bool(around < np.log(0.5))
 
 
-def _shortest_path(poses: FloatArray) -> tuple[float, float]:
-    """Lengths of the shortest path of a point that is fixed to a body with these poses, and of the
-    path of its origin, m.
+def _least(poses: FloatArray, order: int) -> tuple[float, float]:
+    """Sums of the changes of place (m), or of those of velocity for order 2, of the point that is
+    fixed to a body with these poses and has the least, and of its origin.
     """
-    steps, chords = np.diff(poses[:, :3, 3], axis=0), np.diff(poses[:, :3, :3], axis=0)
+    changes = np.diff(poses[:, :3], order, axis=0)
+    steps, chords = changes[:, :, 3], changes[:, :, :3]
     lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
     for _ in range(_ROUNDS):
         roots = 1.0 / np.sqrt(np.maximum(lengths[-1], 0.01 * median(lengths[-1])))
         rows, target = (roots[:, None, None] * chords).reshape(-1, 3), roots[:, None] * steps
         point = np.linalg.lstsq(rows, target.ravel(), rcond=1e-6)[0]
         lengths.append(np.linalg.norm(steps - chords @ point, axis=1) + 1e-9)
-    paths_m = [float(each.sum()) for each in lengths]
-    return min(paths_m), paths_m[0]
+    sums = [float(each.sum()) for each in lengths]
+    return min(sums), sums[0]
