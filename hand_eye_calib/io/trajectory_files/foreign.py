@@ -270,8 +270,6 @@ def _of_pcd(data: bytes, _: str | None) -> _Rows:
     head, form, body = re.split(rb"(?m)^DATA (\w+)\r?\n", data, maxsplit=1)
     about = {name: values for name, *values in map(str.split, _lines(head))}
     names, sizes = about["FIELDS"], zip(about["TYPE"], about["SIZE"], strict=True)
-    if "roll" not in names:
-        raise ValueError("points, no trajectory; record the odometry as a bag")
     if form == b"ascii":
         return names, map(str.split, _lines(body)), ()
     kinds = zip(names, [f"<{kind.lower()}{size}" for kind, size in sizes], strict=True)
@@ -358,8 +356,9 @@ PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\A\w+ \{\s": "messages as text; record them as a bag",
     rb"\A[^\n]*RINEX VERSION": "observations of satellites; compute positions with RTKLIB",
     rb"\ASQLite format 3": "a database; a bag ends in .db3, and COLMAP exports its model as text",
-    rb"\A(#.*\n)+#\s+FRAME_ID, RIG_ID": "frames of COLMAP; give its images.txt",
-    rb"\A(# \.PCD|VERSION 0?\.7)": _of_pcd,
+    rb"\A(#.*\n)+#\s+(FRAME_ID, RIG|CAMERA_ID, MOD|POINT3D)": "no poses; give images.txt of COLMAP",
+    rb"\A(# \.PCD|VERSION 0?\.7)[^\0]*?\nFIELDS .*\broll\b": _of_pcd,
+    rb"\A(ply\r?\n|# \.PCD|VERSION 0?\.7)": "points, no trajectory; record the odometry as a bag",
     rb"\A[#%][A-Z\d]+A,[^;\n]*;": _of_novatel,
     rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML, no trajectory; record messages as a bag; "
     "samples of an arm are a recording of their own",
