@@ -52,6 +52,20 @@ _NAMELESS = ("parent_sensor", "child_sensor")
 _SHOWN_FIRST = ("views", "trajectories")
 
 
+# Compiled once each.
+_TEMPLATES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_TEMPLATES.filters |= {"number": text.fixed, "printable": printable}
+_TEMPLATES.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+_TEMPLATES.globals |= dict(amount=text.amount, change=text.change, counted=text.counted)
+_TEMPLATES.globals["axis_names"] = _AXIS_NAMES
+
+
 def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> str:
     """A page from its template: every page begins with a verdict, in words and by a tone.
 
@@ -64,19 +78,8 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
     **values
         What else the template shows.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"number": text.fixed, "printable": printable}
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    environment.globals |= dict(amount=text.amount, change=text.change, counted=text.counted)
-    environment.globals["axis_names"] = _AXIS_NAMES
-    values |= {"tone": tone, "mark": MARKS[tone], "verdict": verdict}
-    return environment.get_template(template).render(**values, marks=MARKS, said=text.capital(said))
+    values |= {"tone": tone, "mark": MARKS[tone], "marks": MARKS, "verdict": verdict}
+    return _TEMPLATES.get_template(template).render(**values, said=text.capital(said))
 
 
 def render(

@@ -387,12 +387,13 @@ AGAINST = (
 @pytest.mark.usefixtures("no_figures")
 def test_no_sentence_speaks_against_a_green_verdict():
     green = 0
-    for seed, poses in ((1, 120), (3, 200), (4, 160)):
-        snapshot, calibration = simulated(seed, poses)
+    for seed in range(68):
+        options = {"method": "dnlo", "reference": "B10"} if seed % 4 else {}
+        snapshot, calibration = simulated(seed, 60 + 2 * seed, options=options)
         if calibration.verdict is Verdict.USE:
             green += 1
             assert not re.findall(AGAINST, Page(render(calibration, snapshot)).text.lower())
-    assert green >= 2
+    assert green >= 55
 
 
 def test_views_are_named_by_where_one_looks_from():
