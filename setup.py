@@ -87,7 +87,7 @@ setup(
     ],
     packages=find_packages(include=[name, f"{name}.*"]),
     package_data={
-        name: ["py.typed", "*.pyi"],
+        name: ["py.typed", "*.pyi", "sample/*"],
         f"{name}.report": ["templates/*.html", "templates/*.css"],
         f"{name}.io": ["templates/*"],
         f"{name}.results": ["*.yaml"],

@@ -404,5 +404,9 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
 
 
 def _path(text: str) -> Path | str:
-    """A path; a URL stays as it is, for a path has no two slashes in a row."""
+    """A path, sample:NAME of the recording that comes with the package; a URL stays as it is, for
+    a path has no two slashes in a row.
+    """
+    if text.startswith("sample:"):
+        return Path(__file__).parents[1] / "sample" / text.removeprefix("sample:")
     return text if "://" in text else Path(text)

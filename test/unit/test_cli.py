@@ -406,6 +406,13 @@ def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, 
     assert len(line) < 1000
 
 
+def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
+    assert main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
+    truth = hec.read_trajectory(Path(hec.__file__).parent / "sample" / "truth.tum").poses[0]
+    np.testing.assert_allclose(found, truth, atol=0.005)
+
+
 # ---- the program around the commands
 
 

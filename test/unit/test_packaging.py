@@ -189,7 +189,7 @@ def test_pip_install_gives_the_commands(source, tmp_path):
     where = run([sys.executable, "-c", WHERE], env=environment, cwd=tmp_path)
     assert Path(where.stdout.strip()).is_relative_to(site)
     templates = "report/templates/report.html", "io/templates/extrinsic.urdf.xacro.in"
-    for kept in (*templates, "results/layouts.yaml"):
+    for kept in (*templates, "results/layouts.yaml", "sample/lidar.tum"):
         assert (site / PACKAGE / kept).is_file()
     for command, said in (
         ([target / "bin" / "replay", "--help"], "usage: hand_eye_calib replay"),
