@@ -27,8 +27,8 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 # as with pip and launch.
 DECLARED_AS = {
     # Optional, or without a rosdep key: rosbags reads whole files of mcap.
-    **{name: (name, None) for name in ("mcap", "fsspec", "small_gicp", "segno")},
-    **{name: (name, None) for name in ("pandas", "pyulog")},
+    **{n: (n, None) for n in ("mcap", "fsspec", "small_gicp", "segno", "pandas", "pyulog")},
+    "mcap_protobuf": ("mcap-protobuf-support", None),
     "backports": ("backports.zstd", None),  # rosbags requires it too
     "compression": (None, None),  # the standard library of Python 3.14
     "dask": ("distributed", None),
@@ -96,7 +96,7 @@ def source(tmp_path_factory):
     return target
 
 
-def third_party_imports(folder):
+def third_party_imports(folder, calls=r"import_module|required\("):
     names = set()
     for path in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -104,8 +104,8 @@ def third_party_imports(folder):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 names.add(node.module.split(".")[0])
-            elif isinstance(node, ast.Call) and ast.unparse(node.func) == "import_module":
-                names |= set(re.findall(r"'(\w+)\.", ast.unparse(node.args[0])))
+            elif isinstance(node, ast.Call) and re.match(calls, ast.unparse(node)):
+                names |= set(re.findall(r"'(\w+)[.']", ast.unparse(node.args[0])))
     return names - set(sys.stdlib_module_names) - {PACKAGE}
 
 
