@@ -164,13 +164,13 @@ class Linearisation:
         Derivatives by xi in ``X Exp(xi)`` and by k parameters of systematic errors; last, e.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
-    by_scale : (n, 6, 1) array
-        Derivative by the scale.
+    by_path : (n, 6, 4) array
+        Derivatives by the scale and by a rotation of the direction of travel against the child.
     """
 
     columns: FloatArray
     adjoints: FloatArray
-    by_scale: FloatArray
+    by_path: FloatArray
 
 
 def linearise(
@@ -203,14 +203,15 @@ def linearise(
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-    by_scale, by_bias = np.zeros((len(step), 6, 1)), back[:, :3, :3] @ metres
-    by_scale[:, :3] = -se3.times(back[:, :3, :3], step)[:, :, None]
+    by_path, by_bias = np.zeros((len(step), 6, 4)), back[:, :3, :3] @ metres
+    of_step = np.concatenate([step[:, :, None], se3.skew(step)], axis=2)
+    by_path[:, :3] = -back[:, :3, :3] @ of_step
     of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
     by_xi, residuals = of_all[:, :, :6], of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)
     for k, column in enumerate(columns, start=6):
         if column == SCALE:
-            of_all[:, :, k] = by_scale[:, :, 0]
+            of_all[:, :, k] = by_path[:, :, 0]
         elif column == TIME:
             of_all[:, :, k] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
         elif column in BIAS:
@@ -221,7 +222,7 @@ def linearise(
     residuals[:] = se3.log(back @ (se3.inverse(T_parent_child) @ moved))
     if error is not None:
         residuals += error[1:] - se3.times(adjoints, error[:-1])
-    return Linearisation(of_all, adjoints, by_scale)
+    return Linearisation(of_all, adjoints, by_path)
 
 
 def _child_motions(

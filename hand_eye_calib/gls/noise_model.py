@@ -3,7 +3,8 @@
 Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
 stamps that jitter), the motions a random walk, and time-correlated errors are first-order
 Gauss-Markov processes: translations fixed to the child's body, translations and rotations fixed to
-the parent's world, each with one variance. A scale that drifts is one more.
+the parent's world, each with one variance; so are the scale and the direction of travel, which is
+what odometry errs in that follows its own heading.
 """
 
 from __future__ import annotations
@@ -31,12 +32,13 @@ N_FAST = len(_FAST)
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
+_OF_PATH = {"scale": slice(0, 1), "direction": slice(1, 4)}
 TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
 
 class Slow(NamedTuple):
     """A process of time-correlated errors: ``kind`` body or world, ``part`` translation or
-    rotation; or both scale.
+    rotation; or of the path, scale or direction.
     """
 
     kind: str
@@ -48,7 +50,7 @@ class Slow(NamedTuple):
 LASTING = (
     Slow("body", "translation"),
     *(Slow("world", part) for part in PARTS),
-    Slow("scale", "scale"),
+    *(Slow("path", part) for part in _OF_PATH),
 )
 
 
@@ -98,9 +100,10 @@ class NoiseModel:
         is_swung = self.centre != "sensors"
         ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
         for process in self.slow:
-            if process.kind == "scale":
-                ahead.append(np.zeros_like(linearisation.by_scale))
-                behind.append(-linearisation.by_scale)
+            if process.kind == "path":
+                by_path = linearisation.by_path[:, :, _OF_PATH[process.part]]
+                ahead.append(np.zeros_like(by_path))
+                behind.append(-by_path)
                 continue
             directions = _directions(process, streams, to_child)
             ahead.append(directions[1:])
@@ -165,6 +168,9 @@ class NoiseModel:
         lower[JITTER], taus = TUNING.lowest_level, slice(N_FAST + 1, None, 2)
         precision[taus], lower[taus] = TUNING.tau_precision, shortest
         upper[taus] = max(np.log(TUNING.longest_share * self.duration_s), shortest)
+        # One that lasts is a bias or a mount askew, which have parameters.
+        is_direction = [each.part == "direction" for each in self.slow]
+        upper[taus] = np.where(is_direction, shortest + np.log(TUNING.first_tau), upper[taus])
         return Prior(mean, precision, lower, upper)
 
     def with_lasting(
@@ -174,7 +180,7 @@ class NoiseModel:
         shortest = TUNING.first_tau * self.interval_s
         longest = max(TUNING.last_tau * self.duration_s, shortest)
         first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
-        first["scale"] = TUNING.first_scale
+        first |= dict.fromkeys(_OF_PATH, TUNING.first_of_path)
         starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
@@ -185,10 +191,10 @@ class NoiseModel:
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         error, start = np.zeros((len(states), 6)), WHITE
         for process in self.slow:
-            if process.kind != "scale":
+            if process.kind != "path":
                 directions = _directions(process, streams, to_child)
                 error += se3.times(directions, states[:, start : start + 3])
-            start += 1 if process.kind == "scale" else 3
+            start += 1 if process.part == "scale" else 3
         return error
 
 

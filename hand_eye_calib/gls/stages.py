@@ -339,6 +339,8 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
     levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible))
     levels[3:5] = np.maximum(levels[3:5], total + np.log(tuning.audible_walk))
     model, levels = fit.model.with_lasting(LASTING, levels)
+    # Biases are free here: those that are there would be taken for drift and never be found.
+    free = replace(fit, sigmas=np.array(tuning.sizes))
     prior, faint = model.prior(levels), levels - tuning.faded
 
     def smaller(levels: FloatArray, information: FloatArray) -> reml.Rest:
@@ -351,10 +353,10 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
         left = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
         model = replace(model, slow=tuple(compress(model.slow, matters)))
         faint, prior = faint[left], reml.Prior(*np.array(prior)[:, left])
-        return problem.space(fit, kept, model), levels[left], prior
+        return problem.space(free, kept, model), levels[left], prior
 
-    found, information = reml.fit(problem.space(fit, kept, model), levels, prior, smaller)
-    before = Posterior(problem.space(fit, kept), fit.levels)
+    found, information = reml.fit(problem.space(free, kept, model), levels, prior, smaller)
+    before = Posterior(problem.space(free, kept), fit.levels)
     if before.loss - found.loss < tuning.least_gain:
         return fit
     faint = np.full(len(found.levels), np.inf)

@@ -115,11 +115,11 @@ class Tuning:
     # Time constants are between an interval and this share of the recording.
     longest_share: float = 0.25
     # The search begins at this share of the white and walking noise, below which no white noise is
-    # then, nor a walk below this share of the whole; at this level of a scale that drifts, and at a
-    # time constant between so many intervals and this share of the recording.
+    # then, nor a walk below this share of the whole; at this level of a scale and a direction of
+    # travel that drift; at a time constant between so many intervals and this share of the time.
     audible: float = 0.1
     audible_walk: float = 1e-3
-    first_scale: float = -10.0
+    first_of_path: float = -10.0
     first_tau: float = 10.0
     last_tau: float = 0.06
     # Those that are fixed to the body last on all scales (flicker). A recording hardly shows those

@@ -190,8 +190,9 @@ def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrelatedError:
-    """A time-correlated error: what it is fixed to (``kind``: body, world, or scale), its part of
-    the poses, its standard deviation per axis (m, rad or a share) and its correlation time.
+    """A time-correlated error: what it is fixed to (``kind``: body or world, or path), its part of
+    the poses or the path, its standard deviation per axis (m, rad or a share) and its correlation
+    time.
     """
 
     kind: str

@@ -93,7 +93,7 @@ class Goal:
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
         # Below so many seconds of motion, a standard deviation is not believed.
         lasting = calibration.noise.lasting if calibration.noise else ()
-        slowest_s = max((each.tau_s for each in lasting if each.kind != "scale"), default=0.0)
+        slowest_s = max((each.tau_s for each in lasting if each.kind != "path"), default=0.0)
         least_s = max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
         is_known, may_end = bool(is_within) and motion_s >= least_s, self.best is not None
         # Every result of a robot that stands still is the same result.
