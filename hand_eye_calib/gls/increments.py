@@ -204,8 +204,7 @@ def linearise(
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
     by_path, by_bias = np.zeros((len(step), 6, 4)), back[:, :3, :3] @ metres
-    of_step = np.concatenate([step[:, :, None], se3.skew(step)], axis=2)
-    by_path[:, :3] = -back[:, :3, :3] @ of_step
+    by_path[:, :3] = -back[:, :3, :3] @ np.dstack([step, se3.skew(step)])
     of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
     by_xi, residuals = of_all[:, :, :6], of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)

@@ -31,8 +31,9 @@ _FAST = ("translation", "rotation", "jitter", "walk_translation", "walk_rotation
 N_FAST = len(_FAST)
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 
+# Rows of the errors of poses, and columns of those of the path.
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
-_OF_PATH = {"scale": slice(0, 1), "direction": slice(1, 4)}
+PARTS |= {"scale": slice(0, 1), "direction": slice(1, 4)}
 TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
 
@@ -49,8 +50,10 @@ class Slow(NamedTuple):
 # recording gains by it.
 LASTING = (
     Slow("body", "translation"),
-    *(Slow("world", part) for part in PARTS),
-    *(Slow("path", part) for part in _OF_PATH),
+    Slow("world", "translation"),
+    Slow("world", "rotation"),
+    Slow("path", "scale"),
+    Slow("path", "direction"),
 )
 
 
@@ -101,9 +104,8 @@ class NoiseModel:
         ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
         for process in self.slow:
             if process.kind == "path":
-                by_path = linearisation.by_path[:, :, _OF_PATH[process.part]]
-                ahead.append(np.zeros_like(by_path))
-                behind.append(-by_path)
+                behind.append(-linearisation.by_path[:, :, PARTS[process.part]])
+                ahead.append(np.zeros_like(behind[-1]))
                 continue
             directions = _directions(process, streams, to_child)
             ahead.append(directions[1:])
@@ -179,8 +181,8 @@ class NoiseModel:
         """The model with processes that last, and log levels to start a search at."""
         shortest = TUNING.first_tau * self.interval_s
         longest = max(TUNING.last_tau * self.duration_s, shortest)
-        first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
-        first |= dict.fromkeys(_OF_PATH, TUNING.first_of_path)
+        first = dict.fromkeys(PARTS, TUNING.first_of_path)
+        first |= zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=False)
         starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 

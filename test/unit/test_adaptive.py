@@ -160,28 +160,29 @@ def lasting(seed, n_poses, sigmas, tau_poses):
     return errors
 
 
-@pytest.mark.parametrize("kind", ["body", "world"])
+@pytest.mark.parametrize("kind", ["body", "world", "path"])
 def test_errors_that_last_are_found_and_told_apart(kind):
     squared, kinds = [], []
+    part, sigma, tau = ("direction", 0.1, 4) if kind == "path" else ("translation", 0.02, 20)
     for seed in range(4):
         parent, child = noisy_drive(seed, n_poses=600, white=(0.001, 0.001))
-        errors = lasting(100 + seed, 600, [0.02, 0.002], 20)
+        errors = lasting(100 + seed, 600, [sigma, 0.002], tau)
         if kind == "world":
             back = np.swapaxes(parent[:, :3, :3], 1, 2)
-            errors = np.concatenate(
-                [(back @ part[:, :, None])[:, :, 0] for part in (errors[:, :3], errors[:, 3:])], 1
-            )
-            parent = parent @ se3.exp(errors)
+            of_parts = [se3.times(back, each) for each in np.split(errors, 2, axis=1)]
+            parent = parent @ se3.exp(np.concatenate(of_parts, axis=1))
+        elif kind == "path":
+            steps, turns = se3.inverse(child[:-1]) @ child[1:], np.roll(errors[1:], 3, axis=1)
+            steps[:, :3, 3] = se3.times(se3.exp(turns)[:, :3, :3], steps[:, :3, 3])
+            child = walked(steps, child[0])
         else:
             child = child @ se3.exp(errors)
         solution = estimator.solve(stamps(600), parent, child)
-        strongest = max(
-            (slow for slow in solution.noise.lasting if slow.part == "translation"),
-            key=lambda slow: slow.sigma,
-        )
+        of_part = (slow for slow in solution.noise.lasting if slow.part == part)
+        strongest = max(of_part, key=lambda slow: slow.sigma)
         kinds.append(strongest.kind)
-        assert strongest.sigma == pytest.approx(0.02, rel=0.5)
-        assert strongest.tau_s == pytest.approx(2.0, rel=0.8)
+        assert strongest.sigma == pytest.approx(sigma, rel=0.5)
+        assert strongest.tau_s == pytest.approx(0.1 * tau, rel=0.8)
         # Rotations fixed to the body are no process: the scatter of the tenths has to state them.
         found = assess_adaptive(PosePairs(stamps(600), parent, child), solution)
         stated = replace(solution, cov_parent_child_in_child=found.cov_parent_child_in_child)
