@@ -202,8 +202,7 @@ def test_flicker_is_stated_beyond_what_was_found():
     )
     longer = stated.cov_parent_child_in_child - found.cov_parent_child_in_child
     longer = np.sqrt(np.diag(longer)[:3])
-    assert (longer > 0.2e-3).all()
-    assert (longer < 4e-3).all()
+    assert ((longer > 0.2e-3) & (longer < 4e-3)).all()
 
 
 def test_noise_as_large_as_the_motion_does_not_draw_the_answer():
