@@ -350,7 +350,7 @@ def offset_over(
         at, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
         stamps_ns, span_ns = pose_pairs.stamps_ns[at], round(span_s * 1e9)
         ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*shifted.stamps_ns[[0, -1]])
-        before, after = (shifted.at(each) for each in ends_ns)
+        before, after = np.split(shifted.at(ends_ns.ravel()), 2)
         steps, spans_s = se3.log(se3.inverse(before) @ after), np.diff(ends_ns, axis=0)[0] * 1e-9
         twists = (steps / spans_s[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
@@ -375,8 +375,8 @@ def offset_over(
 
 
 def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:
-    """The rate before, and what is left of it: the slope of a line through the offsets of blocks of
-    time, of which the stamps (K,) of the pairs are on the parent's clock.
+    """Estimate the clock rate. To the rate before comes the slope of a line through the offsets
+    that are left in blocks of time; ``stamps_ns`` (K,) of the pairs are on the parent's clock.
     """
     offsets_s, weights = fit.offsets_of_blocks
     if weights.min() <= 0.0:

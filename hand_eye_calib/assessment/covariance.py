@@ -274,7 +274,9 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
 
 
 def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of residual translations (K, 3, 6) by xi; of residual rotations by phi, but for a turn."""
+    """Derivatives of the translations that motion pairs leave by xi (K, 3, 6), and of the rotations
+    by phi (K, 3, 3); the latter in axes that are turned with each pair.
+    """
     chords = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
     pushed = rotation @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
     turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)

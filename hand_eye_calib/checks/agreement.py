@@ -288,7 +288,7 @@ def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Susp
 
 
 def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory) -> list[Finding]:
-    """Finding about streams of which one was computed from the other, or none.
+    """Find out whether one of two streams was computed from the other.
 
     Two sensors differ by their noise, whatever the extrinsic is. Poses that were computed from
     others agree with them to the rounding of their numbers, on the transform that was used.

@@ -247,8 +247,8 @@ def _check_agreeing(
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
-    """Findings about each of two streams, on one clock, of which one at least has only positions,
-    rotations or rates: what there is to see before a solve.
+    """Check two streams on one clock, at least one of which has only positions, rotations or rates.
+    These findings are about each stream by itself and need no solve.
     """
     if not (parent.has_positions and child.has_positions):
         parent, child = parent.scaled(0.0), child.scaled(0.0)

@@ -340,8 +340,8 @@ def conventions(code: str, stream: str) -> dict[str, float | str]:
 
 
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
-    """The same findings; those that the options answer already are notes, and so are a few jumps if
-    the method rejects outliers.
+    """Grade findings by the options that are set. A finding that an option answers becomes a note,
+    and so do a few jumps if the method rejects outliers.
     """
     given, told = config.to_options(), []
     for each in findings:

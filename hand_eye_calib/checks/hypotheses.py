@@ -84,7 +84,7 @@ class StreamPair:
         return correlate_rates(self.parent, self.child, self.max_gap_s)
 
     def shifted(self, offset_s: float) -> "StreamPair":
-        """The same with another clock of the child."""
+        """The pair with ``offset_s`` added to the child's stamps."""
         return replace(self, child=self.child.shifted(offset_s))
 
     @cached_property

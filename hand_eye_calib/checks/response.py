@@ -92,8 +92,8 @@ class Regression:
         return [column for name in (*base, *beside) for column in self._where[name]]
 
     def biases(self, group: str) -> FloatArray:
-        """By how much (m,) noise of the columns of a group, if it is as large as that of the rows,
-        may push its values.
+        """Errors (m,) that noise in the columns of a group can cause in its values. The noise is
+        taken to be as large as that of the rows.
         """
         at = self._where[group]
         return np.asarray(self._sigma**2 * self._weight / np.maximum(self._squares[at, at], 1e-300))

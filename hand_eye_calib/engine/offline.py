@@ -130,7 +130,7 @@ if calibrate.__doc__:  # not with python -OO
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
-    """The same prior as options of a CalibratorConfig, attribute to text.
+    """Options of a CalibratorConfig that state a prior: the text of each attribute.
 
     Raises
     ------

@@ -129,7 +129,9 @@ def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str
 
 
 def _reviewed(first: Run, settled: Collection[str], known: Run | None = None) -> Run:
-    """The same of a run; ``known`` is the one with an estimated time offset, if it was tried."""
+    """Solve once more with what the checks of a run are certain of, and return the better of both.
+    ``known`` is the run with an estimated time offset, if that was tried before.
+    """
     calibration, snapshot, found = first.calibration, first.snapshot, first.check.findings
     given = snapshot.config.given.union(settled)
     options = _certain(found, given)

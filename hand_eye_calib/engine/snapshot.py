@@ -75,7 +75,7 @@ class Snapshot:
 
     @property
     def child(self) -> Trajectory:
-        """The same of the child's, freed of a clock rate."""
+        """Trajectory of the child's, alike; its stamps are corrected for a clock rate."""
         child = _put_right(self.buffered_child, "child", self.config)
         return self.time_offset.steadied(child) if self.time_offset else child
 

@@ -144,8 +144,9 @@ def read_journal(directory: str | Path) -> Journal:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], "array[int]", "array[float]", int]:
-    """What is known of a stream; the stamps of its poses; one row after the other, of each its time
-    of arrival in poses of the parent and x y z qx qy qz qw; the bytes that could be read.
+    """Read the file of one stream: what its comments say, the stamps of its poses, their rows, and
+    how many bytes could be read. A row is x y z qx qy qz qw behind the time of arrival, which is
+    counted in poses of the parent.
     """
     about: dict[str, Any] = {}
     # A pose is 72 bytes in these, and 500 in lists: a session may last all day.

@@ -77,7 +77,7 @@ class StreamChecks:
         return tuple(self._faults.values())
 
     def faults(self) -> tuple[str, ...]:
-        """The same in a line each."""
+        """The findings against calibrating, in a line each, with the parameters that help."""
         return tuple(map(_in_parameters, self.findings))
 
     def state(self) -> ChecksState:

@@ -267,7 +267,9 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
 
 def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """The same; a KeyError, TypeError or ValueError for what was not written so."""
+    """Build a result from a document of the right format. Raises KeyError, TypeError or ValueError
+    if a value is missing or was changed.
+    """
     from hand_eye_calib.results.context import Comparison, Progress, Together
 
     readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), _transform_of)

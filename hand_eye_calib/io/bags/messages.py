@@ -234,7 +234,7 @@ class PoseTable(Columns):
         return cls(stream, stamps_ns, world, sensor, np.asarray(poses), stamps_ns)
 
     def recorded(self, stream: str, bag_ns: Any) -> Self:
-        """The same of a stream, at bag times (N,)."""
+        """The table with the name of its stream, and with the bag times (N,) of its poses."""
         streams = np.full(len(self), stream, dtype=object)
         return replace(self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64))
 
@@ -259,8 +259,8 @@ class PoseTable(Columns):
 
 @lru_cache
 def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
-    """What makes an object of the bytes of a message; an InputError if its definition or encoding
-    is not known.
+    """A function that makes an object of the bytes of a message. Raises InputError if definition or
+    encoding of the messages are not known.
     """
     name, (language, content) = kind.type, kind.definition
     if kind.encoding == "json":

@@ -286,8 +286,8 @@ def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatA
 
 
 def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]:
-    """Of ways to read the sensor's orientations (N, 4) in the frame of the positions (N, 3), those
-    that the motion does not contradict: another does not fit it clearly better.
+    """Select the ways to read orientations (N, 4) that the motion does not contradict: no other way
+    fits it clearly better. The positions (N, 3) are those of the sensor in its world.
     """
     scatters = {
         way: scatter_of_direction(se3.from_quat_xyzw(positions, quats))
