@@ -143,13 +143,34 @@ class RosbagsFile(Storage):
             self.span_ns = reader.start_time, reader.end_time - 1
 
     def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
+        if self._file.suffix == ".bag":
+            return self._of_chunks(kinds)
         wanted = [each for each in self._reader.connections if each.id in kinds]
         messages = self._reader.messages(wanted)
         return ((kinds[each.id], bag_ns, data) for each, bag_ns, data in messages)
 
+    def _of_chunks(self, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
+        """Messages of rosbag1, where the library has found them: it takes long to read their heads."""
+        reader, at, chunk = self._reader, -1, b""
+        found = [(each, kind) for key, kind in kinds.items() for each in reader.indexes[key]]
+        for entry, kind in sorted(found, key=lambda each: each[0].time):
+            if entry.chunk_pos != at:
+                at, about = entry.chunk_pos, reader.chunks[entry.chunk_pos]
+                reader.bio.seek(about.datapos)
+                chunk = about.decompressor(reader.bio.read(about.datasize))
+            end, is_message = entry.offset, False
+            while not is_message:  # or the record of a connection, before its first message
+                begin = end + _LENGTH.size + _LENGTH.unpack_from(chunk, end)[0]
+                is_message = b"op=\x02" in chunk[end:begin]
+                end = begin + _LENGTH.size + _LENGTH.unpack_from(chunk, begin)[0]
+            if end > len(chunk):
+                raise EOFError("a chunk ends in the middle of a record")
+            yield kind, entry.time, chunk[begin + _LENGTH.size : end]
+
 
 # Opcode and length of a record; channel, number, log time and time of publication of a message.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<H4xQ8x")
+_LENGTH = struct.Struct("<I")
 
 
 class McapFile(Storage):
