@@ -150,7 +150,7 @@ class RosbagsFile(Storage):
         return ((kinds[each.id], bag_ns, data) for each, bag_ns, data in messages)
 
     def _of_chunks(self, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
-        """Messages of rosbag1, where the library has found them: it takes long to read their heads."""
+        """Messages of rosbag1, from where the library has found them: its own reading is slow."""
         reader, at, chunk = self._reader, -1, b""
         found = [(each, kind) for key, kind in kinds.items() for each in reader.indexes[key]]
         for entry, kind in sorted(found, key=lambda each: each[0].time):
