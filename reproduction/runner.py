@@ -28,7 +28,8 @@ def in_parallel(
         os.environ.setdefault(name, "1")
     spawning = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(tasks)), spawning) as executor:
-        yield from executor.map(function, *zip(*tasks, strict=True))
+        for each in [executor.submit(function, *task) for task in tasks]:
+            yield each.result()
 
 
 def kept(
