@@ -17,7 +17,7 @@ ROOT = SOURCE.parent
 # long functions, which have goals of 30,000, 400 and 10. Goal still ahead:
 # 450 functions entered by ``calibrate a b``.
 LIMITS = {
-    "lines": 29_510,
+    "lines": 29_540,
     "lines of code": 19_000,
     "numeric constants": 395,
     "files above 500 lines": 0,
