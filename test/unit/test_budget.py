@@ -25,11 +25,11 @@ LIMITS = {
     "rooms": 28,
     "floors": 17,
     "arrows between rooms": 166,
-    "functions entered by calibrate": 546,
+    "functions entered by calibrate": 547,
     "files entered by calibrate": 52,
     "lines of reproduction": 6_960,
     "lines of tests": 19_000,
-    "words of documentation": 34_850,
+    "words of documentation": 34_900,
 }
 
 _LONG_FILE, _LONG_FUNCTION = 500, 50
