@@ -100,7 +100,9 @@ def check_streams(
         return CheckResult(gravest_first(findings))
     given = StreamPair(parent, child.scaled(scale), max_gap_s)
     streams, correlation = given.shifted(time_offset_s), time_offset.Correlation()
-    explanation, offset = _as_they_are(streams, known[0]) if known else (None, None)
+    explanation = offset = None
+    if known and not streams.is_slow:
+        explanation, offset = _as_they_are(streams, known[0])
     if not explanation:
         correlation = (correlate or given.correlate)()
         times = correlation.ratio
@@ -143,8 +145,7 @@ def _as_they_are(
     offset = time_offset.offset_over(lag_s, *both, streams.max_gap_s, X, 2.0 * least_s)
     fit, left_s = offset.fit, offset.largest_s(streams.child.duration_s)
     explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
-    # Poses too far apart to interpolate are compared where they have stamps in common.
-    if fit and explains and left_s < least_s and streams.interval_s <= streams.max_gap_s:
+    if fit and explains and left_s < least_s:
         found = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), streams, lag_s)
         return (None, None) if found.findings else (found, offset)
     return None, None
@@ -157,7 +158,7 @@ def _fine_offset(
     if not correlation.is_clear:
         # Short recordings may not show the offset, and yet the streams agree at the given one.
         correlation = replace(correlation, offset_s=0.0)
-    if right.interval_s > right.max_gap_s:  # too slow to refine it
+    if right.is_slow:
         return time_offset.TimeOffset(correlation.offset_s, right.interval_s, correlation)
     both = right.parent, right.child, correlation, right.max_gap_s, fit
     return time_offset.refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
@@ -172,7 +173,7 @@ def _on_one_clock(
     """
     moved = streams.shifted(known_s)
     from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
-    if streams.interval_s <= streams.max_gap_s:  # most poses have others to interpolate between
+    if not streams.is_slow:
         return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s

@@ -79,6 +79,11 @@ class StreamPair:
         """Median time between poses of the faster stream, s."""
         return min(self.parent.interval_s, self.child.interval_s)
 
+    @property
+    def is_slow(self) -> bool:
+        """Whether most poses are too far apart to interpolate between them."""
+        return self.interval_s > self.max_gap_s
+
     def correlate(self) -> Correlation:
         """Correlation of the angular rates of both."""
         return correlate_rates(self.parent, self.child, self.max_gap_s)
@@ -393,7 +398,7 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
     """Whether inverse poses may be right, or paths deceive: stops, or a small space."""
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
-    return streams.interval_s > streams.max_gap_s or all(
+    return streams.is_slow or all(
         np.linalg.norm(each - medians(each.T), axis=1).max() < _REACH_M for each in positions
     )
 

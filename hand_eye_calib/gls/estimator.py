@@ -45,7 +45,6 @@ from hand_eye_calib.text import angle, counted, length
 # Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
 _SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
 
-_OF_PATH = {"scale": "scale", "direction": "direction of travel"}
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 
@@ -241,9 +240,10 @@ class AdaptiveSolution(ModelSolution):
 
 
 def _slow_in_words(slow: CorrelatedError) -> str:
-    if slow.kind == "path":
-        size = f"{100 * slow.sigma:.2g} %" if slow.part == "scale" else angle(slow.sigma)
-        return f"the {_OF_PATH[slow.part]} drifts by {size} within {slow.tau_s:.2g} s"
+    if slow.part == "scale":
+        return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
+    if slow.part == "direction":
+        return f"the direction of travel drifts by {angle(slow.sigma)} within {slow.tau_s:.2g} s"
     size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
     return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
 

@@ -40,6 +40,8 @@ PARAMETERS = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
 (SCALE,), BIAS, (TIME,), RATE = PARAMETERS.values()
 N_SYSTEMATIC = sum(map(len, PARAMETERS.values()))
 SYSTEMATIC = ("scale", "bias", "time")
+# What of a step may err anew: its length, and its direction.
+PATH_PARTS = ("scale", "direction")
 # Of streams without positions, and of those whose rotations are integrated rates.
 SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
 
@@ -164,13 +166,13 @@ class Linearisation:
         Derivatives by xi in ``X Exp(xi)`` and by k parameters of systematic errors; last, e.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
-    by_path : (n, 6, 4) array
-        Derivatives by the scale and by a rotation of the direction of travel against the child.
+    by_path : dict of (n, 6, k) arrays
+        Derivatives by the scale, and by a rotation of the direction of travel against the child.
     """
 
     columns: FloatArray
     adjoints: FloatArray
-    by_path: FloatArray
+    by_path: dict[str, FloatArray]
 
 
 def linearise(
@@ -203,14 +205,15 @@ def linearise(
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-    by_path, by_bias = np.zeros((len(step), 6, 4)), back[:, :3, :3] @ metres
-    by_path[:, :3] = -back[:, :3, :3] @ np.dstack([step, se3.skew(step)])
+    by_steps, by_bias = np.zeros((len(step), 6, 4)), back[:, :3, :3] @ metres
+    by_steps[:, :3] = -back[:, :3, :3] @ np.dstack([step, se3.skew(step)])
+    by_path = dict(zip(PATH_PARTS, np.split(by_steps, [1], axis=2), strict=True))
     of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
     by_xi, residuals = of_all[:, :, :6], of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)
     for k, column in enumerate(columns, start=6):
         if column == SCALE:
-            of_all[:, :, k] = by_path[:, :, 0]
+            of_all[:, :, k] = by_steps[:, :, 0]
         elif column == TIME:
             of_all[:, :, k] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
         elif column in BIAS:

@@ -3,8 +3,7 @@
 Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
 stamps that jitter), the motions a random walk, and time-correlated errors are first-order
 Gauss-Markov processes: translations fixed to the child's body, translations and rotations fixed to
-the parent's world, each with one variance; so are the scale and the direction of travel, which is
-what odometry errs in that follows its own heading.
+the parent's world, each with one variance; so are the scale and the direction of travel.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.gls.increments import Linearisation, Streams
+from hand_eye_calib.gls.increments import PATH_PARTS, Linearisation, Streams
 from hand_eye_calib.gls.reml import Prior
 from hand_eye_calib.gls.state_space import WHITE, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
@@ -31,9 +30,7 @@ _FAST = ("translation", "rotation", "jitter", "walk_translation", "walk_rotation
 N_FAST = len(_FAST)
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 
-# Rows of the errors of poses, and columns of those of the path.
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
-PARTS |= {"scale": slice(0, 1), "direction": slice(1, 4)}
 TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
 
@@ -50,10 +47,8 @@ class Slow(NamedTuple):
 # recording gains by it.
 LASTING = (
     Slow("body", "translation"),
-    Slow("world", "translation"),
-    Slow("world", "rotation"),
-    Slow("path", "scale"),
-    Slow("path", "direction"),
+    *(Slow("world", part) for part in PARTS),
+    *(Slow("path", part) for part in PATH_PARTS),
 )
 
 
@@ -104,7 +99,7 @@ class NoiseModel:
         ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
         for process in self.slow:
             if process.kind == "path":
-                behind.append(-linearisation.by_path[:, :, PARTS[process.part]])
+                behind.append(-linearisation.by_path[process.part])
                 ahead.append(np.zeros_like(behind[-1]))
                 continue
             directions = _directions(process, streams, to_child)
@@ -181,8 +176,8 @@ class NoiseModel:
         """The model with processes that last, and log levels to start a search at."""
         shortest = TUNING.first_tau * self.interval_s
         longest = max(TUNING.last_tau * self.duration_s, shortest)
-        first = dict.fromkeys(PARTS, TUNING.first_of_path)
-        first |= zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=False)
+        first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
+        first |= dict.fromkeys(PATH_PARTS, TUNING.first_of_path)
         starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 

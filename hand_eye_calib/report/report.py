@@ -51,7 +51,6 @@ _NAMELESS = ("parent_sensor", "child_sensor")
 # Figures for whoever uses the result; the others are evidence for whoever doubts it.
 _SHOWN_FIRST = ("views", "trajectories")
 
-
 # Compiled once each.
 _TEMPLATES = jinja2.Environment(
     loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),

@@ -32,7 +32,9 @@ _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
 def calibrate_rig(
     trajectories: Mapping[str, Trajectory],
     options: Mapping[str, Any] | None = None,
-    **more: Any,
+    *,
+    time_offset: str | None = None,
+    scale: str | None = None,
 ) -> RigCalibration:
     """Estimate the poses of all sensors of a rig in the frame of the first one.
 
@@ -47,10 +49,9 @@ def calibrate_rig(
         Poses of each sensor in its own world, by the name of its frame; at least three.
     options : mapping of str to value, optional
         By their public names, such as method, max_gap or target.translation; see
-        :class:`~hand_eye_calib.config.CalibratorConfig`. They are of every sensor against the
-        first one: time_offset and scale are words, such as "estimate".
-    **more
-        Further options by their public names.
+        :class:`~hand_eye_calib.config.CalibratorConfig`.
+    time_offset, scale : str, optional
+        "estimate", for the scale also "auto" or "none": of every sensor against the first one.
 
     Raises
     ------
@@ -65,7 +66,8 @@ def calibrate_rig(
     >>> len(rig.calibrations)
     2
     """
-    options = {**(options or {}), **more}
+    named = {"time_offset": time_offset, "scale": scale}
+    options = dict(options or {}) | {name: each for name, each in named.items() if each is not None}
     _refuse(trajectories, options)
     first, *rest = [replace(each, sensor_frame=name) for name, each in trajectories.items()]
     star, moved = [], []

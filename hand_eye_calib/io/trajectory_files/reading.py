@@ -52,11 +52,11 @@ _FORMATS: dict[str, tuple[Sequence[str], str]] = {
         "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
     ),
 }
-# A stamp, a position and a quaternion, whose order is to be found.
 _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
+# A stamp, a position and a quaternion, whose order is to be found.
 _UNNAMED = ("t", *POSITION, *UNNAMED)
 # Rows of numbers that have a matrix, all or the first three rows of it, by how many there are.
 _LAST_ROW = tuple(f"m4{column}" for column in "1234")
