@@ -82,7 +82,7 @@ class StreamPair:
     @property
     def is_slow(self) -> bool:
         """Whether most poses are too far apart to interpolate between them."""
-        return self.interval_s > self.max_gap_s
+        return all(each.interval_s > self.max_gap_s for each in (self.parent, self.child))
 
     def correlate(self) -> Correlation:
         """Correlation of the angular rates of both."""
