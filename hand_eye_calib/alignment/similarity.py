@@ -31,7 +31,8 @@ from hand_eye_calib.stats import MEDIAN_LENGTH, median
 # Starts: so many random subsets of each of these sizes, of so many pairs; and how many starts are
 # refined.
 _SUBSETS, _SUBSET_SIZES, _MAX_RANKED_PAIRS, _REFINED_STARTS = 32, (12, 24, 48), 300, 3
-_MAX_STEPS, _STEP_TOLERANCE = 30, 1e-6
+# Steps end below this share of a standard deviation in every direction that is determined.
+_MAX_STEPS, _STEP_TOLERANCE = 30, 1e-2
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING = 3.0
@@ -359,7 +360,7 @@ class _Problem:
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             T = se3.retracted(T, step[:6])
             scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
-            if np.abs(np.r_[step[:3] / max(self.rms_a, 1e-9), step[3:]]).max() < _STEP_TOLERANCE:
+            if step @ moments[:-1, :-1] @ step < _STEP_TOLERANCE**2:
                 break
         return T, scale, offset_s
 
