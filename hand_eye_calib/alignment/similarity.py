@@ -28,8 +28,7 @@ from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_ov
 from hand_eye_calib.solvers import all_pairs, quadratic_form
 from hand_eye_calib.stats import MEDIAN_LENGTH, median
 
-# Starts: so many random subsets of each of these sizes, of so many pairs; and how many starts are
-# refined.
+# Starts: so many random subsets of each size, of so many pairs; and how many are refined.
 _SUBSETS, _SUBSET_SIZES, _MAX_RANKED_PAIRS, _REFINED_STARTS = 32, (12, 24, 48), 300, 3
 # Steps end below this share of a standard deviation in every direction that is determined.
 _MAX_STEPS, _STEP_TOLERANCE = 30, 1e-2
