@@ -210,9 +210,7 @@ def sample(n_poses: int, most: int) -> IntArray | None:
     burst = np.array(TUNING.burst)
     offsets = burst[2 * len(burst) * n_poses // most > burst]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(burst)).astype(int)
-    kept = np.zeros(n_poses, dtype=bool)
-    kept[starts[:, None] + offsets] = True
-    return np.flatnonzero(kept)
+    return np.unique(starts[:, None] + offsets)
 
 
 def start(problem: Problem) -> Fit:
@@ -287,8 +285,7 @@ def outliers(problem: Problem, fit: Fit) -> Fit:
     """Jumps and outlier poses, and the noise without them."""
     tuning = problem.tuning
     found = _outliers_found(problem, fit, tuning.outlier_rounds)
-    changed = found.outliers.differs_by(fit.outliers) > tuning.negligible
-    if changed:
+    if found.outliers.differs_by(fit.outliers) > tuning.negligible:
         found = _outliers_found(problem, noise(problem, found), 1)
     if np.mean(found.outliers.spikes) > tuning.most_spikes:
         # Whole stretches are noisy, no single pose is wrong: all get less weight, none is left out.
@@ -372,6 +369,10 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
     posterior, tuning, columns = problem.posterior(fit), problem.tuning, problem.columns
     without, log_odds = posterior.products - problem.known(fit), np.log(tuning.odds)
     times = [[], [TIME]] if TIME in columns else [[]]
+    # A time offset that is not known beforehand is there.
+    times = times[-1:] if problem.is_clock_free else times
+    # The levels may be those of other systematic errors: they are known as by so much evidence.
+    rows = 6.0 * len(problem.streams)
 
     def likeliest(of_path: list[int]) -> tuple[float, Fit, NormalEquations]:
         """The loss with these errors of the path, with a time offset or without."""
@@ -380,11 +381,9 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
             is_there = [k in there or k in RATE for k in range(N_SYSTEMATIC)]
             rival = replace(fit, sigmas=np.where(is_there, tuning.sizes, tuning.none))
             normal = NormalEquations(without + problem.known(rival))
-            loss = float(normal.cost + normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
-            odds = [
-                tuning.certain if k == TIME and problem.is_clock_free else log_odds for k in there
-            ]
-            found.append((loss - 2.0 * sum(odds), rival, normal))
+            loss = 2.0 * rows * np.log1p(float(normal.cost) / rows)
+            loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
+            found.append((loss - 2.0 * log_odds * len(there), rival, normal))
         return min(found, key=lambda each: each[0])
 
     best = plain = likeliest([])
@@ -396,8 +395,10 @@ def systematic(problem: Problem, fit: Fit) -> Fit:
         if growth < tuning.most_growth**2 and gain > most:
             best, most = rival, gain
     _, chosen, normal = best
-    states = posterior.states_after(normal.step)
-    return chosen.moved(normal.step, columns).freed(problem.streams, states)
+    moved = chosen.moved(normal.step, columns)
+    noise_m = float(np.exp(0.5 * whole(fit.levels)[0]))
+    moved = replace(moved, course=course_of(problem.streams, moved.T, noise_m))
+    return moved.freed(problem.streams, posterior.states_after(normal.step))
 
 
 def polish(problem: Problem, fit: Fit) -> Fit:

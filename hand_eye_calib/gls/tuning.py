@@ -128,14 +128,12 @@ class Tuning:
 
     # -- Systematic errors --
     # Standard deviations beforehand: of a scale, of a bias along each axis (m/m), of a time offset
-    # (s), of a bias of rates (rad/s), if they are there, at these odds; and the one that stands for
-    # none. A time offset that is not known beforehand is all but certain (log odds).
+    # (s), of a bias of rates (rad/s), if they are there, at these odds; and that for none.
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
     # As long as it is not decided which are there: biases are usually small.
     first_sizes: tuple[float, ...] = (0.03, 0.0026, 0.0026, 0.0026, 0.1, 1.0, 1.0, 1.0)
     odds: float = 0.03
     none: float = 1e-6
-    certain: float = 50.0
     # A bias of the path that does not gain a third more than a scale is a scale, or one along the
     # direction of travel.
     like_scale: float = 0.75
