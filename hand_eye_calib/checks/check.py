@@ -42,8 +42,8 @@ from hand_eye_calib.text import axes_in_words
 # are interpolated across if their clocks differ by more.
 _COARSE, _SLOW_GAP = 0.5, 1.5
 
-_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.3048: "feet"}
-_UNIT_TOLERANCE = 0.1
+_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
+_UNIT_TOLERANCE = 0.05
 
 # Most motions that faults of their response are looked for in.
 _MAX_MOTIONS = 1500

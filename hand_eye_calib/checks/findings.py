@@ -163,7 +163,8 @@ _ROWS = {
     "units": _Row(
         "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",
-        "convert them to metres",
+        "convert them to metres; if the child has no unit, such as a single camera, have the scale "
+        "estimated",
     ),
     "scale": _Row(
         "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "

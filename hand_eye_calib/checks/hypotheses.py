@@ -378,7 +378,8 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
             agrees = paths + arms > 0.0 and not _may_be_an_arm(right)
             is_clear = is_other and (paths > clear or agrees)
             if (is_doubtful or is_other) and not is_clear:
-                found = finding("inverse_both", "both", Severity.WARNING)
+                options = conventions("inverse", "both")
+                found = finding("inverse_both", "both", Severity.WARNING, options)
                 return replace(explanation, findings=(found,))
         if is_other:
             hypothesis = hypothesis.inverted()

@@ -138,10 +138,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
-    """Calibrate from files on this machine; ``as_given`` puts URLs back into texts.
-
-    Returns the exit code.
-    """
+    """Calibrate from files here; ``as_given`` puts URLs back into texts. Returns the exit code."""
     if arguments.list:
         return _list_topics(arguments, as_given)
     from hand_eye_calib.cli import reading

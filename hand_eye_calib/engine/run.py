@@ -152,20 +152,21 @@ def _reviewed(first: Run, settled: Collection[str], known: Run | None = None) ->
     second = second or (_solved_with(first.snapshot, options) if options else None)
     if not second:
         return first
-    (n_first, fit_first), (n_second, fit_second) = map(_against, (first, second))
-    is_better = n_second <= n_first - least and fit_second >= fit_first
+    (bad, n_first, fit_first), (is_bad, n_second, fit_second) = map(_against, (first, second))
+    is_better = is_bad < bad or (n_second <= n_first - least and fit_second >= fit_first)
     return _telling(second, options, found) if is_better or _is_sound(second) else first
 
 
-def _against(found: Run) -> tuple[int, bool]:
-    """How many findings speak against a run, and whether its noise model fits."""
-    noise = found.calibration.noise
-    serious = sum(one.severity is not Severity.NOTE for one in found.check.findings)
-    return serious, noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
+def _against(found: Run) -> tuple[bool, int, bool]:
+    """If a run is unusable, how many findings speak against it, and if its noise model fits."""
+    noise, findings = found.calibration.noise, found.check.findings
+    serious = sum(one.severity is not Severity.NOTE for one in findings)
+    fits = noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
+    return any(one.makes_unusable for one in findings), serious, fits
 
 
 def _is_sound(found: Run) -> bool:
-    return _against(found) == (0, True)
+    return _against(found) == (False, 0, True)
 
 
 def _repaired(
@@ -197,7 +198,10 @@ def _repaired(
         f"the streams are: {as_they_are} (undo with {undo})"
     )
     second = _saying(second, {**options, **second.options}, (told, *second.told))
-    return _doubting(second, [each for each in findings if each.code == "ambiguous"])
+    # The child may have a scale of its own instead.
+    doubtful = [each for each in findings if (each.code, each.stream) == ("units", "parent")]
+    doubts = [replace(each, severity=Severity.WARNING, options={}) for each in doubtful]
+    return _doubting(second, [*doubts, *(each for each in findings if each.code == "ambiguous")])
 
 
 def _doubting(found: Run, doubts: Collection[Finding]) -> Run:

@@ -18,8 +18,8 @@ from hand_eye_calib.stats import median
 # bound).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# A sensor's position in its own world (m) is never so large: the Earth's centre is 6.4e6 m away.
-FARTHEST_M = 1e8
+# A position (m) is never so large, not even from the Earth's centre in millimetres.
+FARTHEST_M = 1e10
 
 # Tolerance for rotation matrices: a file with six digits passes, a scaled matrix does not.
 ROTATION_TOLERANCE = 1e-3

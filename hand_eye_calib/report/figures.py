@@ -399,17 +399,15 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
             _draw_sensor(panel, T[seen], calibration.child_frame, CHILD, axis_m, -14)
             is_known = np.isfinite(calibration.sigmas[seen])
             if is_known.all():
-                R = T[seen, :3]
-                covariance = R @ calibration.covariance_with_floor[:3, :3] @ R.T
-                values, vectors = np.linalg.eigh(covariance)
+                R, covariance = T[seen, :3], calibration.covariance_with_floor[:3, :3]
+                values, vectors = np.linalg.eigh(R @ covariance @ R.T)
                 wide, high = 2 * LOOK.sigmas * np.sqrt(np.maximum(values, 0.0))
                 turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
                 ellipse = Ellipse((at[0], at[1]), wide, high, angle=turned, color=CHILD, alpha=0.3)
                 panel.add_patch(ellipse)
-            lines = (panel.axhline, panel.axvline)
-            for line, fixed, known in zip(lines, at[::-1], is_known, strict=True):
-                if not known:
-                    line(fixed, color=CHILD, ls="--", lw=1.0)
+            for line, k in ((panel.axhline, 1), (panel.axvline, 0)):
+                if not is_known[k]:
+                    line(at[k], color=CHILD, ls="--", lw=1.0)
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.3)
@@ -423,6 +421,4 @@ def _draw_sensor(
     for axis, of_axis in zip(seen[:, :3].T, (BAD, GREEN, PARENT), strict=True):
         panel.plot(*np.stack([at, at + axis_m * axis], axis=1), color=of_axis)
     panel.plot(*at, "o", color=colour, ms=5)
-    panel.annotate(
-        plain_label(name), (at[0], at[1]), (5, below), textcoords="offset points", color=INK
-    )
+    panel.annotate(plain_label(name), (*at,), (5, below), textcoords="offset points", color=INK)

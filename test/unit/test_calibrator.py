@@ -101,7 +101,7 @@ class TestRefusals:
         ("position", "quat", "message"),
         [
             ((0, np.nan, 0), (0, 0, 0, 1), "not finite"),
-            ((1.7e308, 1.7e308, 0), (0, 0, 0, 1), r"is more than 1e\+08 m from the origin"),
+            ((1.7e308, 1.7e308, 0), (0, 0, 0, 1), r"is more than 1e\+10 m from the origin"),
             ((0, 0, 0), (0, 0, 0, 0), "of length 0, expected 1"),
             ((0, 0, 0), (0.5, 0.5, 0.5, 0.6), "of length 1.05"),
             ((0, 0, 0), (0, 0, np.nan, 1), "not finite"),

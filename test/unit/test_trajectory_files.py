@@ -168,10 +168,8 @@ def test_without_a_header_the_columns_must_be_named(file):
     ("header", "message"),
     [
         ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
-        (
-            "t,x,y,z,rx [deg],ry [deg],rz [deg],e",
-            "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for turns",
-        ),
+        ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", "no column for qx, .* rotvec_x,rotvec_y,rotvec_z"),
+        ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations show no pose.; na"),
         ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
         (f"t,time,{XYZW[2:]}", "columns t, time could all be t; name them with `columns`"),
     ],

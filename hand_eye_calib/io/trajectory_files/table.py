@@ -141,10 +141,12 @@ class Table:
         ways = (("secs", "nsecs"), ("header",), ("t",), ())
         stamp = next(way for way in ways if {*way} <= found.keys())
         if missing := [name for name in measured if name not in found]:
+            no_pose = " (accelerations show no pose)" * bool(re.search(r", a(cc\w*)?_?x", listed))
             raise InputError(
-                f"{self.path}: no column for {', '.join(missing)} among {listed}; name all columns "
-                "with `columns`, such as t,x,y,z,qw,qx,qy,qz, or roll_deg,pitch_deg,yaw_deg or "
-                "rotvec_x,rotvec_y,rotvec_z for turns; remove other text above the rows"
+                f"{self.path}: no column for {', '.join(missing)} among {listed}{no_pose}; name "
+                "all columns with `columns`, such as t,x,y,z,qw,qx,qy,qz, or roll_deg,pitch_deg,"
+                "yaw_deg or rotvec_x,rotvec_y,rotvec_z for turns, or t,wx,wy,wz of a gyroscope; "
+                "remove other text above the rows"
             )
         for name in (*stamp, *measured):
             if len(found[name]) > 1:
