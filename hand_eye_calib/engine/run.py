@@ -14,7 +14,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset, correlate_rates, re
 from hand_eye_calib.checks import check as checking
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.config import METHODS, CalibratorConfig
-from hand_eye_calib.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
+from hand_eye_calib.engine.snapshot import MOST_MOVED_S, STREAMS, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
@@ -28,10 +28,7 @@ _ESTIMATED: Options = {"time_offset": "estimate"}
 
 # Findings whose options are certain; and options that repair a stream: the second solve proves it.
 _MENDED = ("time_offset", "scale", "units")
-_REPAIRS = (
-    *("parent_invert", "parent_quaternion", "parent_scale"),
-    *("child_invert", "child_quaternion"),
-)
+_REPAIRS = ("parent_scale", *(f"{s}_{o}" for s in STREAMS for o in ("invert", "quaternion")))
 
 # Positions alone are paired anew from this offset (s) on: their model knows it better than speeds
 # do.

@@ -5,7 +5,7 @@ used as it is. The gravest reason decides. docs/verdict.md has the same table; a
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
@@ -257,19 +257,24 @@ _OF_FLOOR = (
 )
 
 
+def _amounts(axes: Iterable[tuple[str, float]], of: str = " ") -> str:
+    """Axes and their sizes, rotations as such: the table has angles about other axes."""
+    return listing([f"{axes_in_words([name])}{of}{amount(name, size)}" for name, size in axes])
+
+
 def _worse_than_target(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
     if rough:
         names = tuple(axis.name for axis in rough)
-        told = listing([f"{axis.name} {amount(axis.name, axis.total)}" for axis in rough])
+        told = _amounts((axis.name, axis.total) for axis in rough)
         targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
         more = "more rotation about other axes" if {*names} & {*TRANSLATIONS} else "more rotation"
         text = f"standard deviations above the target of {targets}: {told}"
         floors = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
-        left = [f"{each.name} {amount(each.name, of)}" for each, of in floors if of > each.target]
+        left = [(each.name, of) for each, of in floors if of > each.target]
         advice = [f"record longer, with {more}"] if len(left) < len(rough) else []
         if left:
-            advice.append(f"constant odometry errors alone leave {listing(left)}: {_OF_FLOOR}")
+            advice.append(f"constant odometry errors alone leave {_amounts(left)}: {_OF_FLOOR}")
         yield text, "; ".join(advice), names, {}
 
 
@@ -277,13 +282,11 @@ def _floor(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
     if rough:
         names = tuple(axis.name for axis in rough)
-        told = [
-            f"{axes_in_words([each.name])} to {amount(each.name, each.total)}" for each in rough
-        ]
+        told = _amounts(((each.name, each.total) for each in rough), " to ")
         targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
         text = (
             "constant odometry errors, which no recording can show, limit the knowledge of "
-            f"{listing(told)}: more than the target of {targets}"
+            f"{told}: more than the target of {targets}"
         )
         yield text, _OF_FLOOR, names, {}
 
