@@ -44,7 +44,7 @@ def render_batch(
         TONES.get(cells[0][2], "bad"),
         counted(len(rows), "recording"),
         listing([f"{count:,} {verdict}" for verdict, count in counts.most_common()]),
-        batch=title.rpartition("/")[2],
+        batch=title.rstrip("/*").rpartition("/")[2] or title,
         vehicles_left_out=max(0, len(ordered) - LOOK.vehicles),
         vehicles=[
             (name, result, _values(row_of_result(result.to_dict())), _trend(result, number))
