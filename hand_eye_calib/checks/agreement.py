@@ -4,6 +4,7 @@ little of the motion unexplained and yet spoil the extrinsic.
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import starmap
 from typing import TypeAlias
 
 import numpy as np
@@ -12,7 +13,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.checks.response import Fitted, Regression, delays, response
+from hand_eye_calib.checks.response import TOLERANCE, Fitted, Regression, delays, response
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between, pairs_over
@@ -63,13 +64,19 @@ _SHORT_S, _MOST_SHORT = 1.0, 6000
 _DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
 
-# Orientations are copies if they agree to this angle, several times better than any two sensors of
-# the recordings at hand, and so many times better than each stream is rough: slow motion is smooth,
-# and a slow stream of fast motion is rough without noise. Noise of both streams that is the same
-# shows a copy as well: roughness grows with each further difference as that of white noise does
-# (by 1.9), and what remains is so many times smaller.
-_AGREE, _AGREE_IN_NOISE = (np.radians(0.008), 50.0), (np.radians(0.02), 15.0)
-_WHITE = 1.6
+# Orientations are copies if they agree to this angle (rad), several times better than any two
+# sensors of the recordings at hand, and so many times better than each stream is rough: slow motion
+# is smooth, and a slow stream of fast motion is rough without noise.
+_AGREE = np.radians(0.008), 50.0
+
+# Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
+# upper quarter of their spectra, where they are white (the quarter below it differs by less than
+# the first), both streams have so many times more than what remains, in positions or orientations;
+# sensors that shake together at most 1.2 and 16 times more. Times when both accelerate so many
+# times more than usual are left out: an impulse is white as well. So is motion that intervals are
+# too long for; orientations' noise is a small share of the squared turning.
+_NOISE = {"flat": 1.75, "abrupt": 4.0, "longest_ns": 3e8, "small": 1e-3}
+_SHARED = np.array([3.0, 30.0])
 
 # This share of the poses must agree: the rest may be jumps.
 _SHARE = 0.9
@@ -114,8 +121,10 @@ def check_agreement(
     }
     if change:
         tried["moved"] = lambda: _moved_mount(change, int(pose_pairs.stamps_ns[0]))
-    share, most = max((slow.share(name), name) for name in tried)
-    suspects: list[_Suspect] = [(share, tried[most]())]
+    most = max(tried, key=slow.share)
+    # Streams that are turned explain about the same: one of them may be significant.
+    alike = [each for each in tried if each[:6] == most[:6] == "turned"] or [most]
+    suspects: list[_Suspect] = [(slow.share(each), tried[each]()) for each in alike]
     motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
     if fast := delays(pose_pairs, motions, X):
         suspects += _delays(fast, pose_pairs, speed, offset_s)
@@ -217,12 +226,10 @@ def _moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
     if change.log_ratio < SIGNIFICANT:
         return None
-    size = max(moved_m, moved_rad)
-    if change.log_ratio < 2.0 * SIGNIFICANT:
-        size = min(size, LIMITS["mount_moved"][-1])
+    most = LIMITS["mount_moved"][-1] if change.log_ratio < 2.0 * SIGNIFICANT else np.inf
     told = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
     values = {"size": told, "at_s": (change.at_ns - start_ns) * 1e-9}
-    return graded("mount_moved", "both", size, **values)
+    return graded("mount_moved", "both", min(max(moved_m, moved_rad), most), **values)
 
 
 def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Finding | None:
@@ -301,25 +308,51 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
     aligned : Trajectory
         The child on the parent's clock.
     """
-    (rough_p, white_p), (rough_c, white_c) = map(_roughness, (parent, child))
-    kinds = [_AGREE, _AGREE_IN_NOISE] if min(white_p, white_c) > _WHITE else [_AGREE]
-    limit_rad = max(min(angle_rad, min(rough_p, rough_c) / below) for angle_rad, below in kinds)
+    limit_rad = min(_AGREE[0], min(map(_roughness, (parent, child))) / _AGREE[1])
     # Programs interpolate at the stamps of the new stream.
-    for slow, fast in ((child, parent), (parent, child), (aligned, parent), (parent, aligned)):
-        residual_rad = _disagreement(slow, fast)
-        if residual_rad < limit_rad:
-            return [finding("not_independent", residual_rad=residual_rad)]
+    on_one_clock = (aligned, parent), (parent, aligned)
+    residual_rad = min(starmap(_disagreement, ((child, parent), (parent, child), *on_one_clock)))
+    shared = max(starmap(_shared_noise, on_one_clock))
+    if residual_rad < limit_rad or shared > 1.0:
+        return [finding("not_independent", residual_rad=residual_rad, shared=shared)]
     return []
 
 
-def _roughness(trajectory: Trajectory) -> tuple[float, float]:
-    """Third difference of the orientations, rad, and by how much the fourth is larger."""
+def _roughness(trajectory: Trajectory) -> float:
+    """Third difference of the orientations, rad."""
     rotations = trajectory.poses[:, :3, :3]
     steps = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    third, fourth = (
-        quantile(np.linalg.norm(np.diff(steps, n=n, axis=0), axis=1), _SHARE) for n in (2, 3)
-    )
-    return third, fourth / max(third, 1e-300)
+    return quantile(np.linalg.norm(np.diff(steps, n=2, axis=0), axis=1), _SHARE)
+
+
+def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
+    """How many times more white noise both streams have in common than two sensors; 0 if it is not
+    white noise that makes them rough.
+    """
+    slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
+    slow = slow[len(slow) // 2 :][: _NEAREST[1]]
+    longest_ns = min(_NOISE["longest_ns"], (1.0 + TOLERANCE) * median(np.diff(slow.stamps_ns)))
+    if len(slow) < _NEAREST[0] or np.diff(slow.stamps_ns).max() > longest_ns:
+        return 0.0
+    both = slow.poses, fast.at(slow.stamps_ns, straight=True)
+    steps = (se3.log(se3.inverse(Ts[:-1]) @ Ts[1:]) for Ts in both)
+    a, b = (np.diff(each, 2, axis=0).reshape(-1, 2, 3) for each in steps)
+    b = b @ se3.nearest_rotation(b[:, 1].T @ a[:, 1])
+    left, arms = b - a, se3.skew(a[:, 1])
+    left[:, 0] -= arms @ np.linalg.lstsq(arms.reshape(-1, 3), left[:, 0].ravel(), rcond=None)[0]
+    sizes = np.linalg.norm([a, b], axis=3)
+    usual = _NOISE["abrupt"] * np.median(sizes, axis=1, keepdims=True)
+    is_calm = (sizes <= usual).any(axis=0).all(axis=1)[:, None, None]
+    spectra = (np.abs(np.fft.rfft(is_calm * [a, b, left], axis=1)) ** 2).sum(axis=3)
+    # Of poses, as differences raise it.
+    spectra /= (2.0 * np.sin(np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])))[:, None] ** 6
+    _, _, middle, upper = (each.mean(axis=1) for each in np.array_split(spectra, 4, axis=1))
+    unlike = np.maximum(middle, upper) / np.maximum(np.minimum(middle, upper), 1e-300)
+    position, rotation = (unlike[:2] < _NOISE["flat"]).all(axis=0)
+    turned = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
+    is_noise = upper[:2, 1].max() < _NOISE["small"] * turned
+    ratios = np.sqrt(upper[:2].min(axis=0) / np.maximum(upper[2], 1e-300)) / _SHARED
+    return float(max(position * ratios[0], ratios[1]) * rotation * is_noise)
 
 
 def _disagreement(slow: Trajectory, fast: Trajectory) -> float:

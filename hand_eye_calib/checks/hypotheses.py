@@ -107,9 +107,8 @@ class StreamPair:
         """
         pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
-            raise NotEnoughDataError(
-                f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
-            )
+            text = f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
+            raise NotEnoughDataError(text)
         return pairs
 
 
@@ -217,9 +216,8 @@ def _axes() -> Iterator[Hypothesis]:
     """All permutations and flips of the axes of the positions, except the mirror of all three. On
     flat ground some of them are the same as an inverted orientation.
     """
-    for order, signs in itertools.product(
-        itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
-    ):
+    flips = itertools.product((1, -1), repeat=3)
+    for order, signs in itertools.product(itertools.permutations(range(3)), flips):
         matrix = np.diag(signs) @ np.eye(3)[list(order)]
         parts = zip(order, signs, strict=True)
         detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in parts)
@@ -294,14 +292,11 @@ def _below(
 ) -> list[Explanation]:
     """The best of the rivals, and those about as good, that leave less than this unexplained."""
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
-    rows, n_pairs = np.concatenate([pairs.i, pairs.j]), len(pairs)
-    few = streams.synchronised[rows]
+    few, first = streams.synchronised[np.concatenate([pairs.i, pairs.j])], np.arange(len(pairs))
     tried = []
     for rival in rivals:
         poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
-        motions = motion_pairs.pairs_between(
-            *poses, np.arange(n_pairs), np.arange(n_pairs) + n_pairs
-        )
+        motions = motion_pairs.pairs_between(*poses, first, first + len(pairs))
         tried.append(Explanation(rival, fit_similarity(motions)))
     least = min(each.fit.unexplained for each in tried)
     limit = min(most, _ABOUT_EQUAL * least)

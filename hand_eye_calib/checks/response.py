@@ -31,7 +31,7 @@ from hand_eye_calib.stats import median, robust_sigma
 
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
-_STEP_S, _TOLERANCE = 0.05, 0.3
+_STEP_S, TOLERANCE = 0.05, 0.3
 _BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
@@ -241,7 +241,7 @@ def delays(
     follow = np.zeros(len(stamps_ns), dtype=bool)
     inner, around = np.arange(2 * step, len(stamps_ns) - 2 * step), np.array([-2, -1, 1, 2])
     elapsed_s = (stamps_ns[inner[:, None] + step * around] - stamps_ns[inner, None]) * 1e-9
-    follow[inner] = (np.abs(elapsed_s - h * around) < _TOLERANCE * h).all(axis=1)
+    follow[inner] = (np.abs(elapsed_s - h * around) < TOLERANCE * h).all(axis=1)
     motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
     if len(motions) < _BLOCKS**2:
         return None

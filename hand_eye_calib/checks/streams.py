@@ -173,10 +173,8 @@ def _grid_step(values: FloatArray) -> float:
 
 def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Finding about a stream that has only x, y and yaw while the other tilts, or none."""
-    for name, flat, other, whole in (
-        ("parent", parent, "child", child),
-        ("child", child, "parent", parent),
-    ):
+    both = ("parent", parent), ("child", child)
+    for (name, flat), (other, whole) in (both, both[::-1]):
         vertical, heights = flat.poses[:, 2, 2], flat.poses[:, 2, 3]
         if np.abs(vertical - vertical[0]).max() > _SAME or np.ptp(heights) > _SAME:
             continue
@@ -203,10 +201,8 @@ def _jumps(trajectory: Trajectory) -> BoolArray:
         around = np.partition(shifted, 2, axis=0)[2]
         excess = np.linalg.norm(velocities - around, axis=1)
         speed = np.linalg.norm(velocities, axis=1)
-        jumps |= excess > np.maximum(
-            _JUMP_SIGMAS * (median(excess) + 1e-12),
-            _JUMP_STEPS * quantile(speed, _USUAL),
-        )
+        of_motion = _JUMP_STEPS * quantile(speed, _USUAL)
+        jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), of_motion)
     return jumps
 
 

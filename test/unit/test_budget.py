@@ -17,7 +17,7 @@ ROOT = SOURCE.parent
 # long functions, which have goals of 30,000, 400 and 10. Goal still ahead:
 # 450 functions entered by ``calibrate a b``.
 LIMITS = {
-    "lines": 29_510,
+    "lines": 29_540,
     "lines of code": 19_000,
     "numeric constants": 395,
     "files above 500 lines": 0,
@@ -25,11 +25,11 @@ LIMITS = {
     "rooms": 28,
     "floors": 17,
     "arrows between rooms": 166,
-    "functions entered by calibrate": 546,
+    "functions entered by calibrate": 547,
     "files entered by calibrate": 52,
     "lines of reproduction": 6_960,
     "lines of tests": 19_000,
-    "words of documentation": 34_850,
+    "words of documentation": 34_900,
 }
 
 _LONG_FILE, _LONG_FUNCTION = 500, 50
