@@ -47,7 +47,6 @@ def fit(
     levels = np.clip(start, prior.lower, prior.upper)
     posterior, radius = Posterior(space, levels), TUNING.first_radius
     loss = posterior.loss + prior.loss(levels)
-    settled = TUNING.settled_loss * len(levels)
     for _ in range(TUNING.max_steps):
         gradient, information = derivatives(posterior)
         if smaller and (rest := smaller(levels, information)):
@@ -61,7 +60,7 @@ def fit(
         while radius > TUNING.settled_level:
             step, is_newton = _step(levels, gradient, curvature, prior, radius)
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
-            is_small = is_newton and promised < settled
+            is_small = is_newton and promised < TUNING.settled_loss
             if is_small or np.abs(step).max() < TUNING.settled_level:
                 break
             try:
@@ -79,7 +78,7 @@ def fit(
             radius = min(2.0 * radius, TUNING.largest_radius)
         elif gain < TUNING.poor * promised:
             radius = 0.5 * float(np.abs(step).max())
-        if gain < 0.5 * settled:
+        if gain < 0.5 * TUNING.settled_loss:
             break
     return posterior, information
 

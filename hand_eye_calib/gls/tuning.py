@@ -53,8 +53,8 @@ class Tuning:
     caution: float = 10.0
 
     # -- Newton steps of the levels --
-    # They end if a step promises to lower the loss by less, times the number of levels (which need
-    # no more than a few per cent), or is so short; after so many steps at the latest.
+    # They end if a step promises to lower the loss by less (noise levels need no more than a few
+    # per cent), or is so short; after so many steps at the latest.
     settled_loss: float = 0.05
     settled_level: float = 1e-3
     max_steps: int = 20
