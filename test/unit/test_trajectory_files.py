@@ -20,6 +20,7 @@ START_NS = 1_700_000_000_123_456_789
 TRAJECTORY = as_trajectory(wandering_poses(30), start_ns=START_NS)
 POSITIONS = TRAJECTORY.poses[:, :3, 3].tolist()
 QUATS_XYZW = se3.to_quat_xyzw(TRAJECTORY.poses).tolist()
+NO_QUATERNION = "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for turns"
 XYZW, WXYZ = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
 
 
@@ -168,7 +169,7 @@ def test_without_a_header_the_columns_must_be_named(file):
     ("header", "message"),
     [
         ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
-        ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", "no column for qx, .* rotvec_x,rotvec_y,rotvec_z"),
+        ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", NO_QUATERNION),
         ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations show no pose.; na"),
         ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
         (f"t,time,{XYZW[2:]}", "columns t, time could all be t; name them with `columns`"),
