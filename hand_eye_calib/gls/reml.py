@@ -47,6 +47,7 @@ def fit(
     levels = np.clip(start, prior.lower, prior.upper)
     posterior, radius = Posterior(space, levels), TUNING.first_radius
     loss = posterior.loss + prior.loss(levels)
+    settled = TUNING.settled_loss * (len(levels) if smaller else 1)
     for _ in range(TUNING.max_steps):
         gradient, information = derivatives(posterior)
         if smaller and (rest := smaller(levels, information)):
@@ -60,7 +61,7 @@ def fit(
         while radius > TUNING.settled_level:
             step, is_newton = _step(levels, gradient, curvature, prior, radius)
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
-            is_small = is_newton and promised < TUNING.settled_loss
+            is_small = is_newton and promised < settled
             if is_small or np.abs(step).max() < TUNING.settled_level:
                 break
             try:
@@ -78,7 +79,7 @@ def fit(
             radius = min(2.0 * radius, TUNING.largest_radius)
         elif gain < TUNING.poor * promised:
             radius = 0.5 * float(np.abs(step).max())
-        if gain < 0.5 * TUNING.settled_loss:
+        if gain < 0.5 * settled:
             break
     return posterior, information
 

@@ -54,7 +54,8 @@ class Tuning:
 
     # -- Newton steps of the levels --
     # They end if a step promises to lower the loss by less (noise levels need no more than a few
-    # per cent), or is so short; after so many steps at the latest.
+    # per cent; the search of errors that last: by less per level), or is so short; after so many
+    # steps at the latest.
     settled_loss: float = 0.05
     settled_level: float = 1e-3
     max_steps: int = 20
