@@ -142,7 +142,7 @@ _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": m
 _QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
 
 # Lengths (m) and angles (rad) that a person gives are smaller: no square of one overflows.
-_LARGEST_QUANTITY = 1e6
+_LARGEST = 1e6
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
 # pitch, yaw (rad): value and standard deviation, or both as the text of the option ``prior.AXIS``.
@@ -170,8 +170,8 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     """
     value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
     axes, form = [name.removeprefix("prior.")], "VALUE+/-SIGMA, with its standard deviation"
-    (known,) = _quantities(name, axes, value.split(), form)
-    return known, _quantities(name, axes, sigma.split(), form, 0.0)[0]
+    (known,) = quantities(name, axes, value.split(), form)
+    return known, quantities(name, axes, sigma.split(), form, 0.0)[0]
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:
@@ -183,7 +183,7 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
     ConfigError
         If the text has another form.
     """
-    return tuple(_quantities(name, [*AXIS_UNITS], text.split(), "X Y Z ROLL PITCH YAW"))
+    return tuple(quantities(name, [*AXIS_UNITS], text.split(), "X Y Z ROLL PITCH YAW"))
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
@@ -203,13 +203,13 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
                 f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
                 f"yaw=0.5deg; got {shown_value(word)}"
             )
-        (targets[axis],) = _quantities(f"{name}: {axis}", [axis], [value], "TARGET", 0.0)
+        (targets[axis],) = quantities(f"{name}: {axis}", [axis], [value], "TARGET", 0.0)
         if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
             raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
     return targets
 
 
-def _quantities(
+def quantities(
     name: str, axes: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
 ) -> list[float]:
     """Numbers of axes, in m or rad, from words with or without units; ``form`` is how the option
@@ -224,9 +224,8 @@ def _quantities(
             units = " or ".join(_IN_SI[unit])
             raise ConfigError(f"{name} must be numbers in {units}; got {shown_value(word)}")
         value = float(match[1]) * _IN_SI[unit][match[2] or unit]
-        if abs(value) > _LARGEST_QUANTITY:
-            largest = f"{_LARGEST_QUANTITY:g} {unit}"
-            raise ConfigError(f"{name} must be at most {largest}; got {word[:20]!r}")
+        if abs(value) > _LARGEST:
+            raise ConfigError(f"{name} must be at most {_LARGEST:g} {unit}; got {word[:20]!r}")
         if not value > above:
             raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(word)}")
         if unit == "rad" and not match[2] and abs(value) > 2 * math.pi:

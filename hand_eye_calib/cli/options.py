@@ -19,7 +19,8 @@ from typing import Any, TypeVar
 
 import hand_eye_calib.config as config
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.option import OptionField, check_value, did_you_mean
+from hand_eye_calib.option import OptionField, check_value, did_you_mean, option_name
+from hand_eye_calib.text import quantities
 
 _Item = TypeVar("_Item")
 
@@ -249,9 +250,11 @@ def _prior(text: str) -> tuple[str, Any]:
 
 
 def _value(field: OptionField, value: Any) -> Any:
-    """The value of an option, from text or as YAML has it."""
-    kind = type(field.default)
+    """The value of an option, from text or as YAML has it; lengths and angles may name a unit."""
+    kind, unit = type(field.default), field.metadata["unit"]
     if isinstance(value, str) and kind in (int, float):
+        if axis := {"m": "x", "rad": "roll"}.get(unit):
+            return check_value(field, *quantities(option_name(field), [axis], [value], ""))
         with suppress(ValueError):  # check_value says what it should be
             value = kind(value)
     return check_value(field, value)
@@ -275,8 +278,7 @@ def _read_config(path: Path) -> Options:
 
     document = read_yaml(path)
     if not isinstance(document, dict | None):
-        found = type(document).__name__
-        raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
+        raise ConfigError(f"{path}: expected options and values; found {type(document).__name__}")
     options, ignored, of_others = {}, [], []
     for name, value in _flat(document or {}):
         node, is_of_ros, option = name.rpartition(f"{_OF_ROS}.")

@@ -376,9 +376,9 @@ def config_file(tmp_path):
 def test_config_file_plain_or_for_ros(config_file, text):
     expected = CalibratorConfig(method="dnl", threshold=1e-3, keyframe_min_interval=1.0)
     assert parsed(config_file(text)) == expected
-    assert parsed([*config_file(text), "--method", "dnlo"]) == dataclasses.replace(
-        expected, method="dnlo"
-    )
+    options = ["--method", "dnlo", "--target-translation", "5cm"]
+    other = dataclasses.replace(expected, method="dnlo", target_translation=0.05)
+    assert parsed([*config_file(text), *options]) == other
 
 
 def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
@@ -392,7 +392,7 @@ def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
     [
         ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean method\?; known"),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
-        ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
+        ("[1, 2]", r"config\.yaml: expected options and values; found list"),
         ("/slam: {ros__parameters: {a: 1}}", "named calibrator; found some for /slam"),
         ("/calibrator: {ros__parameters: [1]}", "unknown option '/calibrator.ros__parameters'"),
         ("reference: B" + "9" * 3000, "reference"),
