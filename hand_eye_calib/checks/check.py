@@ -217,16 +217,16 @@ def _check_sizes(
     """
     motions, fit = _motions(pose_pairs, hypotheses.MAX_PAIRS), explanation.fit
     chords = motions.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    of_noise = fit.sigma_rotation**2 * np.eye(3)
-    hidden = LeverArms.of(chords).hidden_axes(of_noise)
+    hidden = LeverArms.of(chords).hidden_axes(fit.sigma_rotation**2 * np.eye(3))
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
             of_both = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
             fit = similarity.estimate_scale(pose_pairs, of_both)
             if similarity.scale_differs(fit):
-                values: dict[str, Any] = {"scale": fit.scale, "sigma": fit.scale_sigma}
-                values["options"] = {"scale": round(known * fit.scale, 4)}
+                total, sigma = known * fit.scale, known * fit.scale_sigma
+                values: dict[str, Any] = {"scale": total, "sigma": sigma}
+                values["options"] = {"scale": round(total, 4)}
                 differs = graded("scale", "child", fit.scale - 1.0, **values)
                 findings.append(in_other_units(fit.scale, fit.scale_sigma, known) or differs)
     return [*filter(None, findings)], fit
@@ -290,19 +290,18 @@ def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
 
 def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:
     """The finding that a stream's lengths are in another unit, by the scale that was found beside
-    the known one: the child's if it is below 1, otherwise the parent's; None if the scale is about
-    that of no unit.
+    the known one, or by both together, as the solve may have found that one: the child's if it is
+    below 1, otherwise the parent's; None if it is about that of no unit.
     """
-    smaller, stream, other = scale, "child", "parent"
-    if scale > 1.0:
-        smaller, stream, other = 1.0 / scale, "parent", "child"
-    for factor, unit in _UNITS.items():
-        if abs(smaller / factor - 1.0) < _UNIT_TOLERANCE:
-            options = {"parent_scale": round(factor / known, 9)}
-            if stream == "child":
-                options = {"scale": round(known * factor, 9)}
-            told: dict[str, Any] = {"other": other, "scale": scale, "sigma": sigma, "unit": unit}
-            return finding("units", stream, options=options, **told)
+    for total in (scale * known, scale) if 0.5 < known < 2.0 else (scale,):
+        stream, other = ("child", "parent") if total < 1.0 else ("parent", "child")
+        for factor, unit in _UNITS.items():
+            if abs(min(total, 1.0 / total) / factor - 1.0) < _UNIT_TOLERANCE:
+                options = {"parent_scale": factor}
+                if stream == "child":
+                    options = {"scale": round(factor * known * scale / total, 9)}
+                told: dict[str, Any] = {"scale": total, "sigma": sigma * total / scale}
+                return finding("units", stream, options=options, other=other, unit=unit, **told)
     return None
 
 
