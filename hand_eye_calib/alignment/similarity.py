@@ -15,9 +15,8 @@ A start is found on random small subsets: their linear relaxation is the quadrat
 Gauss-Newton steps with Geman-McClure weights follow.
 """
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -124,6 +123,7 @@ def fit_similarity(
     twists: tuple[FloatArray, FloatArray] | None = None,
     start: SimilarityFit | FloatArray | None = None,
     same_unit: bool = False,
+    most: float = np.inf,
 ) -> SimilarityFit:
     """Fit X, the scale and, with twists, the time offset.
 
@@ -139,6 +139,8 @@ def fit_similarity(
     same_unit : bool
         Keep the scale at 1. A sensor that the body only rotates about hardly moves, and any small
         scale would do.
+    most : float
+        Starts that leave more than this share unexplained are not refined.
 
     Returns
     -------
@@ -151,9 +153,12 @@ def fit_similarity(
         starts = _starts(pairs) if start is None else [(start, 1.0)]
     fits: list[SimilarityFit] = []
     for T, scale in starts:
-        fits.append(problem.describe(*problem.refine(T, 1.0 if same_unit else scale)))
-        if fits[-1].unexplained < EXPLAINED:
-            break
+        scale = 1.0 if same_unit else scale
+        if most == np.inf or problem.shares(problem.rows(T, scale)[1], scale)[1] < most:
+            fits.append(problem.describe(*problem.refine(T, scale)))
+            if fits[-1].unexplained < EXPLAINED:
+                break
+    fits = fits or [problem.describe(T, scale, 0.0)]
     # The volume that the residuals spread over, in the smaller unit of length.
     return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
 
@@ -234,10 +239,11 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     """
     ranked = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
     parent, child = ranked.Ts_parenti_parentj.copy(), ranked.Ts_childi_childj.copy()
-    units = [max(_rms(Ts[:, :3, 3]), 1e-12) for Ts in (parent, child)]
+    rms = [np.linalg.norm(Ts[:, :3, 3]) / len(Ts) ** 0.5 for Ts in (parent, child)]
+    units = np.maximum(rms, 1e-12)
     parent[:, :3, 3] /= units[0]
     child[:, :3, 3] /= units[1]
-    ranked = dataclasses.replace(ranked, Ts_parenti_parentj=parent, Ts_childi_childj=child)
+    ranked = replace(ranked, Ts_parenti_parentj=parent, Ts_childi_childj=child)
     random = np.random.default_rng(0)
     subsets = np.zeros((1 + _SUBSETS, len(ranked)))
     subsets[0] = 1.0
@@ -250,38 +256,26 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     left = forms[:, :12, :12]
     left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
     matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
-    guesses = list(zip(forms, se3.nearest_rotation(matrices), strict=True))
-    guesses += [(forms[0], rotation) for rotation in all_pairs.start_rotations(ranked)]
-    candidates = [_with_translation(form, rotation) for form, rotation in guesses]
+    rotations = [*se3.nearest_rotation(matrices), *all_pairs.start_rotations(ranked)]
+    forms = np.concatenate([forms, *[forms[:1]] * (len(rotations) - len(forms))])
+    # The best scale and translation of each.
+    reduced, to_translation = quadratic_form.without_translation(forms)
+    vectors = np.append(np.reshape(rotations, (-1, 9)), np.zeros((len(forms), 1)), axis=1)
+    products = se3.times(reduced, vectors)
+    scales = -products[:, 9] / np.maximum((vectors * products).sum(axis=1), 1e-300)
+    scales[scales <= 1e-3] = 1.0  # opposite or no motion: a bad candidate, but one for every form
+    translations = -se3.times(to_translation, scales[:, None] * vectors + np.eye(10)[9])
+    Ts = se3.from_rotation_translation(np.array(rotations), translations)
     coefficients = quadratic_form.coefficients(ranked)
     # In the smaller unit of length: otherwise a scale of zero would cost least.
     costs, of_child = [], coefficients.reshape(-1, 2, 3, 4)[:, 1, :, 3]
     child_lengths = of_child.copy()
-    for T, scale in candidates:
+    for T, scale in zip(Ts, scales, strict=True):
         of_child[:] = child_lengths * scale
         costs.append(median(quadratic_form.costs(coefficients, T)) / min(scale, 1.0) ** 2)
-    starts = []
-    for T, scale in (candidates[index] for index in np.argsort(costs)[:_REFINED_STARTS]):
-        T = se3.from_rotation_translation(T[:3, :3], T[:3, 3] * units[0])
-        starts.append((T, scale * units[0] / units[1]))
-    return starts
-
-
-def _with_translation(form: FloatArray, rotation: FloatArray) -> tuple[FloatArray, float]:
-    """Transform and scale that minimise a form for a given rotation."""
-    basis = np.zeros((13, 4))
-    basis[:9, 0], basis[9:12, 1:] = rotation.ravel(), np.eye(3)
-    normal, right = basis.T @ form @ basis, -basis.T @ form[:, 12]
-    normal += 1e-9 * np.trace(normal) * np.eye(4)
-    scale = float(np.linalg.solve(normal, right)[0])
-    if scale <= 1e-3:  # opposite or no motion: a bad candidate, but one for every form
-        scale = 1.0
-    translation = np.linalg.solve(normal[1:, 1:], right[1:] - normal[1:, 0] * scale)
-    return se3.from_rotation_translation(rotation, translation), scale
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+    Ts[:, :3, 3] *= units[0]
+    scales *= units[0] / units[1]
+    return [(Ts[k], float(scales[k])) for k in np.argsort(costs)[:_REFINED_STARTS]]
 
 
 class _Problem:
@@ -296,7 +290,8 @@ class _Problem:
         self.chord_a, self.chord_b = rotation_a - np.eye(3), rotation_b - np.eye(3)
         self.quats_a, self.quats_b = se3.to_quat_xyzw(rotation_a), se3.to_quat_xyzw(rotation_b)
         self.skew_b = se3.skew(self.translation_b)
-        self.rms_a, self.rms_b = _rms(self.translation_a), _rms(self.translation_b)
+        lengths = (np.linalg.norm(Ts[:, :3, 3]) / len(pairs) ** 0.5 for Ts in (A, B))
+        self.rms_a, self.rms_b = map(float, lengths)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
         self.free = np.ones(len(_UNKNOWNS), dtype=bool)
         self.free[_SCALE], self.free[_OFFSET] = not same_unit, twists is not None
@@ -310,7 +305,7 @@ class _Problem:
         self.translation_by_offset = moved_i - moved_j
 
     def rows(
-        self, T: FloatArray, scale: float, offset_s: float
+        self, T: FloatArray, scale: float, offset_s: float = 0.0
     ) -> tuple[list[FloatArray], tuple[float, float]]:
         """Derivatives of the residuals of translation and of rotation, in the parent's axes, by
         (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; the residuals in the last
@@ -363,9 +358,18 @@ class _Problem:
                 break
         return T, scale, offset_s
 
+    def shares(self, sigmas: tuple[float, float], scale: float) -> tuple[float, float]:
+        """Unexplained shares of translations and motion, from the residuals' sigmas (m, rad)."""
+        # Of the stream that moves less or, with one unit of length, of the one that moves more.
+        lengths = (self.rms_a, scale * self.rms_b)
+        rms_translation = min(lengths) if self.free[_SCALE] else max(lengths)
+        of_translation = sigmas[0] / max(rms_translation, 1e-12)
+        of_rotation = sigmas[1] / max(self.rms_rotation, 1e-12)
+        return of_translation, float(np.hypot(of_translation, of_rotation))
+
     def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
         """The result, with its uncertainty."""
-        parts, (sigma_translation, sigma_rotation) = self.rows(T, scale, offset_s)
+        parts, sigmas_of_residuals = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
         blocks = np.array_split(rows, min(_N_BLOCKS, len(rows)))
         moments = np.array([np.tensordot(each, each, axes=([0, 1], [0, 1])) for each in blocks])
@@ -378,11 +382,7 @@ class _Problem:
         by = [_solve(total, -total[:, column], extrinsic)[:6] for column in (_SCALE, _OFFSET)]
         weights = normal[:, _OFFSET, _OFFSET]
         offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
-        # Of the stream that moves less or, with one unit of length, of the one that moves more.
-        lengths = (self.rms_a, scale * self.rms_b)
-        rms_translation = min(lengths) if self.free[_SCALE] else max(lengths)
-        of_translation = sigma_translation / max(rms_translation, 1e-12)
-        of_rotation = sigma_rotation / max(self.rms_rotation, 1e-12)
+        of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         sigmas = np.sqrt(np.diag((len(blocks) - 1) / len(blocks) * answers.T @ answers))
         return SimilarityFit(
             T_parent_child=T,
@@ -393,11 +393,11 @@ class _Problem:
             offset_sigma_s=float(sigmas[_OFFSET]),
             sensitivity=np.column_stack(by),
             offsets_of_blocks=np.stack([offsets, weights]),
-            sigma_translation=sigma_translation,
-            sigma_rotation=sigma_rotation,
+            sigma_translation=sigmas_of_residuals[0],
+            sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,
             explains_translation=of_translation < _MAX_UNEXPLAINED_TRANSLATION,
-            unexplained=float(np.hypot(of_translation, of_rotation)),
+            unexplained=unexplained,
         )
 
 

@@ -331,10 +331,11 @@ def offset_over(
     max_gap_s: float,
     start: SimilarityFit | FloatArray | None,
     least_s: float,
+    most: float = np.inf,
 ) -> TimeOffset:
     """Offset and fit over motions of ``lag_s``, from the coarse offset and a fit, or X, to start
     at; no fit if there are too few. A clearly smaller offset than ``least_s`` is not refined,
-    others no better than that asks for.
+    others no better than that asks for; nor is a fit whose start leaves more than ``most``.
     """
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
@@ -354,8 +355,8 @@ def offset_over(
         steps, spans_s = se3.log(se3.inverse(before) @ after), np.diff(ends_ns, axis=0)[0] * 1e-9
         twists = (steps / spans_s[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
-        start = fit = fit_similarity(pairs, of_child, start=start)
-        if not fit.explains_translation:
+        start = fit = fit_similarity(pairs, of_child, start=start, most=most)
+        if not fit.explains_translation and most == np.inf:
             # A body that rotates about one of its sensors shows no scale.
             in_one_unit = fit_similarity(pairs, of_child, same_unit=True)
             start = fit = in_one_unit if in_one_unit.explains_translation else fit

@@ -140,9 +140,9 @@ def _as_they_are(
     as they are, on one clock and in one unit; none of others.
     """
     least_s, lag_s = LIMITS["time_offset"][1], hypotheses.LAGS_S[1]
-    both = streams.parent, streams.child, time_offset.Correlation()
+    given = streams.parent, streams.child, time_offset.Correlation(), streams.max_gap_s, X
     # In one step if it is below half of what is told.
-    offset = time_offset.offset_over(lag_s, *both, streams.max_gap_s, X, 2.0 * least_s)
+    offset = time_offset.offset_over(lag_s, *given, 2.0 * least_s, hypotheses.HOLDS)
     fit, left_s = offset.fit, offset.largest_s(streams.child.duration_s)
     explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
     if fit and explains and left_s < least_s:

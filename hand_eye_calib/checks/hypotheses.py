@@ -293,14 +293,14 @@ def _below(
     """The best of the rivals, and those about as good, that leave less than this unexplained."""
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
     few, first = streams.synchronised[np.concatenate([pairs.i, pairs.j])], np.arange(len(pairs))
-    tried = []
+    tried: list[Explanation] = []
     for rival in rivals:
         poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
         motions = motion_pairs.pairs_between(*poses, first, first + len(pairs))
-        tried.append(Explanation(rival, fit_similarity(motions)))
-    least = min(each.fit.unexplained for each in tried)
-    limit = min(most, _ABOUT_EQUAL * least)
-    return [each for each in tried if least < most and each.fit.unexplained <= limit]
+        # The start of a fit leaves about as much as the fit.
+        tried.append(Explanation(rival, fit_similarity(motions, most=_DECISIVE * most)))
+        most = min(most, _ABOUT_EQUAL * tried[-1].fit.unexplained)
+    return [each for each in tried if each.fit.unexplained <= most]
 
 
 def _fitted(
