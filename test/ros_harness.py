@@ -45,7 +45,7 @@ RELIABLE_INPUTS = [
     for stream in ("parent", "child")
 ]
 
-_domains = itertools.count(os.getpid())
+_domains, _held = itertools.count(os.getpid()), {}
 
 
 def values_of(status):
@@ -56,12 +56,12 @@ def values_of(status):
 def free_domain():
     """A domain id whose first participant's port nobody listens on."""
     for candidate in itertools.islice(_domains, 100):
-        domain = (
-            1 + candidate % 100
-        )  # above 101, the ports run into those that Linux gives to clients
+        domain = 1 + candidate % 100  # above 101, the ports run into those of Linux for clients
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind(("", 7410 + 250 * domain))
+                # Held for a while: the tests may run in two interpreters at once.
+                _held[candidate % 50] = socket.create_server(("", 7410 + 250 * domain))
             except OSError:
                 continue
         return domain
