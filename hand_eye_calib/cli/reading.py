@@ -3,16 +3,16 @@
 import dataclasses
 import re
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, flag, note, waiting_for, with_progress
-from hand_eye_calib.engine.run import run
+from hand_eye_calib.engine.run import Options, run
 from hand_eye_calib.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 
 _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
@@ -25,7 +25,7 @@ class Recording:
     """
 
     snapshot: Snapshot
-    inputs: dict[str, Any]
+    inputs: Document
     files: list[Path]
     warnings: tuple[str, ...] = ()
 
@@ -71,11 +71,11 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
 # ----------------------------------------------------------------------- files
 
 
-def read_pair(arguments: Namespace, options: Mapping[str, Any]) -> Recording:
+def read_pair(arguments: Namespace, options: Options) -> Recording:
     """The recording of the trajectory files of parent and child."""
     (parent, child), repairs = read_files(arguments, arguments.paths, options)
     note(*repairs)
-    inputs: dict[str, Any] = {}
+    inputs: Document = {}
     for path, stream, poses in zip(arguments.paths, STREAMS, (parent, child), strict=True):
         first_ns, last_ns = poses.stamps_ns[[0, -1]].tolist()
         inputs[stream] = {"file": str(path), "poses": len(poses)}
@@ -86,7 +86,7 @@ def read_pair(arguments: Namespace, options: Mapping[str, Any]) -> Recording:
 
 
 def read_files(
-    arguments: Namespace, paths: Sequence[Path | str], options: Mapping[str, Any]
+    arguments: Namespace, paths: Sequence[Path | str], options: Options
 ) -> tuple[list[Trajectory], list[str]]:
     """The trajectories of files, and what was wrong with their stamps; a note says what was
     guessed. How each is read is among the arguments: of two, its own options go before those for

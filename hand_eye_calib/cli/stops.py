@@ -4,7 +4,6 @@ a hand and images of a target.
 
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from hand_eye_calib.cli.options import STREAMS, note, options_from, with_progress
 from hand_eye_calib.cli.reading import read_files
@@ -13,10 +12,11 @@ from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io import target_images
 from hand_eye_calib.io.stops import read_arm_samples
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 
 
-def solved(arguments: Namespace) -> tuple[Calibration, dict[str, Any]]:
+def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     """The calibration, and where the poses came from in plain values."""
     options = options_from(arguments)
     config = CalibratorConfig.from_options(options)

@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from hand_eye_calib.config import other_names
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.files import LONGEST_LINE, open_regular
 from hand_eye_calib.io.trajectory_files.table import tum_line
+from hand_eye_calib.plain import Document
 
 _FORMAT = "hand_eye_calib/journal"
 _VERSION = 2
@@ -38,7 +38,7 @@ _ADVICE = "move it away to start anew"
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
 #: What is known of each stream: plain values, such as topic, frame, origin and options.
-About = Mapping[str, Mapping[str, Any]]
+About = Mapping[str, Document]
 
 
 class JournalWriter:
@@ -55,7 +55,7 @@ class JournalWriter:
         Path(directory).mkdir(parents=True, exist_ok=True)
         before = resumed or Journal({}, np.array([]), np.array([]), np.array([]), {})
         self._parent_poses = int((before.streams == "parent").sum())
-        self._about: dict[str, Mapping[str, Any]] = {**before.about}
+        self._about: dict[str, Document] = {**before.about}
         self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before.about}}
         self._files: dict[str, FileIO] = {}
         for stream in self._pending:
@@ -116,7 +116,7 @@ class Journal:
     read.
     """
 
-    about: dict[str, dict[str, Any]]
+    about: dict[str, Document]
     streams: np.ndarray
     stamps_ns: IntArray
     poses: FloatArray
@@ -143,12 +143,12 @@ def read_journal(directory: str | Path) -> Journal:
     )
 
 
-def _read(path: Path) -> tuple[dict[str, Any], "array[int]", "array[float]", int]:
+def _read(path: Path) -> tuple[Document, "array[int]", "array[float]", int]:
     """Read the file of one stream: what its comments say, the stamps of its poses, their rows, and
     how many bytes could be read. A row is x y z qx qy qz qw behind the time of arrival, which is
     counted in poses of the parent.
     """
-    about: dict[str, Any] = {}
+    about: Document = {}
     # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
     stamps_ns, values, whole_bytes = array("q"), array("d"), 0
     with open_regular(path) as file, suppress(*_UNREADABLE):

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.run import with_options
+from hand_eye_calib.engine.run import Options, with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.log import GOES_ON_S, ONCE_S, NodeLog
@@ -152,11 +151,11 @@ class SolveCycle:
         """Begin a new session: no result yet."""
         self.result: Calibration | None = None
         self._told_result: ResultState | None = None
-        self._solved: tuple[Calibrator, dict[str, Any]] | None = None
+        self._solved: tuple[Calibrator, Options] | None = None
         self._solved_at_s = 0.0
         self._seen = NO_MOTION
         self._failure: Failure | None = None
-        self._certain: dict[str, Any] = {}
+        self._certain: Options = {}
         self._told: tuple[str, ...] = ()
         self._is_unchecked, self._check_due_s = False, 0.0
         self.checks.restart()
@@ -244,7 +243,7 @@ class SolveCycle:
         self._seen, self._failure = replace(answer.seen, rotation=rotation), answer.failure
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
-            self._certain, self._told = self._certain | answer.options, answer.told
+            self._certain, self._told = {**self._certain, **answer.options}, answer.told
         if answer.check is not None:
             self.checks.take(answer.check)
         elif answer.is_checked:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, StreamStatistics
@@ -14,6 +13,7 @@ from hand_eye_calib.io.journal import Journal, has_session, read_journal
 from hand_eye_calib.live.journal import SessionJournal
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import GRACE_S, JournalState, Level
+from hand_eye_calib.plain import Document
 
 # The engines by the child sensor of each; all of them have the same parent.
 Engines = Mapping[str, Calibrator]
@@ -74,7 +74,7 @@ class LiveSession:
         self.has_new_poses = False
         self._is_solved = True
         self._log = log
-        self._measures: dict[str, Any] = {}
+        self._measures: Document = {}
         self._origins: dict[str, LocalOrigin] = {}
         self._journal: SessionJournal | None = None
 
@@ -223,11 +223,11 @@ class LiveSession:
         self._log.info(f"session resumed from {directory}: {poses} poses")
         return journal
 
-    def _about(self) -> dict[str, dict[str, Any]]:
+    def _about(self) -> dict[str, Document]:
         """Options, topics, frames and origins (rad, rad, m), for whoever reads the journal."""
         config = self.calibrator.config
         of_all = {"options": config.to_options(), "given": sorted(config.given)}
-        about: dict[str, dict[str, Any]] = {}
+        about: dict[str, Document] = {}
         for stream in ("parent", *self.engines):
             own_stream, engine = takers(stream, self.engines)[0]
             origin = self._origins.get(stream, LocalOrigin()).geodetic

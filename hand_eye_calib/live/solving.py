@@ -24,7 +24,7 @@ from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.run import check, review, with_options
+from hand_eye_calib.engine.run import Options, check, review, with_options
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.live.state import GRACE_S
 from hand_eye_calib.pairing.motion_pairs import PosePairs
@@ -64,7 +64,7 @@ class Job:
     session: int
     calibrator: Calibrator
     check: bool = False
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Options = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Answer:
     failure: Failure | None = None
     is_checked: bool = False
     check: CheckResult | None = None
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Options = field(default_factory=dict)
     told: tuple[str, ...] = ()
 
 
