@@ -87,6 +87,8 @@ class SimilarityFit:
     offsets_of_blocks : (2, B) array
         By how much d would differ in each block of time, X and s as they are, and the weight of
         that. Zero without twists.
+    held : float
+        Those offsets, steps with fixed robust weights, as a share of what they should be.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
     unexplained_translation, unexplained : float
@@ -106,6 +108,7 @@ class SimilarityFit:
     offset_sigma_s: float
     sensitivity: FloatArray
     offsets_of_blocks: FloatArray
+    held: float
     sigma_translation: float
     sigma_rotation: float
     unexplained_translation: float
@@ -306,11 +309,11 @@ class _Problem:
 
     def rows(
         self, T: FloatArray, scale: float, offset_s: float = 0.0
-    ) -> tuple[list[FloatArray], tuple[float, float]]:
+    ) -> tuple[list[FloatArray], tuple[float, float], FloatArray]:
         """Derivatives of the residuals of translation and of rotation, in the parent's axes, by
         (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; the residuals in the last
-        column. Two (K, 3, 9) arrays in standard deviations and times their robust weights, and
-        these per axis (m, rad).
+        column. Two (K, 3, 9) arrays in standard deviations and times their robust weights, these
+        deviations per axis (m, rad), and these weights (K,).
         """
         rotation, back = T[:3, :3], T[:3, :3].T
         of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, len(_UNKNOWNS) + 1))
@@ -340,7 +343,7 @@ class _Problem:
         root = 1.0 / (1.0 + squared / (6 * _TUNING**2))
         for part, sigma in zip(parts, sigmas, strict=True):
             part *= (root / sigma)[:, None, None]
-        return parts, sigmas
+        return parts, sigmas, root
 
     def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
         """X, scale and offset after Gauss-Newton steps with robust weights until they are small."""
@@ -369,7 +372,7 @@ class _Problem:
 
     def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
         """The result, with its uncertainty."""
-        parts, sigmas_of_residuals = self.rows(T, scale, offset_s)
+        parts, sigmas_of_residuals, root = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
         blocks = np.array_split(rows, min(_N_BLOCKS, len(rows)))
         moments = np.array([np.tensordot(each, each, axes=([0, 1], [0, 1])) for each in blocks])
@@ -381,6 +384,9 @@ class _Problem:
         extrinsic = np.arange(len(_UNKNOWNS)) < _SCALE
         by = [_solve(total, -total[:, column], extrinsic)[:6] for column in (_SCALE, _OFFSET)]
         weights = normal[:, _OFFSET, _OFFSET]
+        # Robust weights fall as the offset moves, so that a step is shorter than it should be.
+        pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
+        held = 1.0 - pulls.sum() / (1.5 * _TUNING**2) / max(weights.sum(), 1e-300)
         offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         sigmas = np.sqrt(np.diag((len(blocks) - 1) / len(blocks) * answers.T @ answers))
@@ -393,6 +399,7 @@ class _Problem:
             offset_sigma_s=float(sigmas[_OFFSET]),
             sensitivity=np.column_stack(by),
             offsets_of_blocks=np.stack([offsets, weights]),
+            held=float(np.clip(held, 0.5, 1.0)),
             sigma_translation=sigmas_of_residuals[0],
             sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,

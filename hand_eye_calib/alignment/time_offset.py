@@ -378,6 +378,7 @@ def offset_over(
 def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:
     """Estimate the clock rate. To the rate before comes the slope of a line through the offsets
     that are left in blocks of time; ``stamps_ns`` (K,) of the pairs are on the parent's clock.
+    Its variance is that of Student's t, as the blocks are few.
     """
     offsets_s, weights = fit.offsets_of_blocks
     if weights.min() <= 0.0:
@@ -389,7 +390,7 @@ def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRa
     spread = float(weights @ away_s**2)
     slope = float(weights @ (away_s * left_s)) / spread
     residuals_s = left_s - slope * away_s
-    variance = float(weights @ residuals_s**2) / (len(offsets_s) - 2) / spread
+    variance = float(weights @ residuals_s**2) / (len(offsets_s) - 4) / spread / fit.held**2
     total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
     sigma = float(np.sqrt(variance))
     is_used = abs(total) > _PLAIN_RATE * sigma

@@ -156,13 +156,12 @@ class NoiseModel:
         """What is known beforehand, for a search from these levels."""
         total, shortest = whole(levels), np.log(self.interval_s)
         mean, precision = levels.copy(), np.zeros(len(levels))
-        lower = np.full(len(levels), TUNING.lowest_level)
+        lower = np.full(len(levels), np.log(TUNING.lowest_variance))
         upper = np.full(len(levels), TUNING.highest_level)
-        lower[:N_FAST] = np.log(TUNING.lowest_variance)
         lower[:2] = np.maximum(lower[:2], total + TUNING.least_white)
         lower[3:5] = np.maximum(lower[3:5], total + TUNING.least_walk)
         mean[JITTER], precision[JITTER] = TUNING.jitter, TUNING.jitter_precision
-        lower[JITTER], taus = TUNING.lowest_level, slice(N_FAST + 1, None, 2)
+        taus = slice(N_FAST + 1, None, 2)
         precision[taus], lower[taus] = TUNING.tau_precision, shortest
         upper[taus] = max(np.log(TUNING.longest_share * self.duration_s), shortest)
         # One that lasts is a bias or a mount askew, which have parameters.

@@ -64,7 +64,7 @@ def first_outliers(
     limits = np.maximum(TUNING.first_jump_sigmas * usual / MEDIAN_LENGTH, TUNING.least_jump)
     jumps = (sizes > limits).any(axis=1)
     spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
-    if np.mean(spikes) > TUNING.most_first_spikes:
+    if np.mean(spikes) > TUNING.most_spikes:
         return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
     jumps = jumps & ~(spikes[1:] | spikes[:-1])
     if spikes.any():
@@ -125,9 +125,7 @@ def judged(
     decisive = of_walk > factor * alarming
     beside = np.maximum(of_white[1:], of_white[:-1])
     found = decisive & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
-    jumps = outliers.jumps & decisive
-    if np.sum(jumps | found) <= TUNING.most_jumps * len(jumps):
-        jumps = jumps | found
+    jumps = (outliers.jumps & decisive) | found
     spikes = outliers.spikes
     if with_spikes:
         walks = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])

@@ -28,14 +28,13 @@ class Tuning:
     # rotation shifts positions in a way that the model of one increment does not follow. In
     # recordings of thousands of poses the walk fitted was a tenth of the true one.
     longest_gap: int = 60
-    # Variances never fall below this (rad^2 or m^2): rounding, not noise. White noise and walk do
-    # not fall below these shares of the whole (logarithms), either; the precisions of both stand
+    # Variances never fall below this (rad^2, m^2, s^2): rounding, not noise. White noise and walk
+    # do not fall below these shares of the whole (logarithms), either; the precisions of both stand
     # in one matrix.
     lowest_variance: float = 1e-14
     least_white: float = -14.0
     least_walk: float = -12.0
-    # Bounds of all other levels.
-    lowest_level: float = -32.0
+    # No level is above this.
     highest_level: float = 14.0
     # Expected level of the jitter of stamps (s^2), 1 ms, and how well it is known; precision of the
     # level of time constants, too.
@@ -82,14 +81,11 @@ class Tuning:
     # white errors.
     walk_kurtosis: float = 1.5
     heavy_kurtosis: float = 1.7
-    # No more than this share of the increments are jumps: otherwise the noise levels are wrong.
-    most_jumps: float = 0.5
     # First look for jumps: increments this many robust sigmas out, at least so large (m, rad).
     # Wide, for the noise levels are not known yet.
     first_jump_sigmas: float = 5.0
     least_jump: float = 1e-6
-    # At most these shares of the poses are outliers: pairs of jumps, and once the noise is known.
-    most_first_spikes: float = 0.3
+    # At most this share of the poses are outliers.
     most_spikes: float = 0.2
     # The noise levels are fitted again only if more than this share of poses changed status.
     negligible: float = 0.005
