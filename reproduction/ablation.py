@@ -174,13 +174,11 @@ def _row(
 def main() -> None:
     """Draw, solve and print."""
     parser = study_parser("reproduction.ablation", __doc__)
-    parser.add_argument("--quick", action="store_true", help="two of each platform: five minutes")
     parser.add_argument("--repeats", type=int, default=10, help="recordings of each platform")
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
-    repeats = 2 if arguments.quick else arguments.repeats
-    cases = [*real_cases(arguments.data_folder), *simulated_cases(seed, repeats)]
+    cases = [*real_cases(arguments.data_folder), *simulated_cases(seed, arguments.repeats)]
     drawn_by = f"Seed {seed}, {len(cases)} recordings."
     show(arguments.page, {"ablation": f"{drawn_by}\n\n{table(cases)}"})
 
