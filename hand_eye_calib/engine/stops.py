@@ -51,12 +51,12 @@ def calibrate_stops(
     (4, 4)
     """
     config = config or CalibratorConfig()
-    fit = solve(Stops.of_one(Ts_world_parent, Ts_world_child))
-    other = solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
+    stops = Stops.of_one(Ts_world_parent, Ts_world_child)
+    fit, other = solve(stops), solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
     is_smaller = max(other.level_m / fit.level_m, other.level_rad / fit.level_rad) < 1.0 / _CLEARLY
     findings = [finding("inverse", "child")] if is_smaller and other.converged else []
-    frames = "parent", "child", "parent_world", "child_world"
-    return _assessed(fit, Ts_world_parent, Ts_world_child, config, frames, findings)
+    frames = ["parent", "child", "parent_world", "child_world"]
+    return _assessed(fit, stops, config, frames, *findings)
 
 
 def calibrate_arm(
@@ -94,26 +94,21 @@ def calibrate_arm(
     named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
     Ts_target_camera = se3.inverse(tracking)
     fits = [
-        (solve(Stops.of_one(poses, Ts_target_camera)), poses, parent, world)
+        (solve(stops := Stops.of_one(poses, Ts_target_camera)), stops, parent, world)
         for poses, parent, world in ((robot, "hand", "base"), (se3.inverse(robot), "base", "hand"))
     ]
-    fit, poses, parent, world = min(fits, key=lambda each: each[0].objective)
-    frames = named[parent], named["camera"], named[world], named["target"]
-    return _assessed(fit, poses, Ts_target_camera, config or CalibratorConfig(), frames, [])
+    fit, stops, parent, world = min(fits, key=lambda each: each[0].objective)
+    frames = [named[each] for each in (parent, "camera", world, "target")]
+    return _assessed(fit, stops, config or CalibratorConfig(), frames)
 
 
 def _assessed(
-    fit: RobotWorld,
-    Ts_world_parent: FloatArray,
-    Ts_world_child: FloatArray,
-    config: CalibratorConfig,
-    frames: tuple[str, str, str, str],
-    findings: list[Finding],
+    fit: RobotWorld, stops: Stops, config: CalibratorConfig, frames: list[str], *findings: Finding
 ) -> Calibration:
     X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
     parent, child, parent_world, child_world = frames
     fused = fuse(X, combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
-    errors = se3.log(se3.inverse(Z @ Ts_world_child) @ Ts_world_parent @ X)
+    errors = se3.log(se3.inverse(Z @ stops.Ts_world_child) @ stops.Ts_world_parent @ X)
     rows = np.arange(len(errors))
     residuals = Residuals(
         translation=errors[:, :3] @ X[:3, :3].T,
@@ -131,7 +126,7 @@ def _assessed(
         T_method=X,
         reference="stops",
         stamp_ns=0,
-        findings=tuple(findings),
+        findings=findings,
         parent_frame=config.parent_frame or parent,
         child_frame=config.child_frame or child,
         T_world_world=Z,

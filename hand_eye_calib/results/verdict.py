@@ -11,8 +11,6 @@ from enum import Enum
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
-import numpy as np
-
 from hand_eye_calib.config import METHODS
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS, Severity, SolveStatus
 from hand_eye_calib.results.result import Result
@@ -201,10 +199,10 @@ def _nothing_known(result: Result) -> Iterator[_Found]:
     if all(axis.is_hidden for axis in _axes(result)):
         text = "nothing about the mounting can be determined from this motion"
         yield text, "record motion with rotations about all axes", (), {}
-    elif result.reference == "stops" and sum(np.linalg.eigvalsh(result.covariance) > 1.0) > 1:
-        # Of variances of a metre or a radian.
-        text = "two or more directions of the mounting cannot be determined from these stops"
-        yield text, "turn the hand about at least two axes between them", (), {}
+    elif result.reference == "stops" and result.unobservable():
+        text, advice, axes, _ = next(_hidden(result))
+        text = text.replace("this motion", "these stops, which do not turn about two axes")
+        yield text, f"turn the hand about at least two axes between them, or {advice}", axes, {}
 
 
 def _findings_of(severity: Severity, result: Result) -> Iterator[_Found]:
@@ -346,7 +344,7 @@ RULES = (
         "a stream check found an error",
         partial(_findings_of, Severity.ERROR),
     ),
-    Rule("nothing_known", _NEVER, "all six axes are unobservable; of stops, two", _nothing_known),
+    Rule("nothing_known", _NEVER, "all six axes are unobservable; of stops, any", _nothing_known),
     Rule(
         "recordings_differ",
         _NEVER,

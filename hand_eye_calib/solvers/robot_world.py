@@ -164,11 +164,13 @@ def solve(stops: Stops) -> RobotWorld:
         )
     starts, views = _starts(stops, counts), _views(stops)
     alone, fits = _alone(views), []
+    # With heavier tails a few stops fit exactly, and all others are outliers.
+    few = 8.0 * sum(counts.shape) / max(len(stops) - sum(counts.shape), 0.1)
     for in_world in (False, True):
-        rough = _fit(stops, starts, in_world, _OUTLIER_TAILS, alone)
+        rough = _fit(stops, starts, in_world, max(few, _OUTLIER_TAILS), alone)
         kept, weights = rough.weights > 0.0, np.zeros(len(stops))
         begin = rough.Ts_parent_child, rough.Ts_world_world
-        fit = _fit(stops[kept], begin, in_world, _TAILS, alone[kept])
+        fit = _fit(stops[kept], begin, in_world, max(few, _TAILS), alone[kept])
         weights[kept] = fit.weights
         # Each stop that is left out counts as an outlier at the limit.
         levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
@@ -362,7 +364,16 @@ def _widened(
         known = of_one**2 / larger + _STRETCH**-2.0
         square = (of_one * of_errors / larger / known) ** 2 + 1.0 / known
         more[np.ix_(columns, columns)] += square * np.outer(products[:12, 12], products[:12, 12])
-    return fit.covariance + fit.covariance @ more @ fit.covariance
+    few = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * len(more), 0.5)  # hardly know the levels
+    return few * (fit.covariance + fit.covariance @ more @ fit.covariance)
+
+
+def _variances(means: FloatArray, stops: Stops, n_values: int) -> FloatArray:
+    """Variances (2,) of positions and rotations; of one level if all positions may fit exactly."""
+    if 3 * len(stops) <= n_values:
+        places_m2 = stops.Ts_world_child[:, :3, 3].var(axis=0).sum() + _SMALLEST_VARIANCE
+        means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
+    return np.maximum(means, _SMALLEST_VARIANCE)
 
 
 def _fit(
@@ -377,12 +388,12 @@ def _fit(
     # What the weights sum to in the end; levels that count with it from the start settle sooner:
     # C. Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
     in_the_end = ((tails + 6.0) * n - 2.0 * n_free) / tails
-    weights, converged = alone, False
+    weights = alone
     for _ in range(_ROUNDS):
         errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         means = in_the_end / weights.sum() * (weights @ squared) / n_free
-        variances = np.maximum(means, _SMALLEST_VARIANCE)
+        variances = _variances(means, stops, n_values)
         distance = squared @ (1.0 / variances)
         weights = alone * (tails + 6.0) / (tails + distance)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
@@ -393,8 +404,7 @@ def _fit(
         step = -np.linalg.solve(products[:-1, :-1] + held, products[:-1, -1])
         steps = se3.exp(step.reshape(-1, 6))
         Xs, Zs = Xs @ steps[: len(Xs)], Zs @ steps[len(Xs) :]
-        converged = bool(-step @ products[:-1, -1] < _SMALL_STEP**2)
-        if converged:
+        if converged := bool(-step @ products[:-1, -1] < _SMALL_STEP**2):
             break
     # Of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust statistical
     # modeling using the t distribution*, JASA 84, 1989, section 4.

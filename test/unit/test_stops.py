@@ -56,9 +56,9 @@ def test_a_scara_is_told_what_is_unknown(random):
     robot, tracking, X, _ = arm(random, turn_rad=(0.0, 0.0, 1.0))
     result = calibrate_arm(robot, tracking)
     assert result.unobservable() == ["z"]
-    assert result.verdict is hec.Verdict.USE_WITH_CARE
+    assert result.headline.startswith("DO NOT USE: z cannot be determined from these stops")
     known = calibrate_arm(robot, tracking, CalibratorConfig(prior_z=f"{X[2, 3]}+/-0.002"))
-    assert not known.unobservable()
+    assert known.verdict is hec.Verdict.USE
 
 
 def test_inverse_poses_are_named(random):
@@ -232,11 +232,11 @@ def poses(random, n, reach_m=0.3, turn_rad=0.5):
     return se3.exp(xi)
 
 
-def recorded(random, n, noise=1.0, outliers=0.0, Ts_world_parent=None, levels=LEVELS):
+def recorded(random, n, noise=1.0, outliers=0.0, Ts_world_parent=None):
     """X, Z and the stops of a target seen by a camera in a hand."""
     X, Z = poses(random, 2, turn_rad=1.5)
     A = poses(random, n) if Ts_world_parent is None else Ts_world_parent
-    B = se3.inverse(Z) @ A @ X @ se3.exp(noise * levels * random.normal(size=(n, 6)))
+    B = se3.inverse(Z) @ A @ X @ se3.exp(noise * LEVELS * random.normal(size=(n, 6)))
     wrong = random.random(n) < outliers
     B[wrong] = B[wrong] @ poses(random, int(wrong.sum()), 0.3, 0.5)
     return X, Z, Stops.of_one(A, B)
@@ -254,17 +254,19 @@ def test_exact_stops_are_solved_exactly(random, n):
     assert np.abs(off(fit.Ts_world_world[0], Z)).max() < 1e-7
 
 
-@pytest.mark.parametrize(("outliers", "size"), [(0.0, 1.0), (0.15, 1.0), (0.0, 0.98)])
-def test_covariance_is_that_of_the_errors(random, outliers, size):
+@pytest.mark.parametrize(
+    ("outliers", "size", "n"), [(0, 1, 20), (0.15, 1, 20), (0, 0.98, 20), (0, 1, 4)]
+)
+def test_covariance_is_that_of_the_errors(random, outliers, size, n):
     squared = []
     for _ in range(40):
-        X, Z, stops = recorded(random, 20, outliers=outliers)
+        X, Z, stops = recorded(random, n, outliers=outliers)
         stops.Ts_world_child[:, :3, 3] *= size
         fit = solve(stops)
         error = np.r_[off(fit.Ts_parent_child[0], X), off(fit.Ts_world_world[0], Z)]
         squared.append(error @ np.linalg.solve(fit.covariance, error))
-    # Twelve are expected; the mean of 40 scatters by 0.8. Of another size the sigmas are wider.
-    assert (8.0 if size == 1.0 else 4.0) < np.mean(squared) < 18.0
+    # Twelve are expected; the mean of 40 scatters by 0.8. Of another size, or few, they are wider.
+    assert (8.0 if size == 1 and n == 20 else 4.0) < np.mean(squared) < 18.0
 
 
 def test_covariance_is_that_of_errors_that_last(random):
@@ -337,22 +339,17 @@ class TestUndetermined:
     @pytest.mark.parametrize("motion", ["one_axis", "no_rotation", "one_axis_unmoved", "two"])
     def test_degenerate_stops_are_refused_by_axis(self, motion, seed):
         random = np.random.default_rng(seed)
-        axis = random.normal(size=3)
-        axis /= np.linalg.norm(axis)
-        xi = np.zeros((25, 6))
-        if motion != "one_axis_unmoved":
-            xi[:, :3] = random.normal(size=(25, 3)) * 0.3
-        if motion != "no_rotation":
-            xi[:, 3:] = random.normal(size=(25, 1)) * axis
+        axis = se3.nearest_rotation(random.normal(size=(3, 3)))[0]
+        moves = 0.3 * (motion != "one_axis_unmoved") * random.normal(size=(25, 3))
+        turns = (motion != "no_rotation") * random.normal(size=(25, 1)) * axis
         places = np.arange(25) % (2 if motion == "two" else 25)
-        A = poses(random, 1, turn_rad=2.0) @ se3.exp(xi[places])
-        levels = LEVELS * random.uniform(0.3, 3.0)
-        X, _, stops = recorded(random, 25, Ts_world_parent=A, levels=levels)
+        A = poses(random, 1, turn_rad=2.0) @ se3.exp(np.c_[moves, turns][places])
+        _, _, stops = recorded(random, 25, random.uniform(0.3, 3.0), Ts_world_parent=A)
         fit = solve(stops)
         unknown = np.kron(np.eye(2), fit.Ts_parent_child[0][:3, :3]) @ fit.undetermined()
         along = np.eye(3) if motion == "no_rotation" else axis[None]
         assert np.linalg.norm(along @ unknown[:3], axis=1).min() > 0.98
         result = calibrate_stops(stops.Ts_world_parent, stops.Ts_world_child)
         assert (unknown.shape == (6, 1)) == (motion == "one_axis")
-        rule = "unobservable" if motion == "one_axis" else "nothing_known"
-        assert result.reasons[0].rule == rule
+        assert result.reasons[0].rule == "nothing_known"
+        assert {"x", "y", "z"} & {*result.unobservable()}
