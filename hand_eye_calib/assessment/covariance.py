@@ -40,7 +40,7 @@ from hand_eye_calib.stats import CHI2, median
 SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 
 # Blocks of the jackknife; fewest of them, and of the pairs in each.
-_BLOCKS, _FEWEST = 10, (4, 3)
+BLOCKS, _FEWEST = 10, (4, 3)
 
 # An unseen direction with at least this length in its rotation is not one of translation alone.
 _SHARE_OF_ROTATION = 0.5
@@ -86,7 +86,7 @@ def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) 
     """
     T_parent_child, resampled = solution.T_parent_child, None
     model, unknown = model_covariance(pairs, solution)
-    n_blocks = min(_BLOCKS, len(pairs) // _FEWEST[1])
+    n_blocks = min(BLOCKS, len(pairs) // _FEWEST[1])
     if n_blocks >= _FEWEST[0]:
         block_of_pair = np.arange(len(pairs)) * n_blocks // len(pairs)
         left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
@@ -151,9 +151,9 @@ def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatA
 
 def _widened(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
     """The model's covariance of a part of xi, widened by blocks and halves."""
-    if len(solution.jumps) < _BLOCKS * _FEWEST[1]:
+    if len(solution.jumps) < BLOCKS * _FEWEST[1]:
         return covariance
-    steps = answers_without(solution.part_products, _BLOCKS)[:, part]
+    steps = answers_without(solution.part_products, BLOCKS)[:, part]
     spread = np.linalg.pinv(covariance, hermitian=True) @ _spread_of_blocks(steps)
     # One factor for all directions: that of a single direction scatters too much.
     covariance = max(float(np.trace(spread)) / len(covariance), 1.0) * covariance
@@ -182,7 +182,7 @@ def noise_driven(
     least_share : float
         See :meth:`~hand_eye_calib.assessment.excitation.LeverArms.hidden_directions`.
     """
-    longest = max(len(Ts_pw_p) // _BLOCKS, 1)
+    longest = max(len(Ts_pw_p) // BLOCKS, 1)
     rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])
     found: list[FloatArray] = []
     for baseline in sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True):

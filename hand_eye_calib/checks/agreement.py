@@ -13,7 +13,8 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.checks.response import TOLERANCE, Fitted, Regression, delays, response
+from hand_eye_calib.checks.response import Fitted, Regression, delays, response
+from hand_eye_calib.checks.streams import USUAL
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between, pairs_over
@@ -70,16 +71,14 @@ _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
 _AGREE = np.radians(0.008), 50.0
 
 # Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
-# upper quarter of their spectra, where they are white (the quarter below it differs by less than
-# the first), both streams have so many times more than what remains, in positions or orientations;
-# sensors that shake together at most 1.2 and 16 times more. Times when both accelerate so many
-# times more than usual are left out: an impulse is white as well. So is motion that intervals are
-# too long for; orientations' noise is a small share of the squared turning.
-_NOISE = {"flat": 1.75, "abrupt": 4.0, "longest_ns": 3e8, "small": 1e-3}
+# upper half of their spectra both have so many times more than what remains, in positions or
+# orientations; sensors that shake together at most 1.2 and 16 times more. They are white (the
+# quarters of that half differ by less than the first), or what remains is not: it falls as motion
+# does, more steeply than errors that add up. Times when both accelerate so many times more than
+# usual are left out: an impulse is white as well. So is motion that intervals are too long for:
+# noise of orientations is a small share of the squared turning.
+_FLAT, _ABRUPT, _LITTLE_NOISE = 1.75, 4.0, 1e-3
 _SHARED = np.array([3.0, 30.0])
-
-# This share of the poses must agree: the rest may be jumps.
-_SHARE = 0.9
 
 # Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
 # compared: a hundredth of them, at least and at most so many.
@@ -311,9 +310,9 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
     limit_rad = min(_AGREE[0], min(map(_roughness, (parent, child))) / _AGREE[1])
     # Programs interpolate at the stamps of the new stream.
     on_one_clock = (aligned, parent), (parent, aligned)
-    residual_rad = min(starmap(_disagreement, ((child, parent), (parent, child), *on_one_clock)))
-    if residual_rad < limit_rad:
-        return [finding("not_independent", residual_rad=residual_rad)]
+    for residual_rad in starmap(_disagreement, ((child, parent), (parent, child), *on_one_clock)):
+        if residual_rad < limit_rad:
+            return [finding("not_independent", residual_rad=residual_rad)]
     # Circumstantial: sensors on one body may shake together.
     if (shared := max(starmap(_shared_noise, on_one_clock))) > 1.0:
         return [finding("not_independent", "both", Severity.WARNING, shared=shared)]
@@ -324,17 +323,17 @@ def _roughness(trajectory: Trajectory) -> float:
     """Third difference of the orientations, rad."""
     rotations = trajectory.poses[:, :3, :3]
     steps = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    return quantile(np.linalg.norm(np.diff(steps, n=2, axis=0), axis=1), _SHARE)
+    return quantile(np.linalg.norm(np.diff(steps, n=2, axis=0), axis=1), USUAL)
 
 
 def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
-    """How many times more white noise both streams have in common than two sensors; 0 if it is not
-    white noise that makes them rough.
+    """How many times more noise both streams have in common than two sensors; 0 if it is motion
+    that makes them rough, or a pose is missing.
     """
     slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
     slow = slow[len(slow) // 2 :][: _NEAREST[1]]
-    longest_ns = min(_NOISE["longest_ns"], (1.0 + TOLERANCE) * median(np.diff(slow.stamps_ns)))
-    if len(slow) < _NEAREST[0] or np.diff(slow.stamps_ns).max() > longest_ns:
+    intervals_ns = np.diff(slow.stamps_ns)
+    if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
         return 0.0
     both = slow.poses, fast.at(slow.stamps_ns, straight=True)
     steps = (se3.log(se3.inverse(Ts[:-1]) @ Ts[1:]) for Ts in both)
@@ -343,38 +342,37 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
     left, arms = b - a, se3.skew(a[:, 1])
     left[:, 0] -= arms @ np.linalg.lstsq(arms.reshape(-1, 3), left[:, 0].ravel(), rcond=None)[0]
     sizes = np.linalg.norm([a, b], axis=3)
-    usual = _NOISE["abrupt"] * np.median(sizes, axis=1, keepdims=True)
+    usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
     is_calm = (sizes <= usual).any(axis=0).all(axis=1)[:, None, None]
     spectra = (np.abs(np.fft.rfft(is_calm * [a, b, left], axis=1)) ** 2).sum(axis=3)
     # Of poses, as differences raise it.
     spectra /= (2.0 * np.sin(np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])))[:, None] ** 6
-    _, _, middle, upper = (each.mean(axis=1) for each in np.array_split(spectra, 4, axis=1))
-    unlike = np.maximum(middle, upper) / np.maximum(np.minimum(middle, upper), 1e-300)
-    position, rotation = (unlike[:2] < _NOISE["flat"]).all(axis=0)
+    half = np.stack([each.mean(axis=1) for each in np.array_split(spectra, 4, axis=1)[2:]])
+    is_white = (half.max(axis=0) < _FLAT * half.min(axis=0))[:2].all()
     turned = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
-    is_noise = upper[:2, 1].max() < _NOISE["small"] * turned
-    ratios = np.sqrt(upper[:2].min(axis=0) / np.maximum(upper[2], 1e-300)) / _SHARED
-    return float(max(position * ratios[0], ratios[1]) * rotation * is_noise)
+    is_noise = half[1, :2, 1].max() < _LITTLE_NOISE * turned
+    common = (half[:, :2].min(axis=1) / np.maximum(half[:, 2], 1e-300)).min(axis=0)
+    follows = half[0, 2, 1] > _FLAT**2 * half[1, 2, 1]
+    found = common**0.5 / _SHARED * [is_white, is_white or follows]
+    return float(is_noise * found.max())
 
 
 def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
     """Angle (rad) that remains between the rotations of two streams, one of them interpolated
     along a straight line at stamps of the other; infinite if they have too few in common.
     """
-    inside = (slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])
-    indices = np.flatnonzero(inside)
-    if len(indices) < 4:
+    slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
+    if len(slow) < 4:
         return np.inf
-    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[indices]), 1, len(fast) - 1)
-    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[indices]).min(axis=0)
-    n_nearest = min(max(_NEAREST[0], len(indices) // 100), len(indices))
-    indices = indices[around <= np.partition(around, n_nearest - 1)[n_nearest - 1]]
-    indices = indices[:: -(-len(indices) // _NEAREST[1])]
-    between = fast.at(slow.stamps_ns[indices], straight=True)
-    start = np.arange(len(indices) - 1)
-    pairs = pairs_between(between, slow.poses[indices], start, start + 1)
+    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns), 1, len(fast) - 1)
+    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns).min(axis=0)
+    n_nearest = min(max(_NEAREST[0], len(slow) // 100), len(slow))
+    slow = slow[around <= np.partition(around, n_nearest - 1)[n_nearest - 1]]
+    slow = slow[:: -(-len(slow) // _NEAREST[1])]
+    between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
+    pairs = pairs_between(between, slow.poses, start, start + 1)
     pairs = pairs[se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3]) < _MAX_ROTATION]
     if len(pairs) < 3:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
-    return quantile(np.linalg.norm(pairs.residuals(X)[1], axis=1), _SHARE)
+    return quantile(np.linalg.norm(pairs.residuals(X)[1], axis=1), USUAL)

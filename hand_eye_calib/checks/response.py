@@ -25,6 +25,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import BLOCKS
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.stats import median, robust_sigma
@@ -32,7 +33,6 @@ from hand_eye_calib.stats import median, robust_sigma
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
 _STEP_S, TOLERANCE = 0.05, 0.3
-_BLOCKS = 10
 
 # Geman-McClure: residuals of about this many standard deviations have half the weight.
 _TUNING, _ROUNDS = 3.0, 4
@@ -81,7 +81,7 @@ class Regression:
         self._weight = float(weights.sum())
         weighted = rows * weights[:, None, None]
         self._squares = flat.T @ weighted.reshape(flat.shape)
-        blocks, parts = [], (np.array_split(each, _BLOCKS) for each in (probes, weighted))
+        blocks, parts = [], (np.array_split(each, BLOCKS) for each in (probes, weighted))
         for probe, part in zip(*parts, strict=True):
             blocks.append(probe.reshape(-1, n_columns).T @ part.reshape(-1, n_columns))
         self._blocks = np.stack(blocks)
@@ -117,7 +117,7 @@ class Regression:
         left_out = np.concatenate([self._blocks, self._blocks[::2] + self._blocks[1::2]])
         tables = np.concatenate([total[None], total - left_out])
         solved = _solved(tables, [*before, *self._where[group]])[:, len(before) :]
-        _, *parts = np.split(solved, [1, 1 + _BLOCKS])
+        _, *parts = np.split(solved, [1, 1 + BLOCKS])
         variances = [(len(values) - 1) * values.var(axis=0) for values in parts]
         sigmas = np.sqrt(np.max(variances, axis=0))
         return Fitted(values=solved[0], sigmas=sigmas)
@@ -243,7 +243,7 @@ def delays(
     elapsed_s = (stamps_ns[inner[:, None] + step * around] - stamps_ns[inner, None]) * 1e-9
     follow[inner] = (np.abs(elapsed_s - h * around) < TOLERANCE * h).all(axis=1)
     motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
-    if len(motions) < _BLOCKS**2:
+    if len(motions) < BLOCKS**2:
         return None
     X, Ts_parent, Ts_child = T_parent_child, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X  # by the other stream

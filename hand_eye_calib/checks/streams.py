@@ -45,7 +45,7 @@ _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
 _FASTEST, _HARDEST = 340.0, 49.0
 
 # Velocities are over so long (s), so that noise adds little. A tenth of them may be of jumps.
-_STEP_S, _USUAL = 1.0, 0.9
+_STEP_S, USUAL = 1.0, 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +201,7 @@ def _jumps(trajectory: Trajectory) -> BoolArray:
         around = np.partition(shifted, 2, axis=0)[2]
         excess = np.linalg.norm(velocities - around, axis=1)
         speed = np.linalg.norm(velocities, axis=1)
-        of_motion = _JUMP_STEPS * quantile(speed, _USUAL)
+        of_motion = _JUMP_STEPS * quantile(speed, USUAL)
         jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), of_motion)
     return jumps
 
@@ -242,8 +242,8 @@ def check_lengths(parent: Trajectory) -> list[Finding]:
     intervals_s = np.diff(parent.stamps_ns)[:, None] * 1e-9
     velocities = np.diff(parent.poses[:, :3, 3], axis=0) / intervals_s
     changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
-    speed = quantile(np.linalg.norm(velocities, axis=1), _USUAL)
-    change = quantile(np.linalg.norm(changes, axis=1), _USUAL)
+    speed = quantile(np.linalg.norm(velocities, axis=1), USUAL)
+    change = quantile(np.linalg.norm(changes, axis=1), USUAL)
     if speed < _FASTEST and change < _HARDEST:
         return []
     options: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
