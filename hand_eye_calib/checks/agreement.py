@@ -309,12 +309,12 @@ def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory
     """
     limit_rad = min(_AGREE[0], min(map(_roughness, (parent, child))) / _AGREE[1])
     # Programs interpolate at the stamps of the new stream.
-    on_one_clock = (aligned, parent), (parent, aligned)
-    for residual_rad in starmap(_disagreement, ((child, parent), (parent, child), *on_one_clock)):
+    pairs = (child, parent), (parent, child), (aligned, parent), (parent, aligned)
+    for residual_rad in starmap(_disagreement, pairs):
         if residual_rad < limit_rad:
             return [finding("not_independent", residual_rad=residual_rad)]
     # Circumstantial: sensors on one body may shake together.
-    if (shared := max(starmap(_shared_noise, on_one_clock))) > 1.0:
+    if (shared := max(starmap(_shared_noise, pairs))) > 1.0:
         return [finding("not_independent", "both", Severity.WARNING, shared=shared)]
     return []
 
