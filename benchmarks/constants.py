@@ -1,4 +1,4 @@
-"""``python benchmarks/constants.py --data-folder DATA``: what every constant of the adaptive search
+"""``python -m benchmarks.constants --data-folder DATA``: what every constant of the adaptive search
 does, halved and doubled, on random platforms that are drawn anew, by poses and by positions alone,
 and on short real recordings. ``constants.csv`` is of seed 45343421.
 """
