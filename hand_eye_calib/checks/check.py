@@ -129,7 +129,7 @@ def check_streams(
     sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
-        findings += _check_agreeing(right, streams, fit, known, time_offset_s + offset.seconds)
+        findings += _check_agreeing(right, given, fit, known, time_offset_s + offset.seconds)
     return CheckResult(gravest_first(findings), explanation.fit, offset)
 
 
