@@ -61,7 +61,7 @@ def free_domain():
             try:
                 probe.bind(("", 7410 + 250 * domain))
                 # Held for a while: the tests may run in two interpreters at once.
-                _held[candidate % 50] = socket.create_server(("", 7410 + 250 * domain))
+                _held[candidate % 10] = socket.create_server(("", 7410 + 250 * domain))
             except OSError:
                 continue
         return domain
