@@ -169,9 +169,10 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
         If the text has another form, an unknown unit or a standard deviation of 0.
     """
     value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
-    axes, form = [name.removeprefix("prior.")], "VALUE+/-SIGMA, with its standard deviation"
-    (known,) = quantities(name, axes, value.split(), form)
-    return known, quantities(name, axes, sigma.split(), form, 0.0)[0]
+    units = [AXIS_UNITS[name.removeprefix("prior.")]]
+    form = "VALUE+/-SIGMA, with its standard deviation"
+    (known,) = quantities(name, units, value.split(), form)
+    return known, quantities(name, units, sigma.split(), form, 0.0)[0]
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:
@@ -183,7 +184,7 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
     ConfigError
         If the text has another form.
     """
-    return tuple(quantities(name, [*AXIS_UNITS], text.split(), "X Y Z ROLL PITCH YAW"))
+    return tuple(quantities(name, [*AXIS_UNITS.values()], text.split(), "X Y Z ROLL PITCH YAW"))
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
@@ -203,26 +204,24 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
                 f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
                 f"yaw=0.5deg; got {shown_value(word)}"
             )
-        (targets[axis],) = quantities(f"{name}: {axis}", [axis], [value], "TARGET", 0.0)
+        (targets[axis],) = quantities(f"{name}: {axis}", [AXIS_UNITS[axis]], [value], "TARGET", 0.0)
         if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
             raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
     return targets
 
 
 def quantities(
-    name: str, axes: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
+    name: str, units: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
 ) -> list[float]:
-    """Numbers of axes, in m or rad, from words with or without units; ``form`` is how the option
-    ``name`` is written.
-    """
-    if len(words) != len(axes):
+    """Numbers in ``units``, m or rad, from words that may name others; ``form`` is in messages."""
+    if len(words) != len(units):
         raise ConfigError(f"{name} must be {form}; got {shown_value(' '.join(words))}")
     found = []
-    for axis, word in zip(axes, words, strict=True):
-        unit, match = AXIS_UNITS[axis], _QUANTITY.fullmatch(word)
+    for unit, word in zip(units, words, strict=True):
+        match = _QUANTITY.fullmatch(word)
         if not match or (match[2] or unit) not in _IN_SI[unit]:
-            units = " or ".join(_IN_SI[unit])
-            raise ConfigError(f"{name} must be numbers in {units}; got {shown_value(word)}")
+            known = " or ".join(_IN_SI[unit])
+            raise ConfigError(f"{name} must be numbers in {known}; got {shown_value(word)}")
         value = float(match[1]) * _IN_SI[unit][match[2] or unit]
         if abs(value) > _LARGEST:
             raise ConfigError(f"{name} must be at most {_LARGEST:g} {unit}; got {word[:20]!r}")

@@ -253,8 +253,8 @@ def _value(field: OptionField, value: Any) -> Any:
     """The value of an option, from text or as YAML has it; lengths and angles may name a unit."""
     kind, unit = type(field.default), field.metadata["unit"]
     if isinstance(value, str) and kind in (int, float):
-        if axis := {"m": "x", "rad": "roll"}.get(unit):
-            return check_value(field, *quantities(option_name(field), [axis], [value], ""))
+        if unit in ("m", "rad"):
+            return check_value(field, *quantities(option_name(field), [unit], [value], ""))
         with suppress(ValueError):  # check_value says what it should be
             value = kind(value)
     return check_value(field, value)
@@ -278,7 +278,8 @@ def _read_config(path: Path) -> Options:
 
     document = read_yaml(path)
     if not isinstance(document, dict | None):
-        raise ConfigError(f"{path}: expected options and values; found {type(document).__name__}")
+        found = type(document).__name__
+        raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
     options, ignored, of_others = {}, [], []
     for name, value in _flat(document or {}):
         node, is_of_ros, option = name.rpartition(f"{_OF_ROS}.")

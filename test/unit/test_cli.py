@@ -392,7 +392,7 @@ def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
     [
         ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean method\?; known"),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
-        ("[1, 2]", r"config\.yaml: expected options and values; found list"),
+        ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
         ("/slam: {ros__parameters: {a: 1}}", "named calibrator; found some for /slam"),
         ("/calibrator: {ros__parameters: [1]}", "unknown option '/calibrator.ros__parameters'"),
         ("reference: B" + "9" * 3000, "reference"),

@@ -254,11 +254,10 @@ def test_exact_stops_are_solved_exactly(random, n):
     assert np.abs(off(fit.Ts_world_world[0], Z)).max() < 1e-7
 
 
-@pytest.mark.parametrize(
-    ("outliers", "size", "n"), [(0, 1, 20), (0.15, 1, 20), (0, 0.98, 20), (0, 1, 4)]
-)
-def test_covariance_is_that_of_the_errors(random, outliers, size, n):
-    squared = []
+# Shares of outliers, sizes of the target, stops.
+@pytest.mark.parametrize("given", [(0, 1, 20), (0.15, 1, 20), (0, 0.98, 20), (0, 1, 4)])
+def test_covariance_is_that_of_the_errors(random, given):
+    squared, (outliers, size, n) = [], given
     for _ in range(40):
         X, Z, stops = recorded(random, n, outliers=outliers)
         stops.Ts_world_child[:, :3, 3] *= size

@@ -116,7 +116,8 @@ def test_sentences_name_axes_values_and_targets(rule, sentence):
 def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(more):
     (reason,) = good(**CASES["floor"], observability=observed(x=0.04, **more)).reasons
     assert reason.rule == "target"
-    assert reason.what_to_do.startswith("record longer, with more " if more else "constant odo")
+    begins = "record longer, with more " if more else "constant odometry errors alone leave x"
+    assert reason.what_to_do.startswith(begins)
     assert ("the rotation about x 1.1 deg" in reason.sentence) == bool(more)
     assert "alone leave x 3 cm: set the target" in reason.what_to_do
 
