@@ -1,5 +1,6 @@
 """What every test may use."""
 
+import gc
 import signal
 
 import pytest
@@ -14,6 +15,11 @@ settings.load_profile("hand_eye_calib")
 # A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests
 # that send it would wait for ever.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_finish():
+    """What is imported stays: the collector need not walk through it again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,5 +1,6 @@
 """The node in a process of its own; the test's process is the other end of the middleware."""
 
+import gc
 import itertools
 import multiprocessing
 import multiprocessing.forkserver
@@ -17,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from motions import disturbed
 from nav_msgs.msg import Odometry
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -27,6 +28,7 @@ import hand_eye_calib
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import ns_of
+from hand_eye_calib.live import solving
 from hand_eye_calib.ros import conversions
 
 # Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
@@ -120,8 +122,21 @@ def stop_forks():
     multiprocessing.forkserver._forkserver._stop()
 
 
+def _solve():
+    """The solving process, forked from the node: nothing is imported again."""
+    gc.freeze()
+    gc.enable()
+    os.closerange(3, 65536)  # with them the pipe on which Popen waits for a program
+    sys.stdin = os.fdopen(0)
+    solving.main()
+
+
 def _run_node(arguments, log_file, environment, before):
     """The node's process, from the fork to its end."""
+    gc.freeze()
+    solving.start = lambda _, **pipes: subprocess.Popen(
+        ["false"], preexec_fn=_solve, process_group=0, **pipes
+    )
     with log_file.open("wb") as log:
         for stream in (1, 2):
             os.dup2(log.fileno(), stream)
@@ -134,31 +149,21 @@ def _run_node(arguments, log_file, environment, before):
     sys.exit(main(arguments))
 
 
-class _Forked:
-    """A forked node, in words of :class:`subprocess.Popen`."""
-
-    def __init__(self, *arguments):
-        self._process = _FORKS.Process(target=_run_node, args=arguments)
-        self._process.start()
-        self.pid = self._process.pid
-
-    @property
-    def returncode(self):
-        return self._process.exitcode
+class _Forked(_FORKS.Process):
+    """A forked node, in words of :class:`subprocess.Popen` too."""
 
     def poll(self):
-        return self._process.exitcode
+        return self.exitcode
+
+    returncode = property(poll)
 
     def wait(self, timeout=None):
-        self._process.join(timeout)
-        assert self.returncode is not None, f"process {self.pid} does not end"
-        return self.returncode
+        self.join(timeout)
+        assert self.exitcode is not None, f"process {self.pid} does not end"
+        return self.exitcode
 
     def send_signal(self, number):
         os.kill(self.pid, number)
-
-    def kill(self):
-        self._process.kill()
 
 
 class NodeProcess:
@@ -180,7 +185,9 @@ class NodeProcess:
         }
         log_file.touch()
         if not fresh:
-            self.process = _Forked(arguments, log_file, environment, before)
+            given = arguments, log_file, environment, before
+            self.process = _Forked(target=_run_node, args=given)
+            self.process.start()
             return
         with log_file.open("wb") as log:
             self.process = subprocess.Popen(
@@ -355,9 +362,6 @@ class Peer:
             SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])
         ).results
         return result
-
-    def parameter_names(self):
-        return set(self.call(ListParameters, "list_parameters").result.names)
 
     def parameter(self, name):
         (value,) = self.call(

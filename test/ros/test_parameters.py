@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+from rcl_interfaces.srv import ListParameters
 from ros_harness import RELIABLE_INPUTS, drive
 
 from hand_eye_calib.config import METHODS, CalibratorConfig, NodeConfig
@@ -23,7 +24,7 @@ def parameter_file(path, **parameters):
 
 def test_every_option_is_a_parameter_with_its_description(start_node, peer):
     start_node()
-    assert set(FIELDS) <= peer.parameter_names()
+    assert set(FIELDS) <= set(peer.call(ListParameters, "list_parameters").result.names)
     for name in ("threshold", "max_pairs", "method", "scale", "parent_frame"):
         meta = FIELDS[name].metadata
         descriptor = peer.describe(name)
