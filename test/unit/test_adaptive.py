@@ -79,13 +79,10 @@ def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=None):
     return increments.linearise(streams, course, T_parent_child, given)
 
 
-def streams_of(parent, child, interval_s=0.1):
-    return increments.Streams(np.arange(len(parent)) * interval_s, parent, child)
-
-
 def test_derivatives_are_the_numerical_ones():
-    parent = smooth_poses(np.arange(60) * 0.1)
-    streams = streams_of(parent, child_of(parent))
+    times_s = np.arange(60) * 0.1
+    parent = smooth_poses(times_s)
+    streams = increments.Streams(times_s, parent, child_of(parent))
     jacobian = linearised(streams).columns[3:-3, :, :-1]
     step = 1e-6
     for column in range(6 + increments.N_SYSTEMATIC):

@@ -41,12 +41,9 @@ def blocks(name):
             found += [("python", block)] if "import hand_eye_calib" in text else []
         else:
             lines = block.replace("\\\n", " ").splitlines()
-            found += [("command", line) for line in lines if is_run_here(line)]
+            ours = (line for line in lines if line.startswith("hand_eye_calib "))
+            found += [("command", line) for line in ours if not ELSEWHERE.search(line)]
     return found
-
-
-def is_run_here(line):
-    return line.startswith("hand_eye_calib ") and not ELSEWHERE.search(line)
 
 
 @pytest.fixture(scope="module")

@@ -214,7 +214,7 @@ def calibrate(run, tmp_path):
     return lambda: run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0]
 
 
-def test_links_are_replaced_and_not_followed(calibrate, tmp_path):
+def test_links_are_replaced_and_not_followed(calibrate, tmp_path, no_figures):
     names = ("extrinsic.yaml", "extrinsic.urdf.xacro", "static_transform.launch.py", "report.html")
     for name in names:
         (tmp_path / f"mine_{name}").write_text("mine")

@@ -34,7 +34,7 @@ def shifted(pairs, from_s, axis, size):
     return PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child)
 
 
-def fed(pairs, covariance=EXACT, T=X, chunk=37):
+def fed(pairs, covariance=EXACT, T=X, chunk=370):
     monitor = MountMonitor(T, covariance)
     alarms = [monitor.add(pairs[first : first + chunk]) for first in range(0, len(pairs), chunk)]
     return monitor, [alarm for alarm in alarms if alarm is not None]

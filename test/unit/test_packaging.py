@@ -209,35 +209,23 @@ def assert_data_files(prefix):
         assert {path.name for path in (share / folder).iterdir() if path.is_file()} == expected
 
 
-@pytest.fixture(scope="module")
-def install_space(source, tmp_path_factory):
-    """The install folder of a real colcon build."""
-    workspace = tmp_path_factory.mktemp("workspace")
-    colcon = [sys.executable, "-m", "colcon", "--log-base", workspace / "log", "build"]
+def test_colcon_lays_out_an_install_space_whose_commands_run(source, tmp_path):
+    colcon = [sys.executable, "-m", "colcon", "--log-base", tmp_path / "log", "build"]
     options = ["--base-paths", source, "--packages-select", PACKAGE]
     options += ["--event-handlers", "console_direct+"]
-    run([*colcon, *options], env=clean_environment(), cwd=workspace)
-    return workspace / "install"
-
-
-def test_colcon_lays_out_the_install_space(install_space):
-    prefix = install_space / PACKAGE
+    run([*colcon, *options], env=clean_environment(), cwd=tmp_path)
+    prefix = tmp_path / "install" / PACKAGE
+    folder = prefix / "lib" / PACKAGE
     assert_data_files(prefix)
-    executables = {path.name: path for path in (prefix / "lib" / PACKAGE).iterdir()}
+    executables = {path.name: path for path in folder.iterdir()}
     assert set(executables) == {PACKAGE, *COMMANDS}
     for path in executables.values():
         assert path.read_text(encoding="utf-8").splitlines()[0] == "#!/usr/bin/env python3"
-    program = f"source '{install_space}/setup.bash' && {sys.executable} -c '{WHERE}'"
-    where = run(["bash", "-c", program], env=clean_environment(), cwd=install_space)
-    package = Path(where.stdout.strip()).resolve()
-    assert package.is_relative_to(prefix)
-
-
-def test_colcon_installed_commands_run(install_space):
-    folder = install_space / PACKAGE / "lib" / PACKAGE
     each = f"for each in {' '.join(COMMANDS)}; do '{folder}'/$each --help; done"
-    program = f"source '{install_space}/setup.bash' && {each} && '{folder}/{PACKAGE}' --version"
-    said = run(["bash", "-c", program], env=clean_environment(), cwd=install_space).stdout
+    program = f"source install/setup.bash && {sys.executable} -c '{WHERE}' && {each}"
+    program += f" && '{folder}/{PACKAGE}' --version"
+    said = run(["bash", "-c", program], env=clean_environment(), cwd=tmp_path).stdout
+    assert Path(said.splitlines()[0]).resolve().is_relative_to(prefix)
     for command in COMMANDS:
         assert f"usage: hand_eye_calib {command}" in said
     assert MANIFEST.findtext("version") in said

@@ -102,7 +102,7 @@ def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
     )
 
 
-def test_two_lidars_from_their_points(tmp_path, capsys):
+def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     rng = np.random.default_rng(11)
     count, body = 70, Body(7.0, rng)
     X, messages = se3.exp([0.6, -0.3, 0.2, 0.1, -0.2, 0.9]), []

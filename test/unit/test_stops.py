@@ -94,7 +94,7 @@ def test_samples_of_others(file, parent, position, within_m):
 
 
 class TestCommand:
-    def test_samples_are_the_only_path(self, random, tmp_path, capsys):
+    def test_samples_are_the_only_path(self, random, tmp_path, capsys, no_figures):
         robot, tracking, X, _ = arm(random)
         pairs = [[a.tolist(), b.tolist()] for a, b in zip(robot, tracking, strict=True)]
         (tmp_path / "samples.json").write_text(json.dumps(pairs))
