@@ -30,7 +30,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
-from hand_eye_calib.gls.normal import NormalEquations, answers_without
+from hand_eye_calib.gls.normal import answers_without
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.results.records import AXES, ROTATIONS, DofObservability, DofVerdict
 from hand_eye_calib.solvers.all_pairs import Solution
@@ -97,7 +97,7 @@ def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) 
 
 def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
     """Covariance and observability of an answer of the adaptive estimator for these poses."""
-    covariance = _widened(solution.cov_parent_child_in_child, solution, slice(0, 6))
+    covariance = widened_by_blocks(solution.cov_parent_child_in_child, solution, slice(0, 6))
     hidden = noise_driven(
         pose_pairs.Ts_pw_p,
         solution.T_parent_child,
@@ -120,7 +120,8 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     """
     part, unseen = slice(3, 6), solution.unseen[3:]
     whole = np.zeros((6, 6))
-    whole[part, part] = _widened(solution.cov_parent_child_in_child[part, part], solution, part)
+    of_model = solution.cov_parent_child_in_child[part, part]
+    whole[part, part] = widened_by_blocks(of_model, solution, part)
     lone_axes = noise_driven(
         Ts_pw_p, solution.T_parent_child, solution.jumps, solution.rotation_variance
     )
@@ -135,7 +136,7 @@ def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatA
     a transform with no rotation, which is unknown. ``covariance`` (3, 3) is that of the model.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = _widened(covariance, solution, slice(0, 3))
+    whole[:3, :3] = widened_by_blocks(covariance, solution, slice(0, 3))
     # White rotation noise per axis: at most what differs from step to step about the two axes with
     # the smoothest rotation. Nothing else shows it where positions alone are measured: noise of the
     # orientation would look like a small motion that does not move the lever arm.
@@ -149,15 +150,25 @@ def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatA
     return combined(np.eye(4), whole, None, basis([*np.eye(6)[3:], *hidden]))
 
 
-def _widened(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
-    """The model's covariance of a part of xi, widened by blocks and halves."""
+def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
+    """The model's covariance of a part of xi, widened to the scatter of its blocks."""
     if len(solution.jumps) < BLOCKS * _FEWEST[1]:
         return covariance
-    steps = answers_without(solution.part_products, BLOCKS)[:, part]
-    spread = np.linalg.pinv(covariance, hermitian=True) @ _spread_of_blocks(steps)
-    # One factor for all directions: that of a single direction scatters too much.
-    covariance = max(float(np.trace(spread)) / len(covariance), 1.0) * covariance
-    return widened_by_halves(covariance, solution.part_products, solution.misfit, part)
+    spread = _spread_of_blocks(answers_without(solution.part_products, BLOCKS)[:, part])
+    # One factor for all directions: that of a single direction scatters too much. Rotations may
+    # have a larger one: slow errors of a sensor's rotation pass for those of a world, which
+    # motion averages.
+    factors = np.full(len(covariance), max(_excess(covariance, spread), 1.0))
+    turns = slice(3, None)
+    if len(covariance) > 3:
+        own = _excess(covariance[turns, turns], spread[turns, turns])
+        factors[turns] = np.maximum(factors[turns], own)
+    return covariance * np.sqrt(np.outer(factors, factors))
+
+
+def _excess(covariance: FloatArray, spread: FloatArray) -> float:
+    """How many times a covariance answers spread, on average over the directions."""
+    return float(np.trace(np.linalg.pinv(covariance, hermitian=True) @ spread)) / len(covariance)
 
 
 def noise_driven(
@@ -298,29 +309,6 @@ def _spread_of_blocks(deviations: FloatArray) -> FloatArray:
     """
     n_blocks, centred = len(deviations), deviations - deviations.mean(axis=0)
     return (n_blocks - 1) / n_blocks * centred.T @ centred
-
-
-def widened_by_halves(
-    model: FloatArray, products: FloatArray, misfit: float, part: slice = slice(0, 6)
-) -> FloatArray:
-    """The model's covariance (6, 6), or that of a part of xi, widened along the direction in which
-    both halves of the recording disagree by more than chance.
-
-    ``products`` (K, p + 1, p + 1) are what each part of the recording adds
-    (``Posterior.part_products``); ``misfit`` is a factor of the covariances of the halves.
-    """
-    half = len(products) // 2
-    halves = NormalEquations(np.array([products[:half].sum(axis=0), products[half:].sum(axis=0)]))
-    if not halves.is_complete.all():
-        return model
-    difference = (halves.step[0] - halves.step[1])[part]
-    joint = misfit * halves.covariance.sum(axis=0)[part, part]
-    away = np.linalg.solve(joint, difference)
-    excess = float(difference @ away) / CHI2[0.1][len(model)]
-    if excess <= 1.0:
-        return model
-    error = model @ away
-    return model + (excess - 1.0) / float(error @ away) * np.outer(error, error)
 
 
 def judged(axis: str, sigma: float) -> DofObservability:

@@ -1,6 +1,7 @@
 """Covariances, verdicts of axes, the floor, and which answer ``method: auto`` takes."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import motions
 import numpy as np
@@ -176,27 +177,28 @@ class TestFloor:
         )
 
 
-class TestHalves:
-    """Two halves of equal information, sigma of each 1, so that of the whole is sqrt(1/2)."""
+class TestBlocks:
+    """Twenty parts of equal information, sigma of each 1."""
 
-    whole = 0.5 * np.eye(6)
+    def variances(self, scatter):
+        """Over those of the model, where answers of parts scatter so many times too much."""
+        found = np.tile(np.eye(7), (20, 1, 1))
+        found[:, 6, :6] = np.random.default_rng(4).standard_normal((20, 6)) * scatter
+        found[:, :6, 6] = found[:, 6, :6]
+        given = np.eye(6) / 20, SimpleNamespace(jumps=np.zeros(100), part_products=found)
+        return 20 * np.diag(uncertainty.widened_by_blocks(*given, slice(0, 6)))
 
-    def products(self, apart):
-        found = np.zeros((2, 7, 7))
-        for products, sign in zip(found, (1, -1), strict=True):
-            products[:6, :6] = np.eye(6)
-            # The residuals at zero of a half whose answer is sign * apart / 2 along x.
-            products[0, 6] = products[6, 0] = -sign * apart / 2
-        return found
+    def test_all_directions_have_one_factor(self):
+        # (16 + 1) / 2 is expected, of nine degrees of freedom.
+        np.testing.assert_allclose(self.variances([4, 4, 4, 1, 1, 1]), 7.76, rtol=1e-3)
 
-    def test_the_direction_of_their_difference_is_widened(self):
-        wide = uncertainty.widened_by_halves(self.whole, self.products(9.0), misfit=1.0)
-        assert wide[0, 0] / 0.5 == pytest.approx(9.0**2 / 2 / 10.64)
-        np.testing.assert_allclose(wide[1:, 1:], self.whole[1:, 1:])
+    def test_rotations_have_a_larger_one_if_they_scatter_more(self):
+        of_translation, of_rotation = self.variances([1, 1, 1, 4, 4, 4]).reshape(2, 3)
+        np.testing.assert_allclose([*np.ptp([of_translation, of_rotation], axis=1)], 0.0, atol=1e-9)
+        assert 5.0 < of_translation[0] < of_rotation[0] / 1.5
 
-    def test_the_misfit_belongs_to_their_covariance(self):
-        kept = uncertainty.widened_by_halves(self.whole, self.products(9.0), misfit=5.0)
-        np.testing.assert_array_equal(kept, self.whole)
+    def test_parts_that_agree_leave_the_model(self):
+        np.testing.assert_allclose(self.variances(np.full(6, 0.3)), 1.0)
 
 
 # ---- the choice of a reference
