@@ -2,6 +2,7 @@
 
 import gc
 import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from hypothesis import settings
@@ -46,6 +47,12 @@ def run(capsys):
         return code, *capsys.readouterr()
 
     return call
+
+
+@pytest.fixture
+def no_processes(monkeypatch):
+    """Several recordings are calibrated in threads: each process would import for a second."""
+    monkeypatch.setattr("hand_eye_calib.cli.batch.work._processes", ThreadPoolExecutor)
 
 
 @pytest.fixture

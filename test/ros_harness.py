@@ -1,6 +1,7 @@
 """The node in a process of its own; the test's process is the other end of the middleware."""
 
 import gc
+import inspect
 import itertools
 import multiprocessing
 import multiprocessing.forkserver
@@ -110,11 +111,15 @@ def matrix(transform):
     return se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
 
 
-# Importing is most of what a start takes: nodes are forked from a process that has done so.
+# Importing is most of what a start takes: nodes are forked from a process that has done so. It has
+# looked for the file of each module, too, as rclpy does with the first line of a log.
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
-    ["pytest", "hand_eye_calib.cli.main", "hand_eye_calib.ros.calibrator_node", "ros_harness"]
+    ["pytest", "ros_harness", "hand_eye_calib.cli.calibrator", "hand_eye_calib.ros.node"]
+    + ["hand_eye_calib.ros.calibrator_node", "rosidl_generator_py"]
+    + ["type_description_interfaces.msg"]
 )
+inspect.getmodule(inspect.currentframe())
 
 
 def stop_forks():

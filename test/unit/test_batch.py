@@ -226,6 +226,7 @@ def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
 # ---- rows
 
 
+@pytest.mark.usefixtures("no_processes")
 def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path, monkeypatch):
     more = ("--vehicle", "truck", "--no-report", "--jobs", "1")
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1

@@ -62,17 +62,14 @@ def test_the_engine_and_the_function_agree_to_the_last_bit():
 
 def test_adaptive_describes_the_noise():
     parent, child = drive()
-    result = calibrate(parent, disturb(child), method="adaptive")
+    noisy = dataclasses.replace(child, poses=disturbed(child.poses, 1, 0.002, 0.002))
+    result = calibrate(parent, noisy, method="adaptive")
     np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.01)
     assert result.status is SolveStatus.OK
     assert result.noise.systematic == "none"
     assert result.noise.translation_white_m == pytest.approx(0.002, rel=0.3)
     assert result.to_dict()["noise"] == plain(result.noise)
     assert all(dof.sigma < 0.02 for dof in result.observability)
-
-
-def disturb(trajectory):
-    return dataclasses.replace(trajectory, poses=disturbed(trajectory.poses, 1, 0.002, 0.002))
 
 
 def test_adaptive_adds_the_lag_it_finds_to_a_time_offset_unless_that_was_set():

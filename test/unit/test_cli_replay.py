@@ -74,7 +74,7 @@ def test_what_was_set_in_a_session_counts_as_set_in_its_replay(tmp_path):
     assert config.given == {"time_offset", "reference"}
 
 
-def test_journals_are_recordings_of_their_own(run, bag, tmp_path):
+def test_journals_are_recordings_of_their_own(run, bag, tmp_path, no_processes):
     write_session(tmp_path / "live" / "journal", {"reference": "B5"})
     code, out, err = run(tmp_path / "live", bag, "--reference", "B5", "--json", "--jobs", "1")
     assert "is a session of its own; they give one result" in err
@@ -148,6 +148,7 @@ def test_parts_that_continue_each_other_are_one_recording_in_any_order(run, bag,
     ("later_s", "reason"),
     [(0.03, "both are of the same 9.9 s"), (3600, "there is a pause of 3590 s between them")],
 )
+@pytest.mark.usefixtures("no_processes")
 def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, reason):
     paths = parts_of(tmp_path, 2 * [slice(0, 100)], later_s)
     code, out, err = run(*paths[::-1], *STREAMS, "--json", "--jobs", "1")

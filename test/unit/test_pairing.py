@@ -14,10 +14,6 @@ from hand_eye_calib.pairing.motion_pairs import (
 )
 
 
-def as_lists(pairs):
-    return list(zip(*(indices.tolist() for indices in pairs), strict=True))
-
-
 @pytest.mark.parametrize(
     ("reference", "n_poses", "expected"),
     [
@@ -35,7 +31,8 @@ def as_lists(pairs):
     ],
 )
 def test_references_are_those_of_the_paper(reference, n_poses, expected):
-    assert as_lists(reference_indices(reference, n_poses)) == expected
+    pairs = (indices.tolist() for indices in reference_indices(reference, n_poses))
+    assert list(zip(*pairs, strict=True)) == expected
 
 
 @pytest.mark.parametrize(

@@ -25,11 +25,6 @@ def covariance_about_parent(rotation, sigmas_deg, sigmas_m=(0.01, 0.02, 0.03)):
     return to_child @ np.diag(np.square(np.r_[sigmas_m, np.radians(sigmas_deg)])) @ to_child.T
 
 
-def samples_of(T, covariance):
-    xi = np.random.default_rng(3).multivariate_normal(np.zeros(6), covariance, SAMPLES)
-    return T @ se3.exp(xi)
-
-
 @pytest.mark.parametrize(
     "rotation",
     [LIDAR_CAMERA, se3.rotation_from_rpy([0.4, -0.9, 2.5]), se3.rotation_from_rpy([2.0, 0.9, 0.0])],
@@ -39,7 +34,8 @@ def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
     T = transform(rotation, (3.0, -2.0, 1.0))
     covariance = covariance_about_parent(rotation, (0.57, 0.028, 0.2))
     assert np.isfinite(sigmas_rpy(T, covariance)).all()
-    drawn = samples_of(T, covariance)
+    xi = np.random.default_rng(3).multivariate_normal(np.zeros(6), covariance, SAMPLES)
+    drawn = T @ se3.exp(xi)
     inverse = se3.inverse(T), se3.inverse(drawn), inverse_covariance(T, covariance)
     for of, samples, stated in ((T, drawn, covariance), inverse):
         along = samples[:, :3, 3].std(axis=0)
