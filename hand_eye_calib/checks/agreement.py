@@ -13,6 +13,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
+from hand_eye_calib.checks.hypotheses import MIN_PAIRS, StreamPair
 from hand_eye_calib.checks.response import Fitted, Regression, delays, response
 from hand_eye_calib.checks.streams import USUAL
 from hand_eye_calib.geometry import se3
@@ -65,10 +66,9 @@ _SHORT_S, _MOST_SHORT = 1.0, 6000
 _DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
 
-# Orientations are copies if they agree to this angle (rad), several times better than any two
-# sensors of the recordings at hand, and so many times better than each stream is rough: slow motion
-# is smooth, and a slow stream of fast motion is rough without noise.
-_AGREE = np.radians(0.008), 50.0
+# Orientations agree better than those of two sensors (in all recordings, 1.3 times) to this angle
+# (rad) and share of the turning, and as copies do to a hundredth of it: rounding to five digits.
+_ALIKE = np.radians(0.08), 0.005
 
 # Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
 # upper half of their spectra both have so many times more than what remains, in positions or
@@ -293,37 +293,42 @@ def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Susp
                 yield fast.share(*groups), graded("smoothed", stream, shift_m, **values)
 
 
-def check_independent(parent: Trajectory, child: Trajectory, aligned: Trajectory) -> list[Finding]:
+def check_independent(given: StreamPair, aligned: StreamPair) -> list[Finding]:
     """Find out whether one of two streams was computed from the other.
 
     Two sensors differ by their noise, whatever the extrinsic is. Poses that were computed from
-    others agree with them to the rounding of their numbers, on the transform that was used.
+    others agree with them to the rounding of their numbers, on the transform that was used; with
+    noise of their own, or where they follow the other's for a while, better than two sensors do.
     Orientations alone show it: they follow from the other stream's if the poses do.
 
     Parameters
     ----------
-    parent, child : Trajectory
-        With their stamps as they are.
-    aligned : Trajectory
-        The child on the parent's clock.
+    given, aligned : StreamPair
+        Sound streams with their stamps as they are, and on one clock.
     """
-    limit_rad = min(_AGREE[0], min(map(_roughness, (parent, child))) / _AGREE[1])
     # Programs interpolate at the stamps of the new stream.
-    pairs = (child, parent), (parent, child), (aligned, parent), (parent, aligned)
-    for residual_rad in starmap(_disagreement, pairs):
-        if residual_rad < limit_rad:
-            return [finding("not_independent", residual_rad=residual_rad)]
-    # Circumstantial: sensors on one body may shake together.
-    if (shared := max(starmap(_shared_noise, pairs))) > 1.0:
-        return [finding("not_independent", "both", Severity.WARNING, shared=shared)]
-    return []
+    pairs = [(each.child, each.parent) for each in (given, aligned)]
+    pairs += [both[::-1] for both in pairs]
+    for left_rad in map(_left, starmap(_nearest, pairs)):
+        if left_rad < 0.01 * _ALIKE[0]:
+            return [finding("not_independent", are="are not independent", residual_rad=left_rad)]
+    # Circumstantial: sensors may be precise, or shake together.
+    motions = [pairs_over(aligned.synchronised, s, _MOST_SHORT) for s in (0.0, _SHORT_S)]
+    more = max(_ALIKE[0] / min(map(_left, motions)), *starmap(_shared_noise, pairs))
+    more_than_usual = f"have {more:.1f} times as much in common as two sensors may have"
+    doubt = finding("not_independent", "both", Severity.WARNING, are=more_than_usual, more=more)
+    return [doubt] if more > 1.0 else []
 
 
-def _roughness(trajectory: Trajectory) -> float:
-    """Third difference of the orientations, rad."""
-    rotations = trajectory.poses[:, :3, :3]
-    steps = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
-    return quantile(np.linalg.norm(np.diff(steps, n=2, axis=0), axis=1), USUAL)
+def _left(motions: MotionPairs) -> float:
+    """Angle (rad) that remains between the rotations of both; infinite unless a small share."""
+    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
+    motions, angles = motions[angles < _MAX_ROTATION], angles[angles < _MAX_ROTATION]
+    if len(motions) < MIN_PAIRS:
+        return np.inf
+    X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
+    left_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
+    return left_rad if left_rad < _ALIKE[1] * quantile(angles, USUAL) else np.inf
 
 
 def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
@@ -357,22 +362,13 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
     return float(is_noise * found.max())
 
 
-def _disagreement(slow: Trajectory, fast: Trajectory) -> float:
-    """Angle (rad) that remains between the rotations of two streams, one of them interpolated
-    along a straight line at stamps of the other; infinite if they have too few in common.
-    """
+def _nearest(slow: Trajectory, fast: Trajectory) -> MotionPairs:
+    """Motions between stamps of one stream at which the other, interpolated, is nearest."""
     slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
-    if len(slow) < 4:
-        return np.inf
     after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns), 1, len(fast) - 1)
     around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns).min(axis=0)
-    n_nearest = min(max(_NEAREST[0], len(slow) // 100), len(slow))
-    slow = slow[around <= np.partition(around, n_nearest - 1)[n_nearest - 1]]
-    slow = slow[:: -(-len(slow) // _NEAREST[1])]
+    nearest = np.sort(around)[: max(_NEAREST[0], len(slow) // 100)]
+    slow = slow[around <= nearest.max(initial=0)]
+    slow = slow[:: max(-(-len(slow) // _NEAREST[1]), 1)]
     between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
-    pairs = pairs_between(between, slow.poses, start, start + 1)
-    pairs = pairs[se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3]) < _MAX_ROTATION]
-    if len(pairs) < 3:
-        return np.inf
-    X = se3.from_rotation_translation(align_rotation_vectors(pairs), np.zeros(3))
-    return quantile(np.linalg.norm(pairs.residuals(X)[1], axis=1), USUAL)
+    return pairs_between(between, slow.poses, start, start + 1)

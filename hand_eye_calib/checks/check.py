@@ -240,7 +240,7 @@ def _check_agreeing(
     """
     of_fit = fit.T_parent_child, fit.sigmas[:6]
     best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-    if copied := agreement.check_independent(given.parent, given.child, right.child):
+    if copied := agreement.check_independent(given, right):
         return [*copied, *agreement.check_same(*best)]
     pose_pairs = right.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)

@@ -91,8 +91,8 @@ _ROWS = {
     ),
     "too_short": _Row("{text}", "record longer"),
     "not_independent": _Row(
-        "The two streams are not independent: one seems to be computed from the other. This result "
-        "only repeats the transform that was used for it.",
+        "The two streams {are}: one seems to be computed from the other. This result only repeats "
+        "the transform that was used for it.",
         "give the poses that each sensor measured by itself",
     ),
     "rate_unit": _Row(

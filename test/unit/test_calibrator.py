@@ -284,7 +284,7 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
 def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
     poses = wandering_poses(400)
     parked = np.concatenate([poses, np.repeat(poses[-1:], 200, axis=0)])
-    parent, child = noisy_pair(parked, 0, 1e-4, 1e-4)
+    parent, child = noisy_pair(parked, 0, 1e-4, 5e-4)
     sound = play(by_stamp(parent, child), max_pairs=max_pairs).snapshot()
     assert check(sound).findings == ()
     assert len(sound.parent) < 150 < 250 < len(sound.streams[0])

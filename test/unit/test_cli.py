@@ -42,7 +42,7 @@ PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"
 TOPICS = ["--parent-topic", PARENT_TOPIC, "--child-topic", CHILD_TOPIC]
 START_NS = 1_700_000_000_000_000_000
 TRUTH = se3.exp(np.array([0.4, -0.1, 0.25, 0.3, -0.2, 1.1]))
-NOISE = 5e-5, 5e-5  # m, rad
+NOISE = 5e-5, 7e-4  # m, rad
 OTHER_WORLD = se3.exp(np.array([5.0, -3.0, 1.0, 0.1, 0.4, -2.0]))
 
 

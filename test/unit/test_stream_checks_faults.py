@@ -136,7 +136,7 @@ class TestOneStreamComputedFromTheOther:
         poses[:, :3, :3] = se3.nearest_rotation(poses[:, :3, :3])
         slow = error_m * np.sin(np.outer(np.arange(len(poses)) / 40, [1, 0, 0, 0, 0.2, 0]))
         own = disturbed(child_of(poses) @ se3.exp(slow), 1, *(width < 1) * np.array([1e-4, 3e-5]))
-        assert self.SENTENCE in self.found(Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own))
+        assert "common" in self.found(Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own))[0]
 
     def test_orientations_alone(self):
         parent, child = _streams(drive())
@@ -146,8 +146,7 @@ class TestOneStreamComputedFromTheOther:
         poses = child.at(inner.stamps_ns)
         wrong = se3.from_rotation_translation(se3.rotation_exp([0.2, -0.1, 0.3]), np.zeros(3))
         poses[:, :3, :3] = (world @ inner.poses @ X @ wrong)[:, :3, :3]
-        child = Trajectory(inner.stamps_ns, poses)
-        assert check_streams(parent, child).findings[0].what == self.SENTENCE
+        assert self.found(parent, Trajectory(inner.stamps_ns, poses))[0] == self.SENTENCE
 
     def test_never_use(self):
         parent = drive().parent
@@ -156,11 +155,12 @@ class TestOneStreamComputedFromTheOther:
         assert result.reasons[0].sentence == self.SENTENCE
 
     @pytest.mark.parametrize("rate_hz", [1.0, 10.0, 100.0])
-    @pytest.mark.parametrize("noise", [2e-4, 2e-3])
-    def test_two_precise_sensors_are_independent(self, rate_hz, noise):
+    @pytest.mark.parametrize("noise", [2e-5, 2e-4, 5e-4, 2e-3])
+    def test_two_precise_sensors_are_no_copies(self, rate_hz, noise):
         poses = wandering_poses(600, 4, 1.0 / rate_hz, 0.8 / rate_hz)
         found = check_streams(*noisy_pair(poses, 1, noise, noise, rate_hz=rate_hz)).findings
-        assert "not_independent" not in [each.code for each in found]
+        doubts = {each.severity for each in found if each.code == "not_independent"}
+        assert doubts == ({Severity.WARNING} if noise < 3e-4 else set())
 
 
 SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]
