@@ -71,7 +71,7 @@ def free_domain():
     raise RuntimeError("no free ROS domain")
 
 
-def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
+def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS, sigma_rad=5e-5):
     """Stamps and poses of both sensors on a rig that turns about all axes. Without noise they would
     be one stream computed from the other.
     """
@@ -80,7 +80,7 @@ def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS):
     places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
-    Ts_cw_c = disturbed(T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD, 1, 5e-5, 5e-5)
+    Ts_cw_c = disturbed(T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD, 1, 5e-5, sigma_rad)
     return start_ns + period_ns * np.arange(n_poses), Ts_pw_p, Ts_cw_c
 
 

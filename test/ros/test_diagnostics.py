@@ -176,7 +176,7 @@ class TestStreamChecks:
         self, start_node, peer, state, damage, said
     ):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
-        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
+        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250, sigma_rad=7e-4)
         child = damage(Trajectory(stamps_ns, Ts_cw_c)).poses
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, child)
 
@@ -196,7 +196,7 @@ class TestStreamChecks:
             "-p solve_period:=0.5", "-p scale:=0.002", f"-p output_directory:={tmp_path}",
             *RELIABLE_INPUTS,
         )  # fmt: skip
-        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250)
+        stamps_ns, Ts_pw_p, Ts_cw_c = drive(250, sigma_rad=7e-4)
         Ts_cw_c[:, :3, 3] *= 1000.0
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
         state(lambda each: each.checks.text.endswith(": set scale to 0.001"))
@@ -213,7 +213,7 @@ class TestStreamChecks:
     def test_sound_streams_raise_nothing(self, start_node, peer, state):
         # A solve of the first few poses may say what they do not determine.
         node = start_node("-p solve_period:=0.5", "-p min_pairs:=240", *RELIABLE_INPUTS)
-        peer.feed(peer.publishers(), *drive(250))
+        peer.feed(peer.publishers(), *drive(250, sigma_rad=7e-4))
         found = state(lambda each: each.checks.level is Level.OK)
         assert not [each for each in found.checks.findings if not each.startswith("note")]
         assert "[WARN]" not in node.log
