@@ -1,6 +1,7 @@
 """The package as text: what its files import."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 PACKAGE = "hand_eye_calib"
@@ -8,6 +9,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / PACKAGE
 
 
+@cache
 def imports_of(path, package_root):
     """Dotted names a file imports, inside functions too; relative ones resolved, import_module of a
     literal included.

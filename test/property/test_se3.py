@@ -65,16 +65,12 @@ def test_interpolation_runs_at_constant_twist(start_xi, step_xi, fraction):
     )
 
 
-def unit_quat(direction, angle):
-    direction = np.array(direction) / np.linalg.norm(direction)
-    return np.r_[np.sin(angle / 2) * direction, np.cos(angle / 2)]
-
-
 @given(DIRECTIONS, st.one_of(ANGLES, st.just(np.pi)))
 def test_conversions_agree_with_scipy(direction, angle):
     from scipy.spatial.transform import Rotation
 
-    quat = unit_quat(direction, angle)
+    along = np.array(direction) / np.linalg.norm(direction)
+    quat = np.r_[np.sin(angle / 2) * along, np.cos(angle / 2)]
     rotation = Rotation.from_quat(quat)
     np.testing.assert_allclose(
         se3.from_quat_xyzw(np.zeros(3), 3.0 * quat)[:3, :3],

@@ -1,5 +1,6 @@
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,11 +27,6 @@ VALUES = {
     "scale+time": np.array([0.03, 0.02]),
     "bias+time": np.array([0.0, -0.03, 0.0, 0.02]),
 }
-
-
-def parameters_of(names):
-    """Parameters of some systematic errors."""
-    return [index for name in names.split("+") for index in increments.PARAMETERS.get(name, ())]
 
 
 def stamps(n_poses):
@@ -226,14 +222,22 @@ def test_errors_are_as_large_as_stated():
     assert 6.0 - 3 * 0.7 < np.mean(found) < 6.0 + 3 * 0.7
 
 
+@cache
+def noisy_and_solved(nuisance, seed):
+    """Both streams with a systematic error and noise, and their solution."""
+    streams = systematic(wandering_poses(300, seed), nuisance, VALUES[nuisance])
+    noisy = with_noise(streams, seed)
+    return noisy, estimator.solve(stamps(300), *noisy)
+
+
 @pytest.mark.parametrize("nuisance", VALUES)
 def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
     chosen, parameters = [], []
+    of = [index for name in nuisance.split("+") for index in increments.PARAMETERS.get(name, ())]
     for seed in range(4):
-        streams = systematic(wandering_poses(300, seed), nuisance, VALUES[nuisance])
-        solution = estimator.solve(stamps(300), *with_noise(streams, seed))
+        _, solution = noisy_and_solved(nuisance, seed)
         chosen.append(solution.systematic)
-        parameters.append(solution.parameters[parameters_of(nuisance)])
+        parameters.append(solution.parameters[of])
     assert chosen.count(nuisance) >= 3
     np.testing.assert_allclose(np.median(parameters, axis=0), VALUES[nuisance], atol=3e-3)
 
@@ -241,12 +245,8 @@ def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
 def test_a_lag_is_not_taken_for_a_lever():
     errors = []
     for seed in range(4):
-        parent = wandering_poses(300, seed)
-        noisy = with_noise((parent, late(child_of(parent), 0.02)), seed)
-        answers = [
-            estimator.solve(stamps(300), *noisy, systematic=models)
-            for models in ((), increments.SYSTEMATIC)
-        ]
+        noisy, with_all = noisy_and_solved("time", seed)
+        answers = [estimator.solve(stamps(300), *noisy, systematic=()), with_all]
         assert answers[1].time_offset_s == pytest.approx(-0.02, abs=1e-3)
         said = " ".join(answers[1].describe(stamps(300)).in_words)
         assert re.search(r"the child's stamps are (19|20|21)\.\d \+/- 0\.\d+ ms late", said)
