@@ -309,12 +309,13 @@ def check_independent(given: StreamPair, aligned: StreamPair) -> list[Finding]:
     # Programs interpolate at the stamps of the new stream.
     pairs = [(each.child, each.parent) for each in (given, aligned)]
     pairs += [both[::-1] for both in pairs]
-    for left_rad in map(_left, starmap(_nearest, pairs)):
-        if left_rad < 0.01 * _ALIKE[0]:
-            return [finding("not_independent", are="are not independent", residual_rad=left_rad)]
+    left_rad = min(map(_left, starmap(_nearest, pairs)))
+    if left_rad < 0.01 * _ALIKE[0]:
+        return [finding("not_independent", are="are not independent", residual_rad=left_rad)]
     # Circumstantial: sensors may be precise, or shake together.
     motions = [pairs_over(aligned.synchronised, s, _MOST_SHORT) for s in (0.0, _SHORT_S)]
-    more = max(_ALIKE[0] / min(map(_left, motions)), *starmap(_shared_noise, pairs))
+    left_rad = min(left_rad, *map(_left, motions))
+    more = max(_ALIKE[0] / left_rad, *starmap(_shared_noise, pairs))
     more_than_usual = f"have {more:.1f} times as much in common as two sensors may have"
     doubt = finding("not_independent", "both", Severity.WARNING, are=more_than_usual, more=more)
     return [doubt] if more > 1.0 else []
