@@ -86,7 +86,7 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     watch.wait_for("NO NODE: Nothing heard of a calibrator yet")
     node = start_node(*QUICK, f"-p output_directory:={tmp_path / 'out'}")
     watch.wait_for("CHECK INPUT: No message on /parent_odom yet")
-    publishers, poses = peer.publishers(), drive(180, period_ns=300_000_000)
+    publishers, poses = peer.publishers(), drive(180, 300_000_000, sigma_rad=7e-4)
     parts = [[part[start:end] for part in poses] for start, end in ((0, 90), (90, 130), (130, 180))]
     peer.solve(publishers, *parts[0])  # 27 s of motion are not enough
     watch.wait_for("▶ GO ON: ")
