@@ -29,7 +29,6 @@ import hand_eye_calib
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import ns_of
-from hand_eye_calib.live import solving
 from hand_eye_calib.ros import conversions
 
 # Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
@@ -127,21 +126,9 @@ def stop_forks():
     multiprocessing.forkserver._forkserver._stop()
 
 
-def _solve():
-    """The solving process, forked from the node: nothing is imported again."""
-    gc.freeze()
-    gc.enable()
-    os.closerange(3, 65536)  # with them the pipe on which Popen waits for a program
-    sys.stdin = os.fdopen(0)
-    solving.main()
-
-
 def _run_node(arguments, log_file, environment, before):
     """The node's process, from the fork to its end."""
     gc.freeze()
-    solving.start = lambda _, **pipes: subprocess.Popen(
-        ["false"], preexec_fn=_solve, process_group=0, **pipes
-    )
     with log_file.open("wb") as log:
         for stream in (1, 2):
             os.dup2(log.fileno(), stream)
