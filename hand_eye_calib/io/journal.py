@@ -127,10 +127,10 @@ def read_journal(directory: str | Path) -> Journal:
     """Read the session that a directory holds; an InputError if there is none, or it cannot be
     read.
     """
-    if not has_session(directory):
-        raise InputError(f"no session journal in {directory}")
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
     found = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
+    if "parent" not in found:  # a node may just have renamed the directory
+        raise InputError(f"no session journal in {directory}")
     abouts, stamps_ns, values, sizes = zip(*found.values(), strict=True)
     rows = np.concatenate([np.reshape(each, (-1, 8)) for each in values])
     order = np.argsort(rows[:, 0], kind="stable")
