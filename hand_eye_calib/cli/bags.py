@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 from hand_eye_calib.cli.options import OPTION_FIELDS, STREAMS, note, waiting_for, with_progress
 from hand_eye_calib.cli.reading import Recording
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
+from hand_eye_calib.engine.calibrator import Calibrator, Calibrators
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import PoseTable
@@ -193,7 +193,7 @@ def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
         given = [name for name in names if name in session.get("given", ())]
         given += CalibratorConfig.from_options(options).given
         calibrator = Calibrator(dataclasses.replace(config, given=given))
-        give(journal, directory, {"child": calibrator})
+        give(journal, directory, Calibrators(child=calibrator))
     sources = {stream: journal.about.get(stream, {}).get("topic") or stream for stream in STREAMS}
     inputs = {"journal": str(directory), **calibrator.inputs(sources)}
     return Recording(calibrator.snapshot(), inputs, sorted(directory.glob("*.tum")))

@@ -5,6 +5,7 @@ files.
 """
 
 import contextlib
+import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,12 @@ from hand_eye_calib.engine import snapshot as snapshots
 from hand_eye_calib.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry.frames import check_pose
-from hand_eye_calib.geometry.trajectory import REACH, Trajectory
+from hand_eye_calib.geometry.trajectory import (
+    FARTHEST_M,
+    QUATERNION_NORM_TOLERANCE,
+    REACH,
+    Trajectory,
+)
 from hand_eye_calib.pairing.motion_pairs import PosePairs, slower_stream
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
@@ -240,7 +246,9 @@ class Calibrator:
         InputError
             If a value is not finite or the quaternion is not of unit length.
         """
-        check_pose(*position, *quat_xyzw)
+        is_unit = abs(math.hypot(*quat_xyzw) - 1.0) <= QUATERNION_NORM_TOLERANCE
+        if not (is_unit and math.hypot(*position) <= FARTHEST_M):
+            check_pose(*position, *quat_xyzw)  # says what is wrong, if anything is
         buffer, limits = self._buffers[stream], self._limits
         is_full = len(buffer) >= limits.capacity
         is_due = buffer.statistics.received % limits.batch_every == 0
@@ -331,3 +339,35 @@ class Calibrator:
         if len(self._kept_parts) > 1:
             self._kept_parts = [PosePairs.concatenate(*self._kept_parts)]
         return self._kept_parts[0]
+
+
+class Calibrators(dict[str, Calibrator]):
+    """Calibrators by child sensor: "child", and the names of further ones. All have the same parent
+    sensor.
+    """
+
+    def takers(self, stream: str) -> list[tuple[str, Calibrator]]:
+        """Who takes the poses of a stream, and as which: the parent's count for all children."""
+        if stream == "parent":
+            return [(stream, each) for each in self.values()]
+        return [("child", self[stream])] if stream in self else []
+
+    def statistics(self, stream: str) -> StreamStatistics:
+        """What was taken of a stream."""
+        own_stream, first = self.takers(stream)[0]
+        return first.statistics(own_stream)
+
+    def set_frame(self, stream: str, sensor_frame: str) -> None:
+        """Set the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
+        for own_stream, each in self.takers(stream):
+            each.set_frame(own_stream, sensor_frame)
+
+    def add_pose(
+        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
+    ) -> bool:
+        """Take a pose, or not; see :meth:`Calibrator.add_pose`."""
+        (own_stream, first), *others = self.takers(stream)
+        is_taken = first.add_pose(own_stream, stamp_ns, position, quat_xyzw)
+        for _, other in others if is_taken else ():
+            other.add_pose(own_stream, stamp_ns, position, quat_xyzw)
+        return is_taken

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -222,12 +221,11 @@ class SolveCycle:
     def _start(self) -> None:
         self.is_solving, now_s = True, time.monotonic()
         self._is_unchecked |= self._session.has_new_poses
-        self._session.has_new_poses = False
         self._in_flight = tuple(self._asked)
         # What somebody asks for is told together with what speaks against it.
         if check := self._must_check(now_s) or (self._is_unchecked and bool(self._in_flight)):
             self._is_unchecked, self._check_due_s = False, now_s + _CHECK_PERIOD_S
-        self._submitted = deepcopy(self._session.calibrator)
+        self._submitted = self._session.copy_to_solve()
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
 
     # ------------------------------------------------------------------ answers

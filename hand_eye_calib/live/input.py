@@ -193,7 +193,7 @@ class PoseInput:
 
     def resume(self) -> None:
         """Go on where a session on disk has ended."""
-        self._guard.resume(self._session.statistics(self.name).last_stamp_ns)
+        self._guard.resume(self._session.engines.statistics(self.name).last_stamp_ns)
 
     def measures_as(self, type_name: str) -> str:
         """What messages of a type (empty for transforms) are read as here.
@@ -252,11 +252,14 @@ class PoseInput:
                 pose = read()
                 # An empty name is the one before, too: parameters or a default name it.
                 if pose.sensor_frame not in (None, self._sensor_frame):
-                    self._session.set_frame(self.name, pose.sensor_frame)
+                    self._session.engines.set_frame(self.name, pose.sensor_frame)
                     self._sensor_frame = pose.sensor_frame
-                if not self._session.add_pose(self.name, stamp_ns, pose.position, pose.quat_xyzw):
+                fields = self.name, stamp_ns, pose.position, pose.quat_xyzw
+                if not self._session.engines.add_pose(*fields):
                     which = with_stamp(stamp_ns)
                     self._log.debug(f"{self.topic}: message {which} is repeated or too late")
+                elif self._session.journal is not None:
+                    self._session.journal.poses.append(fields)
             except HandEyeCalibError as error:
                 self.refuse(with_stamp(stamp_ns), "unusable", str(error))
         if judgement.taken and self._is_new:
@@ -279,7 +282,7 @@ class PoseInput:
             self._counts.append(now)
         rate_hz = arrived / seconds if seconds > 0 else 0.0
         level, text = self._judge(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
-        taken = self._session.statistics(self.name)
+        taken = self._session.engines.statistics(self.name)
         refused = {"repeated stamp": taken.refused_duplicate, "too late": taken.refused_late}
         return InputState(
             level=level,

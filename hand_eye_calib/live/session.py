@@ -1,11 +1,12 @@
 """The live session: its engines, its number, and its journal on disk."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import fields, replace
 from pathlib import Path
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, StreamStatistics
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, Calibrators
 from hand_eye_calib.engine.snapshot import STREAMS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, located
 from hand_eye_calib.io.geodetic import LocalOrigin
@@ -15,18 +16,8 @@ from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import GRACE_S, JournalState, Level
 from hand_eye_calib.plain import Document
 
-# The engines by the child sensor of each; all of them have the same parent.
-Engines = Mapping[str, Calibrator]
 
-
-def takers(stream: str, engines: Engines) -> list[tuple[str, Calibrator]]:
-    """Who takes a message of a stream, and as which: the parent's counts for all child sensors."""
-    if stream == "parent":
-        return [(stream, each) for each in engines.values()]
-    return [("child", engines[stream])] if stream in engines else []
-
-
-def give(journal: Journal, directory: Path, engines: Engines) -> None:
+def give(journal: Journal, directory: Path, engines: Calibrators) -> None:
     """Give engines the session of a directory.
 
     Raises
@@ -36,16 +27,16 @@ def give(journal: Journal, directory: Path, engines: Engines) -> None:
     """
     with located(f"cannot use the session journal {directory}"):
         for stream, about in journal.about.items():
-            for own_stream, engine in takers(stream, engines) if about.get("frame") else ():
-                engine.set_frame(own_stream, about["frame"])
+            if about.get("frame"):
+                engines.set_frame(stream, about["frame"])
         columns = (journal.streams, journal.stamps_ns, journal.poses)
         for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
-            for own_stream, engine in takers(stream, engines):
-                engine.add_pose(own_stream, stamp_ns, pose[:3], pose[3:])
+            if engines.takers(stream):
+                engines.add_pose(stream, stamp_ns, pose[:3], pose[3:])
 
 
 class LiveSession:
-    """Every pose that the engine takes is written to the journal as well, if there is one.
+    """The engines that take the poses, and the journal that keeps them on disk, if there is one.
 
     Parameters
     ----------
@@ -62,57 +53,43 @@ class LiveSession:
         Rises with every new session; a result of another number is out of date.
     topics : dict of str to str
         Where the poses of each stream come from, for the journal.
-    has_new_poses : bool
-        A solve would have something new to go by: poses or options.
+    journal : SessionJournal or None
+        Takes the poses that the engines have taken.
     """
 
     def __init__(self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()) -> None:
-        self.engines = {"child": Calibrator(config)}
+        self.engines = Calibrators(child=Calibrator(config))
         self.engines |= {name: Calibrator(_of_other(config)) for name in others}
         self.number = 0
         self.topics: dict[str, str] = {}
-        self.has_new_poses = False
-        self._is_solved = True
+        self._is_solved, self._n_solved = True, 0
         self._log = log
         self._measures: Document = {}
         self._origins: dict[str, LocalOrigin] = {}
-        self._journal: SessionJournal | None = None
+        self.journal: SessionJournal | None = None
 
     @property
     def calibrator(self) -> Calibrator:
         """The engine of parent and child."""
         return self.engines["child"]
 
-    def add_pose(
-        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
-    ) -> bool:
-        """Take a pose, or not; see :meth:`Calibrator.add_pose`."""
-        (own_stream, first), *others = takers(stream, self.engines)
-        if not first.add_pose(own_stream, stamp_ns, position, quat_xyzw):
-            return False
-        for _, other in others:
-            other.add_pose(own_stream, stamp_ns, position, quat_xyzw)
-        if self._journal is not None:
-            self._journal.poses.append((stream, stamp_ns, position, quat_xyzw))
-        self.has_new_poses |= self._is_solved and stream in STREAMS
-        return True
+    @property
+    def has_new_poses(self) -> bool:
+        """Whether a solve would have something new to go by: poses or options."""
+        return self._is_solved and self._n_poses() > self._n_solved
 
-    def statistics(self, stream: str) -> StreamStatistics:
-        """What the engine has taken of a stream."""
-        own_stream, engine = takers(stream, self.engines)[0]
-        return engine.statistics(own_stream)
+    def copy_to_solve(self) -> Calibrator:
+        """The engine as it is now; its poses are no longer new."""
+        self._n_solved = self._n_poses()
+        return deepcopy(self.calibrator)
 
     def watch_only(self, limits: BufferLimits | None) -> None:
         """Never solve, and keep few poses: somebody takes the pairs as they are made. With None,
         calibrate again.
         """
         self._is_solved = limits is None
-        self.engines = {"child": Calibrator(self.calibrator.config, limits or BufferLimits())}
-
-    def set_frame(self, stream: str, sensor_frame: str) -> None:
-        """Take the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
-        for own_stream, engine in takers(stream, self.engines):
-            engine.set_frame(own_stream, sensor_frame)
+        made = Calibrator(self.calibrator.config, limits or BufferLimits())
+        self.engines, self._n_solved = Calibrators(child=made), 0
 
     def set_measures(self, stream: str, measures: str) -> None:
         """Take what a stream measures, as its message type says, one of config.MEASURES.
@@ -141,16 +118,16 @@ class LiveSession:
             if name != "child":
                 engine.reconfigure(_of_other(config))
         self.calibrator.reconfigure(replace(config, **self._measures))
-        self.has_new_poses = self._n_poses() > 0 and self._is_solved
+        self._n_solved = 0
 
     def reset(self) -> None:
         """Forget everything and begin a new session; the journal of the old one is kept aside."""
         for engine in self.engines.values():
             engine.reset()
         self.number += 1
-        self.has_new_poses = False
-        if self._journal is not None:
-            self._journal.begin()
+        self._n_solved = 0
+        if self.journal is not None:
+            self.journal.begin()
 
     def _n_poses(self) -> int:
         return sum(self.calibrator.statistics(stream).received for stream in STREAMS)
@@ -175,22 +152,22 @@ class LiveSession:
         if options.output_directory and options.journal != "off" and not options.monitor:
             directory = output_path(options.output_directory).resolve() / "journal"
             resumed = self._resume(directory) if is_resuming else None
-            self._journal = SessionJournal(directory, self._about, self._log, resumed)
+            self.journal = SessionJournal(directory, self._about, self._log, resumed)
 
     def flush_journal(self) -> None:
         """Hand what came in to the disk; to be called often."""
-        if self._journal is not None:
-            self._journal.flush()
+        if self.journal is not None:
+            self.journal.flush()
 
     def stop_journal(self) -> None:
         """Write what is left, and leave the directory to others."""
-        if self._journal is not None:
-            self._journal.stop(GRACE_S)
-            self._journal = None
+        if self.journal is not None:
+            self.journal.stop(GRACE_S)
+            self.journal = None
 
     def journal_state(self, options: NodeConfig) -> JournalState:
         """Whether a crash would lose the session."""
-        journal, level, text = self._journal, Level.OK, "the session is being written"
+        journal, level, text = self.journal, Level.OK, "the session is being written"
         if journal is not None and journal.error:
             level = Level.ERROR
             text = f"cannot write the journal: {journal.error}; "
@@ -218,9 +195,7 @@ class LiveSession:
         for stream, about in journal.about.items():
             if "origin" in about:
                 self.origin(stream).geodetic = tuple(about["origin"])
-        poses = self._n_poses()
-        self.has_new_poses = poses > 0
-        self._log.info(f"session resumed from {directory}: {poses} poses")
+        self._log.info(f"session resumed from {directory}: {self._n_poses()} poses")
         return journal
 
     def _about(self) -> dict[str, Document]:
@@ -229,7 +204,7 @@ class LiveSession:
         of_all = {"options": config.to_options(), "given": sorted(config.given)}
         about: dict[str, Document] = {}
         for stream in ("parent", *self.engines):
-            own_stream, engine = takers(stream, self.engines)[0]
+            own_stream, engine = self.engines.takers(stream)[0]
             origin = self._origins.get(stream, LocalOrigin()).geodetic
             known = {"frame": engine.frame(own_stream), "origin": [*(origin or ())]}
             known = {name: each for name, each in known.items() if each}

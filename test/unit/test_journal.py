@@ -9,11 +9,11 @@ from motions import messages as messages_of
 
 import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
+from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, Calibrators
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
 from hand_eye_calib.live.journal import lock_directory
-from hand_eye_calib.live.session import give, takers
+from hand_eye_calib.live.session import give
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}
@@ -36,7 +36,7 @@ def record(writer, calibrator, sequence, flush_every=25):
 
 def resumed(directory, limits=None):
     calibrator, journal = Calibrator(CONFIG, limits), read_journal(directory)
-    give(journal, directory, {"child": calibrator})
+    give(journal, directory, Calibrators(child=calibrator))
     return calibrator, journal
 
 
@@ -166,15 +166,14 @@ def test_a_file_that_was_replaced_is_not_written_to(tmp_path):
 
 
 def test_further_child_sensors_are_resumed_too(tmp_path):
-    engines = {"child": Calibrator(CONFIG), "child2": Calibrator(CONFIG)}
+    engines = Calibrators(child=Calibrator(CONFIG), child2=Calibrator(CONFIG))
     writer = JournalWriter(tmp_path, BOTH | {"child2": {}})
     for stream, *pose in messages():
         for name in [stream, "child2"] if stream == "child" else [stream]:
             writer.add_pose(name, *pose)
-            for own_stream, each in takers(name, engines):
-                each.add_pose(own_stream, *pose)
+            engines.add_pose(name, *pose)
     writer.close()
-    again = {"child": Calibrator(CONFIG), "child2": Calibrator(CONFIG)}
+    again = Calibrators(child=Calibrator(CONFIG), child2=Calibrator(CONFIG))
     give(read_journal(tmp_path), tmp_path, again)
     assert again["child2"].statistics("child").received == 60
     T = engines["child"].estimate().T_parent_child
