@@ -386,7 +386,8 @@ class _Problem:
         weights = normal[:, _OFFSET, _OFFSET]
         # Robust weights fall as the offset moves, so that a step is shorter than it should be.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
-        held = 1.0 - pulls.sum() / (1.5 * _TUNING**2) / max(weights.sum(), 1e-300)
+        fall = pulls.sum() / (1.5 * _TUNING**2) / max(weights.sum(), 1e-300)
+        held = float(np.clip(1.0 - fall, 0.5, 1.0))
         offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         sigmas = np.sqrt(np.diag((len(blocks) - 1) / len(blocks) * answers.T @ answers))
@@ -396,10 +397,10 @@ class _Problem:
             offset_s=offset_s,
             sigmas=sigmas,
             scale_sigma=scale * float(sigmas[_SCALE]),
-            offset_sigma_s=float(sigmas[_OFFSET]),
+            offset_sigma_s=float(sigmas[_OFFSET]) / held,
             sensitivity=np.column_stack(by),
             offsets_of_blocks=np.stack([offsets, weights]),
-            held=float(np.clip(held, 0.5, 1.0)),
+            held=held,
             sigma_translation=sigmas_of_residuals[0],
             sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,

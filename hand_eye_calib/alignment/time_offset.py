@@ -320,7 +320,11 @@ def refine_time_offset(
             best = found
         if found.largest_s(child.duration_s) < least_s:
             break
-    return replace(best, spread_s=np.ptp(held)) if len(held) == len(_LAGS_S) else best
+    if len(held) < len(_LAGS_S):
+        return best
+    # What lasts for longer than the jackknife's blocks shows in how these offsets differ.
+    sigma_s = float(np.hypot(best.sigma_s, np.std(held, ddof=1)))
+    return replace(best, spread_s=np.ptp(held), sigma_s=sigma_s)
 
 
 def offset_over(

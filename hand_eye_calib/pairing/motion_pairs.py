@@ -272,7 +272,11 @@ def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) 
     if len(stamps_ns) > 1:
         lag_s = max(lag_s, median(np.diff(stamps_ns)) * 1e-9)
     i = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), max_pairs)).astype(int)
-    j = np.searchsorted(stamps_ns, stamps_ns[i] + round(lag_s * 1e9) - 1000)
-    i, j = i[j < len(stamps_ns)], j[j < len(stamps_ns)]
+    ends_ns = stamps_ns[i] + round(lag_s * 1e9)
+    after = np.maximum(np.searchsorted(stamps_ns, ends_ns), i + 1)
+    i, ends_ns, after = (each[after < len(stamps_ns)] for each in (i, ends_ns, after))
+    # The nearest: of the poses after that, those with late stamps would be the first more often.
+    is_before = ends_ns - stamps_ns[after - 1] < stamps_ns[after] - ends_ns
+    j = np.maximum(after - is_before, i + 1)
     near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9
     return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i[near], j[near])

@@ -241,11 +241,7 @@ class TestLoss:
             """
             if next(calls) % 50 == 0:
                 send(1)
-            values = [
-                values_of(statuses[name])
-                for name in ("/calibrator: parent input", "/calibrator: child input")
-                if name in statuses
-            ]
+            values = [values_of(each) for name, each in statuses.items() if name.endswith(" input")]
             if len(values) < 2 or any(each["lost"] == "unknown" for each in values):
                 return []
             return [[int(each[key]) for key in ("messages", "lost")] for each in values]
