@@ -25,6 +25,9 @@ DATA ?=
 DEMO_ARGS ?= --out demo_output
 RELEASE ?=
 
+# What is compiled once is not compiled again by each process of a test.
+unexport PYTHONDONTWRITEBYTECODE
+
 VENV := .venv
 OLDEST := .venv-oldest
 PIP_FLAGS := --quiet --disable-pip-version-check

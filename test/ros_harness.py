@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ import hand_eye_calib
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import ns_of
+from hand_eye_calib.live import solving
 from hand_eye_calib.ros import conversions
 
 # Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
@@ -137,12 +139,36 @@ def _run_node(arguments, log_file, environment, before):
     os.chdir(log_file.parent)
     sys.stdout.reconfigure(write_through=True)
     sys.argv = ["hand_eye_calib", *arguments]
+    if not before:
+        # What forked this process goes on, and has no threads: it forks the solving process, too.
+        multiprocessing.forkserver._forkserver.ensure_running = lambda: None
+        solving.start = _forked_solver
     exec(before, {})
     sys.exit(main(arguments))
 
 
+def _forked_solver(*_, **__):
+    (stdin, to), (back, stdout) = os.pipe(), os.pipe()
+    streams = [Connection(each) for each in (stdin, stdout, os.dup(2))]
+    solver = _Forked(target=_solve, args=streams, daemon=True)
+    solver.start()
+    solver.stdin, solver.stdout = os.fdopen(to, "wb"), os.fdopen(back, "rb")
+    return solver
+
+
+def _solve(*streams):
+    """The solving process, from the fork to its end."""
+    gc.freeze()
+    for number, each in enumerate(streams):
+        os.dup2(each.fileno(), number)
+        each.close()
+    os.setpgid(0, 0)
+    sys.stdin = os.fdopen(0)
+    solving.main()
+
+
 class _Forked(_FORKS.Process):
-    """A forked node, in words of :class:`subprocess.Popen` too."""
+    """A forked process, in words of :class:`subprocess.Popen` too."""
 
     def poll(self):
         return self.exitcode
@@ -154,13 +180,16 @@ class _Forked(_FORKS.Process):
         assert self.exitcode is not None, f"process {self.pid} does not end"
         return self.exitcode
 
+    communicate = wait
+
     def send_signal(self, number):
         os.kill(self.pid, number)
 
 
 class NodeProcess:
     """The command ``calibrator`` in a process of its own, with its output in a file; ``before`` is
-    Python code that runs first, ``fresh`` starts an interpreter for it.
+    Python code that runs first, ``fresh`` starts an interpreter for it. Either of them has the node
+    start its solving process as for users; otherwise it is forked.
     """
 
     def __init__(self, domain, log_file, ros_arguments, before="", fresh=False):

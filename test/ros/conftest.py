@@ -1,5 +1,8 @@
 """A node in a process of its own and a peer, on a ROS domain that nobody else uses."""
 
+import os
+import sys
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,10 @@ def _quick_discovery():
         patch.setenv(
             "FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml"))
         )
+        with pytest.MonkeyPatch.context() as path:
+            # It imports what it is told to only from here, and fails in silence.
+            path.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+            forkserver.ensure_running()
         yield
         stop_forks()
 

@@ -73,16 +73,21 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
     assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
-def test_demo_without_ros_says_what_to_install(tmp_path):
+def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start(tmp_path):
+    command = "demo", "--out", tmp_path / "out"
     program = (
         "import sys; sys.modules['rclpy'] = None; from hand_eye_calib.cli.main import main; "
         "sys.exit(main(sys.argv[1:]))"
     )
-    done = run("-c", program, "demo", "--out", tmp_path / "out")
-    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
-    assert "rclpy is missing" in done.stderr
-    assert "pip install" in done.stderr
+    without = run("-c", program, *command)
+    assert len(without.stderr.splitlines()) == 1
+    assert "rclpy is missing" in without.stderr
+    assert "pip install" in without.stderr
     assert not (tmp_path / "out").exists()
+    bad = run("-m", "hand_eye_calib", *command, domain="one")
+    assert "error: cannot start ROS: " in bad.stderr.splitlines()[-1]
+    assert "ROS_DOMAIN_ID is not an integral number" in bad.stderr.splitlines()[-1]
+    assert [(each.returncode, each.stdout) for each in (without, bad)] == [(1, "")] * 2
 
 
 def test_player_does_not_wait_for_ever(domain, monkeypatch):
@@ -90,10 +95,3 @@ def test_player_does_not_wait_for_ever(domain, monkeypatch):
     monkeypatch.setattr("hand_eye_calib.ros.player._PATIENCE_S", 0.1)
     with pytest.raises(HandEyeCalibError, match=r"waited 0\.1 s for the node to listen"):
         play(None, TOPICS, 1.0, 0, lambda: None)
-
-
-def test_demo_says_why_ros_does_not_start(tmp_path):
-    done = run("-m", "hand_eye_calib", "demo", "--out", tmp_path, domain="one")
-    assert (done.returncode, done.stdout) == (1, "")
-    assert "error: cannot start ROS: " in done.stderr.splitlines()[-1]
-    assert "ROS_DOMAIN_ID is not an integral number" in done.stderr.splitlines()[-1]

@@ -22,8 +22,8 @@ def parameter_file(path, **parameters):
     return f"--params-file {path}"
 
 
-def test_every_option_is_a_parameter_with_its_description(start_node, peer):
-    start_node()
+def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(start_node, peer):
+    start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
     assert set(FIELDS) <= set(peer.call(ListParameters, "list_parameters").result.names)
     for name in ("threshold", "max_pairs", "method", "scale", "parent_frame"):
         meta = FIELDS[name].metadata
@@ -34,11 +34,7 @@ def test_every_option_is_a_parameter_with_its_description(start_node, peer):
         assert peer.parameter(name) == FIELDS[name].default
     assert ", ".join(METHODS) in peer.describe("method").description
 
-
-def test_changes_are_applied_or_rejected_with_the_reason(start_node, peer):
-    start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
-    publishers = peer.publishers()
-    answer, _ = peer.solve(publishers, *drive())
+    answer, _ = peer.solve(peer.publishers(), *drive())
     assert "; adaptive " in answer.message
     assert peer.set_parameter("method", "dnl").successful
     assert peer.set_parameter("reference", "B3").successful

@@ -103,13 +103,16 @@ def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
     assert any("as the streams are: no result" in text for text in result.warnings)
 
 
-def test_a_convention_that_was_given_is_kept_and_the_advice_undoes_it(streams):
+def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(streams):
     parent, child, expected = streams
     as_it_is = hec.calibrate(parent, written_otherwise(child, REPAIRS[0]), child_invert="none")
     assert as_it_is.verdict is Verdict.DO_NOT_USE
     assert as_it_is.reasons[0].options == {"child_invert": "poses"}
     wrong = hec.calibrate(parent, child, child_invert="poses", reference="B5")
     assert (wrong.verdict, wrong.reasons[0].options) == (as_it_is.verdict, {"child_invert": "none"})
+    unit = hec.calibrate(parent, child.scaled(1000.0), reference="B5", scale="none")
+    assert (unit.scale, unit.verdict) == (1.0, as_it_is.verdict)
+    assert unit.reasons[0].options == {"scale": 0.001}
 
 
 def test_kept_pairs_are_put_right_like_poses(streams):
@@ -129,14 +132,6 @@ def test_a_slow_arm_in_millimetres_is_noticed_and_a_drone_in_metres_is_not():
     drone = as_trajectory(wandering_poses(1200, step_m=1.0))
     assert check_lengths(arm) == check_lengths(drone) == []
     assert [finding.code for finding in check_lengths(arm.scaled(1000.0))] == ["lengths"]
-
-
-def test_what_was_given_is_kept_and_spoils_the_verdict(streams):
-    parent, child, _ = streams
-    result = hec.calibrate(parent, child.scaled(1000.0), reference="B5", scale="none")
-    assert result.scale == 1.0
-    assert result.verdict is Verdict.DO_NOT_USE
-    assert result.reasons[0].options == {"scale": 0.001}
 
 
 def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):

@@ -41,8 +41,7 @@ def test_the_help_of_every_command_loads_no_library():
 @pytest.mark.parametrize(
     "code",
     [
-        "import hand_eye_calib.engine.calibrator",
-        "import hand_eye_calib.live.solving",
+        "import hand_eye_calib.engine.calibrator, hand_eye_calib.live.solving; "
         "import hand_eye_calib as hec; hec.Trajectory; hec.Calibration; hec.calibrate",
         "import hand_eye_calib.ros.calibrator_node",
     ],

@@ -228,9 +228,7 @@ def test_a_shift_between_parts_counts_with_half_of_it():
     found = possible_shift(products_of(parts(0, 1.0)), 1.0)
     np.testing.assert_allclose(np.sqrt(np.diag(found.spread)), np.abs(SHIFT) / 2, atol=4e-3)
     assert possible_shift(products_of(parts(0, 1.0)[:7]), 1.0) is None
-
-
-def test_a_shift_that_noise_explains_does_not_count():
+    # Noise explains this one.
     found = possible_shift(products_of(parts(1, 0.2)), 1.0)
     assert found is None or (np.diag(found.spread).max() < 1e-6 and not found.warnings)
 
