@@ -123,11 +123,6 @@ _FORKS.set_forkserver_preload(
 inspect.getmodule(inspect.currentframe())
 
 
-def stop_forks():
-    """End the process that nodes are forked from; processor time counts when it is waited for."""
-    multiprocessing.forkserver._forkserver._stop()
-
-
 def _run_node(arguments, log_file, environment, before):
     """The node's process, from the fork to its end."""
     gc.freeze()
