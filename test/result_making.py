@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hand_eye_calib.assessment.excitation import Excitation, LeverArms
+from hand_eye_calib.assessment.excitation import Excitation
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.calibration import (
     Calibration,
@@ -85,5 +85,4 @@ def good_calibration(**changes):
 
 def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
     """A motion that shows much."""
-    lever_arms = LeverArms.of(np.zeros((1, 3, 3)))
-    return Excitation(100, np.radians(rotation_deg), lever_arms, 10.0, motion_s)
+    return Excitation(100, np.radians(rotation_deg), np.zeros((3, 3)), 10.0, motion_s)

@@ -98,6 +98,9 @@ class SimilarityFit:
         the scale is kept at 1, whichever are larger.
     explains_translation : bool
         Whether the fit explains enough of the translations to trust its scale and offset.
+    is_in_one_unit, has_own_unit : bool
+        Whether the lengths of both streams clearly do not differ by enough to matter; and whether
+        they do, significantly.
     """
 
     T_parent_child: FloatArray
@@ -113,12 +116,9 @@ class SimilarityFit:
     sigma_rotation: float
     unexplained_translation: float
     explains_translation: bool
+    is_in_one_unit: bool
+    has_own_unit: bool
     unexplained: float
-
-    @property
-    def is_in_one_unit(self) -> bool:
-        """Whether the lengths of both streams clearly do not differ by enough to matter."""
-        return abs(self.scale - 1.0) + _MIN_SIGMAS * self.scale_sigma < _MIN_DIFFERENCE
 
 
 def fit_similarity(
@@ -199,12 +199,6 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
     return fits[int(np.argmin(doubts))]
 
 
-def scale_differs(fit: SimilarityFit) -> bool:
-    """Whether the lengths of two streams differ significantly, and by enough to matter."""
-    significant = abs(fit.scale - 1.0) > max(_MIN_DIFFERENCE, _MIN_SIGMAS * fit.scale_sigma)
-    return significant and fit.unexplained_translation < _MAX_UNEXPLAINED_TO_DIFFER
-
-
 def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, SimilarityFit | None]:
     """The scale to use, given or estimated as the option ``scale`` asks for, and the fit that it
     comes from if it was estimated.
@@ -224,7 +218,7 @@ def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, Sim
         if option == "estimate":
             raise
         return 1.0, None
-    if option == "auto" and not scale_differs(fit):
+    if option == "auto" and not fit.has_own_unit:
         return 1.0, None
     if not fit.explains_translation:
         raise NotEnoughDataError(
@@ -391,12 +385,14 @@ class _Problem:
         offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         sigmas = np.sqrt(np.diag((len(blocks) - 1) / len(blocks) * answers.T @ answers))
+        scale_sigma, off = scale * float(sigmas[_SCALE]), abs(scale - 1.0)
+        is_off = off > max(_MIN_DIFFERENCE, _MIN_SIGMAS * scale_sigma)
         return SimilarityFit(
             T_parent_child=T,
             scale=scale,
             offset_s=offset_s,
             sigmas=sigmas,
-            scale_sigma=scale * float(sigmas[_SCALE]),
+            scale_sigma=scale_sigma,
             offset_sigma_s=float(sigmas[_OFFSET]) / held,
             sensitivity=np.column_stack(by),
             offsets_of_blocks=np.stack([offsets, weights]),
@@ -405,6 +401,8 @@ class _Problem:
             sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,
             explains_translation=of_translation < _MAX_UNEXPLAINED_TRANSLATION,
+            is_in_one_unit=off + _MIN_SIGMAS * scale_sigma < _MIN_DIFFERENCE,
+            has_own_unit=is_off and of_translation < _MAX_UNEXPLAINED_TO_DIFFER,
             unexplained=unexplained,
         )
 

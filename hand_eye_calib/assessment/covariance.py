@@ -12,27 +12,37 @@ recording. A camera whose intrinsics are slightly wrong, or a lidar map that is 
 error that no statistic of the recording shows: neither the residuals nor the halves know of it. The
 standard deviation of a result contains both.
 
+A rotation R moves the end of a lever arm d by (R - I) d. Over K motions the mean square is d' S d,
+with S = mean (R - I)'(R - I). If all rotations are about one axis, d along that axis does not move:
+the translation of the child sensor along it stays unknown. This is the one rule for that; the
+covariance, the stream checks and the hints to the driver all use it.
+
 The scale is what the data leave open of it; where the frame of a sensor is, and how it is turned,
 is known to what odometries on real recordings with a known extrinsic agree to. An odometry whose
 gain of rotation is slightly wrong moves its own centre by that share of the distance of what it
 sees, which is far where a vehicle is fast: on roads, centres are 6 to 14 cm off, in rooms 1 cm.
 """
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.assessment import excitation
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
-from hand_eye_calib.gls.normal import answers_without
+from hand_eye_calib.gls.normal import answers_without, multiplied
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
-from hand_eye_calib.results.records import AXES, ROTATIONS, DofObservability, DofVerdict
+from hand_eye_calib.results.records import (
+    AXES,
+    ROTATIONS,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.stats import CHI2, median
 
@@ -57,6 +67,21 @@ ROUNDING_VARIANCE = 1e-24
 # Information below this share of the largest is rounding.
 _RANK_TOLERANCE = 1e-12
 
+# A direction counts as revealed if the rotations move it with this many times the power of the
+# rotation errors. With less, noise alone would look like that motion.
+_MIN_SIGNAL_TO_NOISE = 3.0
+
+# Nor is it revealed if it moves less than this share of the direction that moves most: all rotation
+# is then about that direction to within 2.3 deg. Odometry errors of a per cent or two of the
+# rotation are common. They are systematic, so that the residuals do not show them.
+_MIN_SHARE = 0.04
+
+# Rotation errors are never taken to be smaller than this (rad): rounding, not motion.
+_ROUNDING_ANGLE = 1e-6
+
+# An axis is hidden if this share of it lies in directions that are not revealed.
+_HIDDEN_SHARE = 0.1
+
 # Standard deviations (m, rad) above which an axis is weak, and above which it is unobservable: so
 # little is known that nobody can use the value.
 WEAK, UNOBSERVABLE = (0.05, float(np.radians(1.0))), 0.3
@@ -64,19 +89,43 @@ WEAK, UNOBSERVABLE = (0.05, float(np.radians(1.0))), 0.3
 
 @dataclass(frozen=True)
 class Assessment:
-    """Covariance and verdicts of one answer.
+    """An answer with its covariance and verdicts.
 
     Attributes
     ----------
+    T_parent_child : (4, 4) array
     cov_parent_child_in_child : (6, 6) array
         Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``: error in the child sensor's
         frame, m and rad.
     observability : tuple of DofObservability
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
+    contradictions : mapping
+        Axis name to the number of standard deviations between prior and motion, for the axes on
+        which they contradict each other. The prior on these was left out.
     """
 
+    T_parent_child: FloatArray
     cov_parent_child_in_child: FloatArray
     observability: tuple[DofObservability, ...]
+    contradictions: Mapping[str, float] = field(default_factory=dict)
+
+    def status(self, converged: bool, within: slice = slice(6)) -> SolveStatus:
+        """How a solve ended, if it can determine the axes ``within``."""
+        if not converged:
+            return SolveStatus.NOT_CONVERGED
+        if self.contradictions:
+            return SolveStatus.CONTRADICTED
+        verdicts = [dof.verdict for dof in self.observability[within]]
+        is_open = DofVerdict.UNOBSERVABLE in verdicts
+        return SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the reasons of the verdict do not say."""
+        names = [dof.name for dof in self.observability if dof.verdict is DofVerdict.PRIOR]
+        if not names:
+            return []
+        return [f"{', '.join(names)} of the child sensor: mostly from the prior, not the motion"]
 
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:
@@ -105,7 +154,7 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
         solution.rotation_variance,
         # Rotations below the noise of single poses cannot be told from none.
         # Otherwise they can, and the tilt of the axis is stated: half as much is enough.
-        excitation.MIN_SHARE if solution.is_noise_dominated else excitation.MIN_SHARE / 2,
+        _MIN_SHARE if solution.is_noise_dominated else _MIN_SHARE / 2,
     )
     unseen = basis([*solution.unseen.T, *hidden])
     return combined(solution.T_parent_child, covariance, None, unseen)
@@ -131,9 +180,11 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     return combined(solution.T_parent_child, whole, None, basis(unknown))
 
 
-def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatArray) -> Assessment:
+def assess_lever_arm(
+    Ts: FloatArray, solution: ModelSolution, T: FloatArray, covariance: FloatArray
+) -> Assessment:
     """Covariance and observability of a lever arm in the frame of a sensor with poses (N, 4, 4): of
-    a transform with no rotation, which is unknown. ``covariance`` (3, 3) is that of the model.
+    a transform T with no rotation, which is unknown. ``covariance`` (3, 3) is that of the model.
     """
     whole = np.zeros((6, 6))
     whole[:3, :3] = widened_by_blocks(covariance, solution, slice(0, 3))
@@ -147,7 +198,7 @@ def assess_lever_arm(Ts: FloatArray, solution: ModelSolution, covariance: FloatA
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
     )
-    return combined(np.eye(4), whole, None, basis([*np.eye(6)[3:], *hidden]))
+    return combined(T, whole, None, basis([*np.eye(6)[3:], *hidden]))
 
 
 def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
@@ -155,20 +206,16 @@ def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: sli
     if len(solution.jumps) < BLOCKS * _FEWEST[1]:
         return covariance
     spread = _spread_of_blocks(answers_without(solution.part_products, BLOCKS)[:, part])
-    # One factor for all directions: that of a single direction scatters too much. Rotations may
-    # have a larger one: slow errors of a sensor's rotation pass for those of a world, which
-    # motion averages.
-    factors = np.full(len(covariance), max(_excess(covariance, spread), 1.0))
-    turns = slice(3, None)
-    if len(covariance) > 3:
-        own = _excess(covariance[turns, turns], spread[turns, turns])
-        factors[turns] = np.maximum(factors[turns], own)
+    # One factor for all directions, how many times the covariance they spread on average: that of a
+    # single direction scatters too much. Rotations may have a larger one: slow errors of a sensor's
+    # rotation pass for those of a world, which motion averages.
+    factors = np.ones(len(covariance))
+    for turns in (slice(None), slice(3, None)):
+        if n_directions := len(factors[turns]):
+            information = np.linalg.pinv(covariance[turns, turns], hermitian=True)
+            excess = np.trace(information @ spread[turns, turns]) / n_directions
+            factors[turns] = np.maximum(factors[turns], excess)
     return covariance * np.sqrt(np.outer(factors, factors))
-
-
-def _excess(covariance: FloatArray, spread: FloatArray) -> float:
-    """How many times a covariance answers spread, on average over the directions."""
-    return float(np.trace(np.linalg.pinv(covariance, hermitian=True) @ spread)) / len(covariance)
 
 
 def noise_driven(
@@ -176,7 +223,7 @@ def noise_driven(
     T_parent_child: FloatArray,
     jumps: BoolArray,
     rotation_variance: Callable[[int], FloatArray],
-    least_share: float = excitation.MIN_SHARE,
+    least_share: float = _MIN_SHARE,
 ) -> list[FloatArray]:
     """Directions (6,) of translation that the rotations do not reveal over any baseline.
 
@@ -191,7 +238,7 @@ def noise_driven(
     rotation_variance : callable
         Variance (rad^2) per axis of the rotation noise over so many increments.
     least_share : float
-        See :meth:`~hand_eye_calib.assessment.excitation.LeverArms.hidden_directions`.
+        See :func:`hidden_directions`.
     """
     longest = max(len(Ts_pw_p) // BLOCKS, 1)
     rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])
@@ -202,11 +249,10 @@ def noise_driven(
         weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
         if not weights.any():
             weights[:] = 1.0
-        lever_arms = excitation.LeverArms.of(
-            (motions - np.eye(3)) @ T_parent_child[:3, :3], weights
-        )
+        chords = (motions - np.eye(3)) @ T_parent_child[:3, :3]
         noise = rotation_variance(baseline) * np.eye(3)
-        found.append(lever_arms.hidden_directions(noise, least_share).T)
+        products = lever_arm_products(chords, weights)
+        found.append(hidden_directions(products, noise, least_share).T)
     return [np.r_[direction, np.zeros(3)] for direction in min(found, key=len)]
 
 
@@ -227,13 +273,11 @@ def combined(
     covariance, rotation = known @ model @ known + scaled @ scaled.T, T_parent_child[:3, :3]
     sigmas = sigmas_in_parent(rotation, covariance)
     shares = ((np.kron(np.eye(2), rotation) @ unknown) ** 2).sum(axis=1)
-    sigmas = np.where(shares > excitation.HIDDEN_SHARE, np.inf, sigmas)
-    return Assessment(covariance, tuple(map(judged, AXES, sigmas.tolist())))
+    sigmas = np.where(shares > _HIDDEN_SHARE, np.inf, sigmas)
+    return Assessment(T_parent_child, covariance, tuple(map(judged, AXES, sigmas.tolist())))
 
 
-def without_axes(
-    assessment: Assessment, T_parent_child: FloatArray, axes: Collection[str]
-) -> Assessment:
+def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
     """An assessment that counts these axes of the parent's frame as unobservable."""
     # A direction that is unknown already is hardly ever an axis: both would hide a second one.
     known = {*axes}.difference(
@@ -242,14 +286,14 @@ def without_axes(
     rows = [index for index, axis in enumerate(AXES) if axis in known]
     if not rows:
         return assessment
-    to_parent = np.kron(np.eye(2), T_parent_child[:3, :3])
-    unknown = np.asarray(to_parent[rows].T, dtype=float)
-    found = combined(T_parent_child, assessment.cov_parent_child_in_child, None, unknown)
+    T = assessment.T_parent_child
+    unknown = np.asarray(np.kron(np.eye(2), T[:3, :3])[rows].T, dtype=float)
+    found = combined(T, assessment.cov_parent_child_in_child, None, unknown)
     observability = tuple(
         before if before.verdict is DofVerdict.UNOBSERVABLE else after
         for before, after in zip(assessment.observability, found.observability, strict=True)
     )
-    return Assessment(found.cov_parent_child_in_child, observability)
+    return replace(found, observability=observability)
 
 
 def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray, FloatArray]:
@@ -269,17 +313,18 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     variance_r = np.trace(cov_r) / 3
 
     jacobian_t, jacobian_r = _derivatives(pairs, solution.T_parent_child[:3, :3])
-    information_t = excitation.weighted_products(weights, jacobian_t)
+    each = weights[:, None, None]
+    information_t = multiplied(each * jacobian_t, jacobian_t)
     information_r = np.zeros((6, 6))
-    information_r[3:, 3:] = excitation.weighted_products(weights, jacobian_r)
+    information_r[3:, 3:] = multiplied(each * jacobian_r, jacobian_r)
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
-    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * excitation.ROUNDING_ANGLE**2)
+    seen = values > max(_RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2)
     inverse = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)) @ vectors.T
     covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
 
-    hidden = excitation.LeverArms.of(jacobian_t[..., :3], weights).hidden_directions(cov_r).T
+    hidden = hidden_directions(lever_arm_products(jacobian_t[..., :3], weights), cov_r).T
     of_lever_arm = [np.r_[direction, np.zeros(3)] for direction in hidden]
     return covariance, basis([*of_lever_arm, *vectors[:, ~seen].T])
 
@@ -292,6 +337,43 @@ def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, 
     pushed = rotation @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
     turned = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
     return np.concatenate([chords @ rotation, pushed], axis=2), turned
+
+
+def lever_arm_products(chords: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    """S (3, 3) of motions with these chords (K, 3, 3): R - I of each, or (R - I) Q for lever arms
+    in a frame that Q rotates from; and with their weights (K,), 1 by default.
+    """
+    weights = np.ones(len(chords)) if weights is None else weights
+    total = multiplied(weights[:, None, None] * chords, chords)
+    return total / max(float(weights.sum()), 1.0)
+
+
+def hidden_directions(
+    products: FloatArray, cov_rotation: FloatArray | None = None, least_share: float = _MIN_SHARE
+) -> FloatArray:
+    """The directions (3, U) of lever arms that rotations do not reveal.
+
+    Parameters
+    ----------
+    products : (3, 3) array
+        :func:`lever_arm_products` of the motions.
+    cov_rotation : (3, 3) array, optional
+        Covariance C of the rotation errors, rad^2, in the frame of the lever arms. An error e moves
+        a lever arm d by ``e x d``, with the mean square ``d' (tr(C) I - C) d``.
+    least_share : float
+        Least displacement, as a share of that along the direction that moves most.
+    """
+    powers, directions = np.linalg.eigh(products)
+    cov_rotation = np.zeros((3, 3)) if cov_rotation is None else cov_rotation
+    noise = np.trace(cov_rotation) * np.eye(3) - cov_rotation + _ROUNDING_ANGLE**2 * np.eye(3)
+    of_noise = _MIN_SIGNAL_TO_NOISE * np.diag(directions.T @ noise @ directions)
+    return directions[:, powers < np.maximum(of_noise, least_share**2 * powers[-1])]
+
+
+def hidden_axes(products: FloatArray, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:
+    """Names of the axes x, y, z that lie too far in the hidden directions to be known."""
+    shares = (hidden_directions(products, cov_rotation) ** 2).sum(axis=1)
+    return tuple(axis for axis, share in zip("xyz", shares, strict=True) if share > _HIDDEN_SHARE)
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:
@@ -394,9 +476,10 @@ def floor_of_pairs(
     residuals = pairs.residuals(T_parent_child)[0][:, :, None]
     push = (pairs.Ts_childi_childj[:, :3, 3] @ rotation.T)[:, :, None]
     jacobian = np.concatenate([by_xi, push, residuals], axis=2)
-    products = excitation.weighted_products(weights, jacobian)
+    each = weights[:, None, None]
+    products = multiplied(each * jacobian, jacobian)
     information, pushed = products[:6, :6].copy(), products[:6, 6]
-    information[3:, 3:] += 2 * excitation.weighted_products(weights, turned)
+    information[3:, 3:] += 2 * multiplied(each * turned, turned)
     by_scale = np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ pushed
     of_scale = max(float(products[6, 6] - pushed @ by_scale), 1e-30)
     overlap = float(np.mean(pairs.j - pairs.i)) if len(pairs) else 1.0

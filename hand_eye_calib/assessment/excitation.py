@@ -1,10 +1,5 @@
-"""How the parent sensor has moved, what that reveals of the lever arm, and in words what it does
-not show: hints for a person who is still recording.
-
-A rotation R moves the end of a lever arm d by (R - I) d. Over K motions the mean square is d' S d,
-with S = mean (R - I)'(R - I). If all rotations are about one axis, d along that axis does not move:
-the translation of the child sensor along it stays unknown. This is the one rule for that; the
-covariance, the stream checks and the hints to the driver all use it.
+"""How the parent sensor has moved, and in words what it does not show: hints for a person who is
+still recording.
 """
 
 from collections.abc import Sequence
@@ -13,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
@@ -42,83 +38,6 @@ _ALONG_ONE_AXIS, _LONG_STEP = 0.9, 0.3
 # What turns a vehicle about its x, y and z.
 _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
 
-# A direction counts as revealed if the rotations move it with this many times the power of the
-# rotation errors. With less, noise alone would look like that motion.
-_MIN_SIGNAL_TO_NOISE = 3.0
-
-# Nor is it revealed if it moves less than this share of the direction that moves most: all rotation
-# is then about that direction to within 2.3 deg. Odometry errors of a per cent or two of the
-# rotation are common. They are systematic, so that the residuals do not show them.
-MIN_SHARE = 0.04
-
-# Rotation errors are never taken to be smaller than this (rad): rounding, not motion.
-ROUNDING_ANGLE = 1e-6
-
-# An axis is hidden if this share of it lies in directions that are not revealed.
-HIDDEN_SHARE = 0.1
-
-
-@dataclass(frozen=True)
-class LeverArms:
-    """How far rotations move lever arms of 1 m.
-
-    Attributes
-    ----------
-    powers : (3,) array
-        Mean square displacement along three orthogonal directions, ascending, in m^2.
-    directions : (3, 3) array
-        The directions, one a column.
-    information : (3, 3) array
-        S: ``d' S d`` is the mean square displacement of the lever arm d.
-    """
-
-    powers: FloatArray
-    directions: FloatArray
-    information: FloatArray
-
-    @classmethod
-    def of(cls, chords: FloatArray, weights: FloatArray | None = None) -> "LeverArms":
-        """The lever arms of motions with these chords (K, 3, 3): R - I of each, or (R - I) Q for
-        lever arms in a frame that Q rotates from; and their weights (K,), 1 by default.
-        """
-        weights = np.ones(len(chords)) if weights is None else weights
-        information = weighted_products(weights, chords) / max(float(weights.sum()), 1.0)
-        powers, directions = np.linalg.eigh(information)
-        return cls(powers, directions, information)
-
-    def hidden_directions(
-        self, cov_rotation: FloatArray | None = None, least_share: float = MIN_SHARE
-    ) -> FloatArray:
-        """The directions (3, U) that the rotations do not reveal.
-
-        Parameters
-        ----------
-        cov_rotation : (3, 3) array, optional
-            Covariance C of the rotation errors, rad^2, in the frame of the lever arms. An error e
-            moves a lever arm d by ``e x d``, with the mean square ``d' (tr(C) I - C) d``.
-        least_share : float
-            Least displacement, as a share of that along the direction that moves most.
-        """
-        cov_rotation = np.zeros((3, 3)) if cov_rotation is None else cov_rotation
-        noise = np.trace(cov_rotation) * np.eye(3) - cov_rotation + ROUNDING_ANGLE**2 * np.eye(3)
-        of_noise = _MIN_SIGNAL_TO_NOISE * np.diag(self.directions.T @ noise @ self.directions)
-        least = np.maximum(of_noise, least_share**2 * self.powers[-1])
-        return self.directions[:, self.powers < least]
-
-    def hidden_axes(self, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:
-        """Names of the axes x, y, z that lie too far in the hidden directions to be known."""
-        shares = (self.hidden_directions(cov_rotation) ** 2).sum(axis=1)
-        return tuple(
-            axis for axis, share in zip("xyz", shares, strict=True) if share > HIDDEN_SHARE
-        )
-
-
-def weighted_products(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """``sum w J'J`` (p, p) of derivatives J (K, r, p) with weights (K,)."""
-    size = jacobian.shape[2]
-    weighted = weights[:, None, None] * jacobian
-    return weighted.reshape(-1, size).T @ jacobian.reshape(-1, size)
-
 
 @dataclass(frozen=True)
 class Excitation:
@@ -131,8 +50,9 @@ class Excitation:
     rotation : (3,) array
         Rotation about x, y and z, rad: the 95th percentile over the session, of the time span with
         the most rotation.
-    lever_arms : LeverArms
-        How far the rotations move lever arms, over the time span with the most of it.
+    lever_arms : (3, 3) array
+        How far the rotations move lever arms, over the time span with the most of it: their
+        :func:`~hand_eye_calib.assessment.covariance.lever_arm_products`.
     distance : float
         Length of the path, m.
     motion_s : float
@@ -145,7 +65,7 @@ class Excitation:
 
     n_poses: int
     rotation: FloatArray
-    lever_arms: LeverArms
+    lever_arms: FloatArray
     distance: float
     motion_s: float = 0.0
     drives: bool = True
@@ -161,13 +81,13 @@ class Excitation:
         """Axes x, y, z along which the motion cannot show the translation, whatever the noise."""
         if self.rotation.max() < MIN_ROTATION:
             return TRANSLATIONS
-        return self.lever_arms.hidden_axes()
+        return hidden_axes(self.lever_arms)
 
 
 def excitation(pose_pairs: PosePairs) -> Excitation:
     """The Excitation in synchronised poses."""
     n_poses = len(pose_pairs)
-    rotation, lever_arms = np.zeros(3), LeverArms.of(np.zeros((1, 3, 3)))
+    rotation, lever_arms = np.zeros(3), np.zeros((3, 3))
     if n_poses < 2:
         return Excitation(n_poses, rotation, lever_arms, 0.0)
     rows = np.linspace(0, n_poses - 1, min(n_poses, _MAX_POSES)).astype(int)
@@ -177,8 +97,8 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
         rotations = np.swapaxes(poses[:-lag, :3, :3], 1, 2) @ poses[lag:, :3, :3]
         angles = np.abs(se3.rotation_log(rotations))
         rotation = np.maximum(rotation, [quantile(angle, _QUANTILE) for angle in angles.T])
-        at_lag = LeverArms.of(rotations - np.eye(3))
-        if np.trace(at_lag.information) > np.trace(lever_arms.information):
+        at_lag = lever_arm_products(rotations - np.eye(3))
+        if np.trace(at_lag) > np.trace(lever_arms):
             lever_arms = at_lag
         lag *= 2
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())

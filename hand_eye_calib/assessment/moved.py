@@ -1,11 +1,9 @@
 """Has it moved? The one kernel behind comparisons of results, parts of a recording and the monitor.
 
 A change of the extrinsic is judged in two ways, both from its estimate d and the covariance C of
-that. By axis, where a person asks what has moved: an axis has if it differs by more than chance
-makes of any of six once in 200 comparisons, or all together by what chance makes of them once in
-1,000; it is the same only if a change that matters would have been seen. By probability, where a
-shift is looked for at many times: with shifts of covariance L expected, the logarithm of the
-likelihood ratio of a shift against none is, with ``H = C^-1`` and ``S = H d``,
+that. By axis, where a person asks what has moved (:mod:`~hand_eye_calib.assessment.change`). By
+probability, where a shift is looked for at many times: with shifts of covariance L expected, the
+logarithm of the likelihood ratio of a shift against none is, with ``H = C^-1`` and ``S = H d``,
 
     1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|,
 
@@ -24,9 +22,7 @@ much. Errors that wander over minutes, of a map that bends or a bias, give a lar
 stream checks compare how well a world that moves explains the motion.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
@@ -35,8 +31,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
-from hand_eye_calib.results.records import AXES, AxisDifference
-from hand_eye_calib.text import amount, angle, length, listing
+from hand_eye_calib.text import angle, length
 
 # Shifts that are looked for: one standard deviation per axis (m, rad).
 SHIFT_M, SHIFT_RAD = 0.03, float(np.radians(1.0))
@@ -46,10 +41,6 @@ SHIFT_M, SHIFT_RAD = 0.03, float(np.radians(1.0))
 # worse than along the others.
 _SCATTERS = np.repeat([[0.008, np.radians(0.12)], [0.020, np.radians(0.10)]], 3, axis=1)
 _VEHICLE = 4.0
-
-# Standard deviations (m, rad) that stand for "nothing known", and from which on one does.
-UNKNOWN = np.sqrt(np.r_[np.full(3, 100.0), np.full(3, 10.0)])
-UNKNOWN_FROM = 0.1 * UNKNOWN
 
 # Motions over this time (ns) are compared, so many of them in it at most, and what they show is
 # added up over it.
@@ -69,91 +60,6 @@ SIGNIFICANT = 12.0
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
 # recording before and after that. A smaller probability is none.
 _MOVES, _LEAST_PARTS, _LEAST_PROBABILITY = 0.02, 4, 1e-3
-
-
-class Change(str, Enum):
-    """Whether something has moved."""
-
-    SAME = "same"
-    MOVED = "moved"
-    CANNOT_TELL = "cannot tell"
-
-    @classmethod
-    def of_all(cls, changes: Sequence["Change"]) -> "Change":
-        """The gravest of several."""
-        graver = (each for each in (cls.MOVED, cls.CANNOT_TELL) if each in changes)
-        return next(graver, cls.SAME)
-
-
-@dataclass(frozen=True)
-class Moved:
-    """By axis how two estimates of an extrinsic differ, along and about the axes of the parent
-    sensor's frame, and the verdict on all axes together.
-    """
-
-    axes: dict[str, AxisDifference]
-    verdict: Change
-
-    def _those(self, change: Change) -> list[str]:
-        return [axis for axis, found in self.axes.items() if found.verdict == change]
-
-    @property
-    def sentence(self) -> str:
-        """The verdict in one line, with what it rests on."""
-        if self.verdict is Change.MOVED:
-            return f"moved: {self.what}"
-        same, unknown = self._those(Change.SAME), self._those(Change.CANNOT_TELL)
-        if not unknown:
-            return f"same: {self._power(same)}"
-        told = f"cannot tell about {listing(unknown)}"
-        return f"{told}; {listing(same)} the same: {self._power(same)}" if same else told
-
-    @property
-    def what(self) -> str:
-        """The axes that have moved; the two that differ most if none has on its own."""
-        ratios = {axis: abs(each.difference) / each.sigma for axis, each in self.axes.items()}
-        most = sorted(filter(ratios.get, AXES), key=lambda axis: -ratios[axis])[:2]
-        told = [
-            f"{axis} by {amount(axis, one.difference)} +/- {amount(axis, one.sigma)}"
-            for axis, one in ((axis, self.axes[axis]) for axis in self._those(Change.MOVED) or most)
-        ]
-        return listing(told) or "by what the axes show together, none of them alone"
-
-    def _power(self, axes: Sequence[str]) -> str:
-        told = []
-        for names in (AXES[:3], AXES[3:]):
-            if known := [axis for axis in names if axis in axes]:
-                worst = max(known, key=lambda axis: self.axes[axis].visible)
-                told.append(amount(worst, self.axes[worst].visible))
-        return f"a change of {' or '.join(told)} would have been seen"
-
-
-def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Moved:
-    """Judge a difference of two estimates by axis.
-
-    Parameters
-    ----------
-    values : (6,) array
-        Difference along (m) and about (rad) the axes of the parent sensor's frame.
-    covariance : (6, 6) array
-        Of both estimates together, with the scatter of recordings if they are of two.
-    limits : (6,) array
-        Changes that have to be seen before an axis is called the same.
-    """
-    covariance = covariance + 1e-18 * np.eye(6)
-    sigmas = np.sqrt(np.diag(covariance))
-    chi2 = float(values @ np.linalg.solve(covariance, values))
-    sigmas = np.where(sigmas > UNKNOWN_FROM, np.inf, sigmas)
-    largest = stats.LARGEST_OF_SIX
-    visible = (largest + stats.NINE_TIMES_OUT_OF_TEN) * sigmas
-    verdicts = [
-        Change.MOVED if ratio > largest else Change.SAME if seen else Change.CANNOT_TELL
-        for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
-    ]
-    columns = (each.tolist() for each in (values, sigmas, visible))
-    rows = zip(*columns, (each.value for each in verdicts), strict=True)
-    axes = {axis: AxisDifference(*row) for axis, row in zip(AXES, rows, strict=True)}
-    return Moved(axes, Change.MOVED if chi2 > stats.CHI2[0.001][6] else Change.of_all(verdicts))
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
@@ -325,20 +231,11 @@ def _inverse(H: FloatArray) -> FloatArray:
     return np.linalg.inv(H + 1e-6 * np.linalg.inv(shift_covariance()))
 
 
-@dataclass(frozen=True)
-class PossibleShift:
-    """A difference between the parts of a recording: the covariance (6, 6) of xi in ``X exp(xi)``
-    because of it, as an answer between both mounts is half of the shift away from either; and a
-    warning if something has moved, more likely than not, by more than recordings of one rig
-    scatter.
-    """
-
-    spread: FloatArray
-    warnings: tuple[str, ...]
-
-
-def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
-    """The shift of the mount that the parts of a recording may show; None if it is improbable.
+def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tuple[str, ...]]:
+    """The shift of the mount that the parts of a recording may show: the covariance (6, 6) of xi in
+    ``X exp(xi)`` because of it, as an answer between both mounts is half of the shift away from
+    either, zeros if it is improbable; and a warning if something has moved, more likely than not,
+    by more than recordings of one rig scatter.
 
     What the parts before and after each time say of X is compared under the noise model that gave
     X. The likelihood ratio of a shift, averaged over the times, gives its probability.
@@ -355,7 +252,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     after = NormalEquations(np.cumsum(products[::-1], axis=0)[::-1][cuts])
     known = before.is_complete & after.is_complete
     if not known.any():
-        return None
+        return np.zeros((6, 6)), ()
     joint = max(misfit, 1.0) * (before.covariance + after.covariance)[known, :6, :6]
     steps = (after.step - before.step)[known, :6]
     H = np.linalg.inv(joint)
@@ -363,14 +260,14 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
     ratios = log_ratio(H, S)
     found = _probability(ratios)
     if found < _LEAST_PROBABILITY:
-        return None
+        return np.zeros((6, 6)), ()
     shifts = solve(H + np.linalg.inv(shift_covariance()), S)
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     spread = found * squared / 4.0
     beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
     if _probability(log_ratio(beside, se3.times(beside, steps))) < 0.5:
-        return PossibleShift(spread, ())
+        return spread, ()
     best = int(np.argmax(ratios))
     share, xi = int(cuts[known][best]) / len(products), shifts[best]
     sizes = length(float(np.linalg.norm(xi[:3]))), angle(float(np.linalg.norm(xi[3:])))
@@ -379,7 +276,7 @@ def possible_shift(products: FloatArray, misfit: float) -> PossibleShift | None:
         f"results ({', '.join(sizes)}). Perhaps a sensor moved, or an odometry got worse. The +/- "
         "values already include half of this."
     )
-    return PossibleShift(spread, (told,))
+    return spread, (told,)
 
 
 def _probability(log_ratios: FloatArray) -> float:

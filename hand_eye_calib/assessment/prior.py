@@ -7,7 +7,7 @@ stays unknown.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -21,8 +21,13 @@ from hand_eye_calib.assessment.covariance import (
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS
+from hand_eye_calib.results.records import (
+    AXES,
+    ROTATIONS,
+    TRANSLATIONS,
+    DofObservability,
+    DofVerdict,
+)
 
 # Axis name to (value, standard deviation), in m and rad.
 Prior: TypeAlias = Mapping[str, tuple[float, float]]
@@ -45,68 +50,30 @@ _MAX_DISTANCE = 4.0
 _MAX_LEVER_ARM = 50.0
 
 
-@dataclass(frozen=True)
-class Fused:
-    """Estimate from motion and prior together.
-
-    Attributes
-    ----------
-    T_parent_child : (4, 4) array
-    assessment : Assessment
-        Covariance and verdicts of both together.
-    contradictions : dict
-        Axis name to the number of standard deviations between prior and motion, for the axes on
-        which they contradict each other. The prior on these was left out.
-    """
-
-    T_parent_child: FloatArray
-    assessment: Assessment
-    contradictions: dict[str, float]
-
-    def status(self, converged: bool, within: slice = slice(6)) -> SolveStatus:
-        """How a solve ended, if it can determine the axes ``within``."""
-        if not converged:
-            return SolveStatus.NOT_CONVERGED
-        if self.contradictions:
-            return SolveStatus.CONTRADICTED
-        verdicts = [dof.verdict for dof in self.assessment.observability[within]]
-        is_open = DofVerdict.UNOBSERVABLE in verdicts
-        return SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the reasons of the verdict do not say."""
-        axes = self.assessment.observability
-        names = [dof.name for dof in axes if dof.verdict is DofVerdict.PRIOR]
-        if not names:
-            return []
-        return [f"{', '.join(names)} of the child sensor: mostly from the prior, not the motion"]
-
-
-def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fused:
+def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     """Fuse the estimate from motion with a prior, and set what neither of them knows.
 
     Parameters
     ----------
-    T_parent_child : (4, 4) array
-        The estimate from motion.
     assessment : Assessment
-        Of that estimate.
+        The estimate from motion.
     prior : mapping
         Axis name (x, y, z, roll, pitch, yaw; of the child sensor's pose in the parent sensor's
         frame, angles about fixed axes) to (value, sigma), in m and rad. May be empty.
     """
-    covariance = assessment.cov_parent_child_in_child
+    T_parent_child, covariance = assessment.T_parent_child, assessment.cov_parent_child_in_child
     shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
     unknown = np.linalg.qr(UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE])[0]
-    contradictions = _contradictions(T_parent_child, assessment, prior) if prior else {}
+    contradictions = _contradictions(assessment, prior) if prior else {}
     prior = {axis: known for axis, known in prior.items() if axis not in contradictions}
+    found = replace(assessment, contradictions=contradictions)
     if not prior and not unknown.shape[1]:
-        return Fused(T_parent_child, assessment, contradictions)
+        return found
     root, inverse_root, targets = _whitened(T_parent_child, covariance, unknown)
     T, back = T_parent_child, T_parent_child[:3, :3].T
+    none = np.zeros(0), np.zeros((0, 6))
     for _ in range(_MAX_STEPS):
-        residuals, jacobian = _prior_residuals(T, prior)
+        residuals, jacobian = _prior_residuals(T, prior) if prior else none
         jacobian = jacobian @ root
         normal = np.eye(6) + jacobian.T @ jacobian
         apart = back @ (T[:3, 3] - T_parent_child[:3, 3]), se3.rotation_log(back @ T[:3, :3])
@@ -116,7 +83,7 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     if not prior:
-        return Fused(T, assessment, contradictions)
+        return replace(found, T_parent_child=T)
     posterior = root @ np.linalg.inv(normal) @ root.T
     sigmas = sigmas_in_parent(T[:3, :3], posterior).tolist()
     before = sigmas_in_parent(T_parent_child[:3, :3], covariance)
@@ -126,23 +93,22 @@ def fuse(T_parent_child: FloatArray, assessment: Assessment, prior: Prior) -> Fu
         # An axis is mostly from the prior if that at least halves its variance.
         if is_known and axis in prior and 2 * sigma**2 < before[k] ** 2:
             verdicts[k] = DofObservability(axis, DofVerdict.PRIOR, sigma)
-    return Fused(T, Assessment(posterior, tuple(verdicts)), contradictions)
+    return Assessment(T, posterior, tuple(verdicts), contradictions)
 
 
-def widened(assessment: Assessment, rotation: FloatArray, spread: FloatArray) -> Assessment:
-    """An assessment of an estimate with this rotation (3, 3), and with the covariance (6, 6) of
-    (rho, phi), in the child sensor's frame, of something added that the estimate depends on.
+def widened(assessment: Assessment, spread: FloatArray) -> Assessment:
+    """An assessment with the covariance (6, 6) of (rho, phi), in the child sensor's frame, of
+    something added that the estimate depends on.
     """
-    if not spread.any():
-        return assessment
-    added = sigmas_in_parent(rotation, spread)
+    added = sigmas_in_parent(assessment.T_parent_child[:3, :3], spread)
     observability = tuple(
         dof
         if dof.verdict is DofVerdict.UNOBSERVABLE
         else judged(dof.name, float(np.hypot(dof.sigma, more)))
         for dof, more in zip(assessment.observability, added, strict=True)
     )
-    return Assessment(assessment.cov_parent_child_in_child + spread, observability)
+    covariance = assessment.cov_parent_child_in_child + spread
+    return replace(assessment, cov_parent_child_in_child=covariance, observability=observability)
 
 
 def _whitened(
@@ -195,13 +161,11 @@ def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
     return np.array([errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()])
 
 
-def _contradictions(
-    T_parent_child: FloatArray, assessment: Assessment, prior: Prior
-) -> dict[str, float]:
+def _contradictions(assessment: Assessment, prior: Prior) -> dict[str, float]:
     """Axis name to the distance of the prior in standard deviations, if it is too large."""
-    covariance = assessment.cov_parent_child_in_child
-    _, jacobian = _prior_residuals(T_parent_child, prior)
-    distances = np.abs(_weighted(T_parent_child, prior)) / np.sqrt(
+    T, covariance = assessment.T_parent_child, assessment.cov_parent_child_in_child
+    _, jacobian = _prior_residuals(T, prior)
+    distances = np.abs(_weighted(T, prior)) / np.sqrt(
         1.0 + np.einsum("pi,ij,pj->p", jacobian, covariance, jacobian)
     )
     verdicts = {dof.name: dof.verdict for dof in assessment.observability}

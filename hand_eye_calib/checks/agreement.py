@@ -14,7 +14,7 @@ from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
 from hand_eye_calib.checks.hypotheses import MIN_PAIRS, StreamPair
-from hand_eye_calib.checks.response import Fitted, Regression, delays, response
+from hand_eye_calib.checks.response import Regression, delays, response
 from hand_eye_calib.checks.streams import USUAL
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -164,24 +164,24 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
 
 def _rotation_gain(slow: Regression, axes: FloatArray) -> Finding | None:
     """A gain of the child's rotations about an axis."""
-    fitted, biases = slow.fit("gain"), slow.biases("gain")
-    sigmas, least, *_ = LIMITS["rotation_gain"]
-    limits = np.maximum(sigmas * fitted.sigmas, _BIASES * biases)
-    ratios = np.abs(fitted.values) / np.maximum(limits, least)
+    (gains, sigmas), biases = slow.fit("gain"), slow.biases("gain")
+    most_sigmas, least, *_ = LIMITS["rotation_gain"]
+    limits = np.maximum(most_sigmas * sigmas, _BIASES * biases)
+    ratios = np.abs(gains) / np.maximum(limits, least)
     ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
         return None
-    axis, gain = ", ".join(f"{component:.2f}" for component in axes[:, k]), fitted.values[k]
-    values = {"axis": axis, "gain": 1.0 + gain, "sigma": fitted.sigmas[k]}
+    axis, gain = ", ".join(f"{component:.2f}" for component in axes[:, k]), gains[k]
+    values = {"axis": axis, "gain": 1.0 + gain, "sigma": sigmas[k]}
     return graded("rotation_gain", "child", gain, **values)
 
 
 def _turned(slow: Regression, stream: str) -> Finding | None:
     """Positions of a stream that are turned against its orientations."""
-    fitted = slow.fit(f"turned_{stream}")
-    sizes, (sigmas, least, *_) = np.abs(fitted.values), LIMITS["worlds_turned"]
-    limits = np.hypot(sigmas * fitted.sigmas, _BIASES * slow.biases(f"turned_{stream}"))
+    turns, sigmas = slow.fit(f"turned_{stream}")
+    sizes, (most_sigmas, least, *_) = np.abs(turns), LIMITS["worlds_turned"]
+    limits = np.hypot(most_sigmas * sigmas, _BIASES * slow.biases(f"turned_{stream}"))
     if (sizes < limits).all() or sizes.max() < least:
         return None
     turned_rad = float(np.linalg.norm(sizes))
@@ -189,17 +189,17 @@ def _turned(slow: Regression, stream: str) -> Finding | None:
     return graded("worlds_turned", stream, turned_rad, **values)
 
 
-def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
+def _odd_one(values: FloatArray, sigmas: FloatArray) -> tuple[int, float, float]:
     """The index of the value that differs most from the others, of three that should be one; by how
     much, and the standard deviation of that.
     """
     best = (0, 0.0, 1.0)
-    weights = 1.0 / np.maximum(fitted.sigmas, 1e-9) ** 2
+    weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
     for k in range(3):
         rest = np.arange(3) != k
-        mean = float(weights[rest] @ fitted.values[rest] / weights[rest].sum())
-        sigma = float(np.hypot(fitted.sigmas[k], 1.0 / np.sqrt(weights[rest].sum())))
-        off = float(fitted.values[k]) - mean
+        mean = float(weights[rest] @ values[rest] / weights[rest].sum())
+        sigma = float(np.hypot(sigmas[k], 1.0 / np.sqrt(weights[rest].sum())))
+        off = float(values[k]) - mean
         if abs(off) / sigma > abs(best[1]) / best[2]:
             best = k, off, sigma
     return best
@@ -208,7 +208,7 @@ def _odd_one(fitted: Fitted) -> tuple[int, float, float]:
 def _axis_gain(slow: Regression, stream: str) -> Finding | None:
     """A coordinate of a stream that has another scale than the others."""
     group = f"axes_{stream}"
-    k, off, sigma = _odd_one(slow.fit(group))
+    k, off, sigma = _odd_one(*slow.fit(group))
     of_noise = slow.biases(group)[k]
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
     if abs(off) < _BIASES * (of_noise + of_drift):
@@ -233,13 +233,13 @@ def _moved_mount(change: MountChange, start_ns: int) -> Finding | None:
 
 def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Finding | None:
     """A world that moves against the other."""
-    drift, positions = slow.fit("drift"), pose_pairs.Ts_cw_c[:, :3, 3]
-    turning = np.cross(drift.values[3:], positions - positions.mean(axis=0))
-    moving = np.sqrt(((drift.values[:3] + turning) ** 2).sum(axis=1).mean())
+    (drift, sigmas), positions = slow.fit("drift"), pose_pairs.Ts_cw_c[:, :3, 3]
+    turning = np.cross(drift[3:], positions - positions.mean(axis=0))
+    moving = np.sqrt(((drift[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(usual, 1e-9)
-    if (np.abs(drift.values) < LIMITS["world_drift"][0] * drift.sigmas).all():
+    if (np.abs(drift) < LIMITS["world_drift"][0] * sigmas).all():
         return None
-    speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift.values, 2))
+    speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift, 2))
     values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
     return graded("world_drift", "both", share, **values, percent=100 * share)
 
@@ -253,13 +253,13 @@ def _delays(
     for stream, Ts in zip(_STREAMS, (pairs.Ts_cw_c, pairs.Ts_pw_p), strict=True):
         beside = [f"{part}_{stream}" for part in _SMOOTHING_S2]
         groups = f"late_{stream}", f"late_axes_{stream}"
-        whole, by_axis = (fast.fit(group, *beside) for group in groups)
-        k, off_s, off_sigma_s = _odd_one(by_axis)
-        delay_s, along = float(whole.values[0]), usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
+        delays_s, sigmas_s = fast.fit(groups[0], *beside)
+        k, off_s, off_sigma_s = _odd_one(*fast.fit(groups[1], *beside))
+        delay_s, along = float(delays_s[0]), usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
         of_axis = (f"{'xyz'[k]} coordinates", "others")
         for group, late_s, sigma_s, speed_m_s, code, (part, others) in (
-            (groups[0], abs(delay_s), whole.sigmas[0], speed, "position_clock", parts),
+            (groups[0], abs(delay_s), sigmas_s[0], speed, "position_clock", parts),
             # The other stream's coordinate cannot be early.
             (groups[1], off_s, off_sigma_s, along, "axis_lag", of_axis),
         ):
@@ -283,8 +283,7 @@ def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Susp
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
             groups = f"{part}_{stream}", f"late_{stream}"
-            fitted = fast.fit(*groups)
-            value_s2, sigma_s2 = float(fitted.values[0]), float(fitted.sigmas[0])
+            value_s2, sigma_s2 = (float(each[0]) for each in fast.fit(*groups))
             if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
                 smoothing_s = value_s2**0.5
                 displaced_m = value_s2 * float(fast.displaced(groups[0])[0])

@@ -19,7 +19,7 @@ import numpy as np
 from hand_eye_calib.alignment import similarity, time_offset
 from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.excitation import LeverArms
+from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
 from hand_eye_calib.checks import agreement, hypotheses
 from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
@@ -109,7 +109,10 @@ def check_streams(
         turns = graded("turns", "child", float(np.log(times)), times=times)
         if turns and 1.0 - correlation.correlation < hypotheses.HOLDS:
             return CheckResult(gravest_first([*findings, turns]))
-        streams, correlation = _on_one_clock(given, time_offset_s, correlation)
+        from_known = replace(correlation, offset_s=correlation.offset_s - time_offset_s)
+        if streams.is_slow:
+            streams, from_known = _of_slow(given, streams, time_offset_s, correlation)
+        correlation = from_known
     aligned = streams.shifted(correlation.offset_s if correlation.is_clear else 0.0)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
@@ -164,21 +167,18 @@ def _fine_offset(
     return time_offset.refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
 
 
-def _on_one_clock(
-    streams: StreamPair, known_s: float, correlation: time_offset.Correlation
+def _of_slow(
+    streams: StreamPair, moved: StreamPair, known_s: float, correlation: time_offset.Correlation
 ) -> tuple[StreamPair, time_offset.Correlation]:
-    """The streams with the known offset, and the correlation from there. Poses too far apart to
-    interpolate are compared where they have stamps in common, unless the coarse offset is off by
-    more than its accuracy.
+    """Streams whose poses are too far apart to interpolate, and the correlation from there: as they
+    are or ``moved`` by the known offset, where they have stamps in common, unless the coarse offset
+    is off by more than its accuracy.
     """
-    moved = streams.shifted(known_s)
-    from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
-    if not streams.is_slow:
-        return moved, from_known
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
         if len(found.synchronised) > hypotheses.MIN_PAIRS and (is_near or not correlation.is_clear):
             return found, replace(correlation, offset_s=0.0)
+    from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
 
@@ -217,13 +217,13 @@ def _check_sizes(
     """
     motions, fit = _motions(pose_pairs, hypotheses.MAX_PAIRS), explanation.fit
     chords = motions.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    hidden = LeverArms.of(chords).hidden_axes(fit.sigma_rotation**2 * np.eye(3))
+    hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
             of_both = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
             fit = similarity.estimate_scale(pose_pairs, of_both)
-            if similarity.scale_differs(fit):
+            if fit.has_own_unit:
                 total, sigma = known * fit.scale, known * fit.scale_sigma
                 values: dict[str, Any] = {"scale": total, "sigma": sigma}
                 values["options"] = {"scale": round(total, 4)}

@@ -253,7 +253,7 @@ _NEVER = float("inf")
 # and an error: at least half of what spoils an extrinsic by 1 cm or 0.5 deg.
 LIMITS = {
     "time_offset": (5.0, 0.005, 0.01, 0.1),  # s
-    "scale": (0.0, 0.01, 0.01, 0.03),  # of the factor, less 1; similarity.scale_differs knows more
+    "scale": (0.0, 0.01, 0.01, 0.03),  # of the factor, less 1; the fit knows more
     "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
     "frozen": (0.0, 0.02, 0.02, 0.02),  # share of the time
     "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m

@@ -255,7 +255,10 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         if not chosen.holds and thorough and not failed:
             chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:
-            chosen, doubts = _or_axes(chosen, streams, lag_s)
+            doubts: list[Finding] = []
+            hypothesis = chosen.hypothesis
+            if hypothesis.axes is None and {*dict(hypothesis.mistakes)} - {"inverse"}:
+                chosen, doubts = _or_axes(chosen, streams, lag_s)
             found = attributed(chosen, streams, lag_s)
             return replace(found, findings=(*found.findings, *doubts))
         # Jumps spoil long motions more than short ones.
@@ -318,11 +321,9 @@ def _fitted(
 def _or_axes(
     chosen: Explanation, streams: StreamPair, lag_s: float
 ) -> tuple[Explanation, list[Finding]]:
-    """The explanation, but for other orientations wrong axes that explain clearly more, or the
-    finding that wrong axes would explain about as much.
+    """The explanation by other orientations, but wrong axes if they explain clearly more; or the
+    finding that they would explain about as much.
     """
-    if chosen.hypothesis.axes is not None or {*dict(chosen.hypothesis.mistakes)} <= {"inverse"}:
-        return chosen, []
     unexplained = chosen.fit.unexplained
     rivals = _below(_ABOUT_EQUAL * unexplained, _axes(), streams, lag_s)
     if not rivals:

@@ -19,7 +19,6 @@ than it is, never smoother. So columns of the child alone show that the child is
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -42,16 +41,6 @@ _INSTEAD = {"axes_child": "scale", "axes_parent": "scale"}
 
 _Columns: TypeAlias = Mapping[str, FloatArray]
 _Where: TypeAlias = Mapping[str, list[int]]
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """What a group of m columns is fitted with: values and standard deviations (m,), by the
-    jackknife over blocks of time.
-    """
-
-    values: FloatArray
-    sigmas: FloatArray
 
 
 class Regression:
@@ -110,8 +99,10 @@ class Regression:
             costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
         return 1.0 - costs[1] / max(costs[0], 1e-300)
 
-    def fit(self, group: str, *beside: str) -> Fitted:
-        """Fit a group beside the base, or what is left of it, and ``beside`` other groups."""
+    def fit(self, group: str, *beside: str) -> tuple[FloatArray, FloatArray]:
+        """What a group of m columns is fitted with, beside the base or what is left of it, and
+        ``beside`` other groups: values and standard deviations (m,), by the jackknife over blocks.
+        """
         before, total = self._columns(group, *beside), self._blocks.sum(axis=0)
         # All rows, and all but those of each block, or of two: errors may last longer than one.
         left_out = np.concatenate([self._blocks, self._blocks[::2] + self._blocks[1::2]])
@@ -119,8 +110,7 @@ class Regression:
         solved = _solved(tables, [*before, *self._where[group]])[:, len(before) :]
         _, *parts = np.split(solved, [1, 1 + BLOCKS])
         variances = [(len(values) - 1) * values.var(axis=0) for values in parts]
-        sigmas = np.sqrt(np.max(variances, axis=0))
-        return Fitted(values=solved[0], sigmas=sigmas)
+        return solved[0], np.sqrt(np.max(variances, axis=0))
 
 
 def _solved(products: FloatArray, columns: list[int]) -> FloatArray:

@@ -1,7 +1,5 @@
 """Checks of a single stream, and of one beside another."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
@@ -11,9 +9,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import find_leap
 from hand_eye_calib.stats import median, quantile
-
-# Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
-PATH_STEP_S = 0.2
 
 # An interval is a gap if it is longer than the limit and than this many median intervals.
 _GAP_INTERVALS = 5.0
@@ -46,36 +41,6 @@ _FASTEST, _HARDEST = 340.0, 49.0
 
 # Velocities are over so long (s), so that noise adds little. A tenth of them may be of jumps.
 _STEP_S, USUAL = 1.0, 0.9
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreamSummary:
-    """Size and motion of a stream: the rate is of the median interval; path length and the sum of
-    all rotation angles are None without positions, orientations.
-    """
-
-    poses: int
-    duration_s: float
-    rate_hz: float
-    longest_interval_s: float
-    path_m: float | None
-    rotation_rad: float | None
-
-
-def summarise(trajectory: Trajectory) -> StreamSummary:
-    """StreamSummary of a trajectory of at least two poses."""
-    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    poses = coarse(trajectory, max(PATH_STEP_S, median(intervals_s))).poses
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
-    return StreamSummary(
-        poses=len(trajectory),
-        duration_s=trajectory.duration_s,
-        rate_hz=float(1.0 / median(intervals_s)),
-        longest_interval_s=float(intervals_s.max()),
-        path_m=float(steps.sum()) if trajectory.has_positions else None,
-        rotation_rad=float(angles.sum()) if trajectory.has_rotations else None,
-    )
 
 
 def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:

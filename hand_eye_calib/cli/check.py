@@ -11,7 +11,7 @@ from hand_eye_calib.text import angle, length
 
 if TYPE_CHECKING:
     from hand_eye_calib.checks.findings import Finding
-    from hand_eye_calib.checks.streams import StreamSummary
+    from hand_eye_calib.engine.evidence import StreamSummary
     from hand_eye_calib.geometry.trajectory import Trajectory
 
 _EPILOG = """\
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
     from hand_eye_calib.checks.findings import finding, gravest_first
-    from hand_eye_calib.checks.streams import summarise
+    from hand_eye_calib.engine.evidence import summarise
     from hand_eye_calib.engine.run import check
     from hand_eye_calib.engine.snapshot import whole_snapshot
     from hand_eye_calib.plain import plain

@@ -19,8 +19,8 @@ from hand_eye_calib.alignment.similarity import SimilarityFit, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment import covariance
-from hand_eye_calib.assessment.moved import PossibleShift, possible_shift
-from hand_eye_calib.assessment.prior import Fused, fuse, widened
+from hand_eye_calib.assessment.moved import possible_shift
+from hand_eye_calib.assessment.prior import fuse, widened
 from hand_eye_calib.config import METHODS, CalibratorConfig, require_backend
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.geometry.se3 import deviation
@@ -48,8 +48,8 @@ class Solved:
 
     Attributes
     ----------
-    shift : PossibleShift or None
-        Of the mount within the recording.
+    spread : (6, 6) array
+        Of a shift of the mount that the recording may have; zeros without one.
     stamps_ns, config, scale, time_offset
         What was solved; the time offset if it was estimated.
     floor : (6, 6) array
@@ -68,7 +68,7 @@ class Solved:
     reference_reason: str = ""
     proved_global: str = "not tried"
     warnings: tuple[str, ...] = ()
-    shift: PossibleShift | None = None
+    spread: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     scale: float = 1.0
     scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
@@ -78,10 +78,10 @@ class Solved:
         """The result without frame names; ``unseen`` axes count as unobservable whatever the method
         says.
         """
-        T_method, config = self.solution.T_parent_child, self.config
-        fused = fuse(
-            T_method, covariance.without_axes(self.assessment, T_method, unseen), config.prior()
-        )
+        assessment, config = self.assessment, self.config
+        if unseen:
+            assessment = covariance.without_axes(assessment, unseen)
+        fused = fuse(assessment, config.prior())
         offset_s, offset_sigma_s = float(config.time_offset), 0.0
         if offset := self.time_offset:
             offset_s, offset_sigma_s = offset.seconds, offset.sigma_s
@@ -105,7 +105,7 @@ class Solved:
             residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns),
             self.stamps_ns,
             config,
-            T_method=T_method,
+            T_method=found.T_parent_child,
             floor=self.floor,
             proved_global=self.proved_global,
             method=self.method,
@@ -119,13 +119,13 @@ class Solved:
             clock_rate=offset.rate if offset else None,
             scale=scale,
             scale_sigma=scale_sigma,
-            warnings=(*warnings, *self.warnings, *(self.shift.warnings if self.shift else ())),
+            warnings=(*warnings, *self.warnings),
         )
 
 
 def calibration_of(
     solution: Any,
-    fused: Fused,
+    fused: covariance.Assessment,
     residuals: Residuals,
     stamps_ns: IntArray,
     config: CalibratorConfig,
@@ -140,8 +140,8 @@ def calibration_of(
     fields.setdefault("status", fused.status(solution.converged))
     return Calibration(
         T_parent_child=fused.T_parent_child,
-        covariance=fused.assessment.cov_parent_child_in_child,
-        observability=fused.assessment.observability,
+        covariance=fused.cov_parent_child_in_child,
+        observability=fused.observability,
         objective=solution.objective,
         n_poses=len(stamps_ns),
         n_pairs=len(residuals),
@@ -199,7 +199,7 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config, is_beside=is_beside)
-    found, spread = solved.solution, np.zeros((6, 6))
+    found, assessment, spread = solved.solution, solved.assessment, np.zeros((6, 6))
     if scale_fit:
         by_log_scale = scale_fit.sensitivity[:, 0]
         share = scale_fit.scale_sigma / scale_fit.scale
@@ -208,11 +208,10 @@ def solve_poses(
     if time_offset and time_offset.fit and not is_model:
         by_offset = time_offset.fit.sensitivity[:, 1]
         spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
-    if solved.shift is not None:
-        spread += solved.shift.spread
+    spread += solved.spread
     return replace(
         solved,
-        assessment=widened(solved.assessment, found.T_parent_child[:3, :3], spread),
+        assessment=widened(assessment, spread) if spread.any() else assessment,
         config=config,
         scale=scale,
         scale_fit=scale_fit,
@@ -272,6 +271,7 @@ def _of_model(
     stamps_ns = pose_pairs.stamps_ns
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
     Ts_cw_c = child.shifted(solution.time_offset_s).at(stamps_ns, extrapolate=True)
+    spread, warnings = possible_shift(solution.part_products, solution.misfit)
     jumps = float(np.mean(solution.jumps))
     warning = (
         f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
@@ -287,8 +287,8 @@ def _of_model(
         stamps_ns=stamps_ns,
         config=config,
         method_reason=reason,
-        warnings=(warning,) if jumps > _MAX_JUMPS else (),
-        shift=possible_shift(solution.part_products, solution.misfit),
+        warnings=(warning, *warnings) if jumps > _MAX_JUMPS else warnings,
+        spread=spread,
     )
 
 
@@ -302,14 +302,15 @@ def _solve_pairs(
     adaptive estimator's, if it is known. Beside another result there is no proof.
     """
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
-    reference, reason, shift = config.reference, "", None
+    reference, reason, spread = config.reference, "", np.zeros((6, 6))
+    warnings: tuple[str, ...] = ()
     if reference == "auto":
         from hand_eye_calib.assessment.reference_selection import select_reference
 
         choice = select_reference(pose_pairs, replace(method, backend="fast"), solution=solution)
         reference, reason, model = choice.reference, choice.reason(), choice.model
         if model.converged and not model.unseen.size:
-            shift = possible_shift(model.part_products, model.misfit)
+            spread, warnings = possible_shift(model.part_products, model.misfit)
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
     found = method.solve(pairs)
     return Solved(
@@ -325,7 +326,8 @@ def _solve_pairs(
         config=config,
         reference_reason=reason,
         proved_global="not tried" if is_beside else method.proved_global(pairs, found),
-        shift=shift,
+        spread=spread,
+        warnings=warnings,
     )
 
 

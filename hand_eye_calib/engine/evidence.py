@@ -7,7 +7,7 @@ import numpy as np
 from hand_eye_calib.alignment.time_offset import angular_rates
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.excitation import Excitation, excitation
-from hand_eye_calib.checks.streams import are_gaps
+from hand_eye_calib.checks.streams import are_gaps, coarse
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -15,8 +15,41 @@ from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.stats import median
 
+# Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
+_PATH_STEP_S = 0.2
+
 # Most samples of the angular rates, and the shortest window of each (s).
 _MAX_RATES, _MIN_WINDOW_S = 1500, 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamSummary:
+    """Size and motion of a stream: the rate is of the median interval; path length and the sum of
+    all rotation angles are None without positions, orientations.
+    """
+
+    poses: int
+    duration_s: float
+    rate_hz: float
+    longest_interval_s: float
+    path_m: float | None
+    rotation_rad: float | None
+
+
+def summarise(trajectory: Trajectory) -> StreamSummary:
+    """StreamSummary of a trajectory of at least two poses."""
+    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
+    poses = coarse(trajectory, max(_PATH_STEP_S, median(intervals_s))).poses
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    return StreamSummary(
+        poses=len(trajectory),
+        duration_s=trajectory.duration_s,
+        rate_hz=float(1.0 / median(intervals_s)),
+        longest_interval_s=float(intervals_s.max()),
+        path_m=float(steps.sum()) if trajectory.has_positions else None,
+        rotation_rad=float(angles.sum()) if trajectory.has_rotations else None,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

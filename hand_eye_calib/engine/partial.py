@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import assess_lever_arm, assess_rotation
-from hand_eye_calib.assessment.prior import Fused, fuse
+from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm, assess_rotation
+from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.checks.check import in_other_units
 from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.config import CalibratorConfig
@@ -69,7 +69,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         ) from None
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
-    fused = fuse(T, assess_lever_arm(poses, solution, solution.covariance), config.prior())
+    fused = fuse(assess_lever_arm(poses, solution, T, solution.covariance), config.prior())
     findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child)
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
@@ -117,7 +117,7 @@ def _steps(
 
 def _of_path(
     solution: of_positions.LeverArmSolution,
-    fused: Fused,
+    fused: Assessment,
     stamps_ns: IntArray,
     poses: FloatArray,
     positions: FloatArray,
@@ -127,7 +127,7 @@ def _of_path(
     share = of_positions.unexplained_share(poses, positions, solution.lever_arm, solution.scale)
     if share < _SUSPECT_PATH:
         return ()
-    axes = fused.assessment.observability[:3]
+    axes = fused.observability[:3]
     is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
     severity = Severity.ERROR
     if is_known and share < _UNRELATED_PATH:
@@ -163,7 +163,7 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     findings = _of_rotation(Ts_pw_p, Ts_cw_c, T)
     if findings and has_rates:
         findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
-    fused = fuse(T, assess_rotation(Ts_pw_p, solution), config.prior())
+    fused = fuse(assess_rotation(Ts_pw_p, solution), config.prior())
     pairs, weights = motion_pairs(Ts_pw_p, Ts_cw_c, "B1"), (~solution.jumps).astype(float)
     return calibration_of(
         solution,

@@ -107,7 +107,7 @@ def _assessed(
 ) -> Calibration:
     X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
     parent, child, parent_world, child_world = frames
-    fused = fuse(X, combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
+    fused = fuse(combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
     errors = se3.log(se3.inverse(Z @ stops.Ts_world_child) @ stops.Ts_world_parent @ X)
     rows = np.arange(len(errors))
     residuals = Residuals(

@@ -1,8 +1,10 @@
-"""Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``."""
+"""Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``; and
+what these state of the pose of a sensor.
+"""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -94,6 +96,27 @@ def numbers_of(value: Any) -> list[float]:
         return [float(x) for x in np.array(value, dtype=float).ravel()]
     except (TypeError, ValueError):
         return []
+
+
+@dataclass(frozen=True)
+class Extrinsic:
+    """Pose of the child sensor in the parent sensor's frame, as stated by a source.
+
+    Attributes
+    ----------
+    T_parent_child : (4, 4) array
+    origin : str
+        Where it comes from, for a person.
+    covariance : (6, 6) array
+        Of the error xi in ``T_parent_child @ exp(xi)``; zero if the source states none.
+    is_calibration : bool
+        Whether it was found from motion, with the same sensors.
+    """
+
+    T_parent_child: FloatArray
+    origin: str
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    is_calibration: bool = False
 
 
 @dataclass

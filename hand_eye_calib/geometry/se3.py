@@ -4,11 +4,7 @@ Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordi
 into ``target``. Tangent vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before
 rotation (rad), acting on the right: ``T_target_source @ exp(xi_in_source)``. Rotation conversions
 are written out because SciPy's take a tenth of a second to import.
-
-An extrinsic is such a transform with its covariance, of the error xi, and with where it comes from.
 """
-
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -343,7 +339,7 @@ def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
     return np.r_[T_target_source[:3, 3], rotation_to_rpy(T_target_source[:3, :3])]
 
 
-# -------------------------------------------------------------------------- extrinsics
+# ------------------------------------------------------------------- their uncertainty
 
 # Standard deviations above this (rad) count as unknown: the derivative does not hold that far.
 _UNKNOWN_ANGLE = 0.3
@@ -352,27 +348,6 @@ _UNKNOWN_ANGLE = 0.3
 # of the rotation: their own would be 10 deg and more, and far from normal.
 _LOCKED_SIGMAS = 5.0
 _LOCKED_COSINE = 1e-4
-
-
-@dataclass(frozen=True)
-class Extrinsic:
-    """Pose of the child sensor in the parent sensor's frame, as stated by a source.
-
-    Attributes
-    ----------
-    T_parent_child : (4, 4) array
-    origin : str
-        Where it comes from, for a person.
-    covariance : (6, 6) array
-        Of the error xi in ``T_parent_child @ exp(xi)``; zero if the source states none.
-    is_calibration : bool
-        Whether it was found from motion, with the same sensors.
-    """
-
-    T_parent_child: FloatArray
-    origin: str
-    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
-    is_calibration: bool = False
 
 
 def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """Trajectories: stamped poses of one sensor in a fixed frame of its own."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from os import PathLike
 from typing import Any, ClassVar, Protocol, Self, TypeAlias
@@ -114,14 +114,15 @@ def _equal(one: Any, other: Any) -> bool:
 
 
 class Columns(WithArrays):
-    """Base of dataclasses whose fields are arrays of as many rows each."""
+    """Base of dataclasses whose arrays, of which the first field is one, have as many rows each."""
 
     def __len__(self) -> int:
         return len(self.columns[0])
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        """Some of the rows."""
-        return type(self)(*(each[index] for each in self.columns))
+        """Some of the rows: a slice, mask or index array."""
+        parts = (x[index] if isinstance(x, np.ndarray) else x for x in self.columns)
+        return type(self)(*parts)
 
     @classmethod
     def concatenate(cls, *parts: Self) -> Self:
@@ -130,7 +131,7 @@ class Columns(WithArrays):
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory(WithArrays):
+class Trajectory(Columns):
     """Stamped poses of a sensor, in strictly increasing order of time.
 
     Parameters
@@ -273,14 +274,6 @@ class Trajectory(WithArrays):
     def has_rotations(self) -> bool:
         """Whether its orientations mean something."""
         return self.measures != "positions"
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-    def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        """Part of the trajectory: a slice, mask or increasing index array."""
-        stamps_ns, poses = self.stamps_ns[index], self.poses[index]
-        return replace(self, stamps_ns=stamps_ns, poses=poses)
 
     @property
     def duration_s(self) -> float:

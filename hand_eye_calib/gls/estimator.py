@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -104,20 +103,6 @@ class ModelSolution:
                 first = ", ".join(f"{each:.3f}" for each in times_s[:5].tolist())
                 said.append(f"{counted(count, what)}{told} {first}{' ...' if count > 5 else ''} s")
         return said
-
-
-def parts_of(parameters: FloatArray, sigmas: FloatArray, unit: float = 1.0) -> dict[str, Any]:
-    """The fields of a solution that parameters make, with the factor of the child's lengths that
-    was taken out before.
-    """
-    return {
-        "parameters": parameters,
-        "parameter_sigmas": sigmas,
-        "scale": unit * (1.0 + float(parameters[SCALE])),
-        "scale_sigma": unit * float(sigmas[SCALE]),
-        "time_offset_s": -float(parameters[TIME]),
-        "time_offset_sigma_s": float(sigmas[TIME]),
-    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,6 +344,7 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     final = fit.moved(normal.step, columns)
     is_there = fit.sigmas > problem.tuning.none
+    parameters, sigmas = (np.where(is_there, each, 0.0) for each in (final.parameters, sigmas))
     return AdaptiveSolution(
         T_parent_child=final.T,
         cov_parent_child_in_child=covariance[:6, :6] + np.diag(unseen),
@@ -366,7 +352,12 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         model=fit.model,
         levels=fit.levels,
         weights=fit.weights,
-        **parts_of(np.where(is_there, final.parameters, 0.0), np.where(is_there, sigmas, 0.0)),
+        parameters=parameters,
+        parameter_sigmas=sigmas,
+        scale=1.0 + float(parameters[SCALE]),
+        scale_sigma=float(sigmas[SCALE]),
+        time_offset_s=-float(parameters[TIME]),
+        time_offset_sigma_s=float(sigmas[TIME]),
         jumps=fit.outliers.jumps,
         spikes=fit.outliers.spikes,
         misfit=misfit,

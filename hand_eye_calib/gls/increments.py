@@ -28,7 +28,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import chained
+from hand_eye_calib.geometry.trajectory import Columns, chained
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import motions
 from hand_eye_calib.stats import median
@@ -46,8 +46,8 @@ PATH_PARTS = ("scale", "direction")
 SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
 
 
-@dataclass(frozen=True)
-class Streams:
+@dataclass(frozen=True, eq=False)
+class Streams(Columns):
     """Poses of both sensors at common stamps.
 
     Attributes
@@ -60,9 +60,6 @@ class Streams:
     stamps_s: FloatArray
     Ts_pw_p: FloatArray
     Ts_cw_c: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.stamps_s)
 
     @cached_property
     def motions_p(self) -> FloatArray:
@@ -87,12 +84,9 @@ class Streams:
         upper = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
         return 0.5 * (lower + upper)
 
-    def __getitem__(self, index: IntArray | slice) -> Streams:
-        return Streams(self.stamps_s[index], self.Ts_pw_p[index], self.Ts_cw_c[index])
 
-
-@dataclass(frozen=True)
-class Course:
+@dataclass(frozen=True, eq=False)
+class Course(Columns):
     """How the sensors move, by steps free of each increment's own noise; sums over time.
 
     Attributes

@@ -25,7 +25,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import increments, reml
-from hand_eye_calib.gls.estimator import ModelSolution, parts_of
+from hand_eye_calib.gls.estimator import ModelSolution
 from hand_eye_calib.gls.noise_model import (
     N_FAST,
     ROTATION,
@@ -333,7 +333,12 @@ def _solution(
         lever_arm=state.X[:3, 3] + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
         response=(float(-parameters[RESPONSE]), float(sigmas[RESPONSE])),
-        **parts_of(parameters, sigmas, first_scale),
+        parameters=parameters,
+        parameter_sigmas=sigmas,
+        scale=first_scale * (1.0 + float(parameters[increments.SCALE])),
+        scale_sigma=first_scale * float(sigmas[increments.SCALE]),
+        time_offset_s=-float(parameters[increments.TIME]),
+        time_offset_sigma_s=float(sigmas[increments.TIME]),
         model=state.model,
         levels=state.levels,
         worse=state.worse,

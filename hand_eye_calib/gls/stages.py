@@ -90,8 +90,8 @@ class Problem:
         poses, course, error, weights = fit.poses, fit.course, fit.error, fit.weights
         outliers = fit.outliers
         if kept is not None:
-            course = Course(course.twists[kept], course.path[kept], course.along[kept])
-            poses, error, weights = poses[kept], error[kept], weights[kept]
+            poses, course = poses[kept], course[kept]
+            error, weights = error[kept], weights[kept]
             outliers = outliers.across(kept)
         known = error if error.any() else None
         return (model or fit.model).state_space(

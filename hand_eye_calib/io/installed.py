@@ -15,8 +15,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import EXPORT_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError, located
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import FrameTree, numbers_of, pose_of
-from hand_eye_calib.geometry.se3 import Extrinsic
+from hand_eye_calib.geometry.frames import Extrinsic, FrameTree, numbers_of, pose_of
 from hand_eye_calib.io.files import read_bytes
 from hand_eye_calib.io.results import FILE_NAME, load_result
 from hand_eye_calib.io.yaml_files import read_yaml

@@ -19,11 +19,12 @@ from datetime import datetime
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment import moved
+from hand_eye_calib.assessment import change, moved
 from hand_eye_calib.assessment.covariance import floor_of_pairs
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import Extrinsic, sigmas_in_parent
+from hand_eye_calib.geometry.frames import Extrinsic
+from hand_eye_calib.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis
@@ -106,7 +107,7 @@ class Alarm:
 
     since_ns: int
     raised_ns: int
-    shift: moved.Moved
+    shift: change.Moved
     log_ratio: float
 
     def __str__(self) -> str:
@@ -269,7 +270,7 @@ class MountMonitor:
         self.alarm = Alarm(
             since_ns=self.alarm.since_ns if self.alarm else since_ns,
             raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
-            shift=moved.moved(
+            shift=change.moved(
                 to_parent @ covariance @ S[best], to_parent @ covariance @ to_parent.T, np.zeros(6)
             ),
             log_ratio=float(ratios[best]),
@@ -422,7 +423,7 @@ class MountWatch:
             unwatched = axes_in_words([AXES[index] for index in np.flatnonzero(hidden)])
             text = "the mount has not moved"
             text += f"; {unwatched} cannot be watched here" if unwatched else ""
-        told = np.where(visible < moved.UNKNOWN_FROM, visible, np.nan)
+        told = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
         shift = alarm.shift.axes if alarm else {}
         return MountState(
             level=Level.ERROR if alarm else Level.OK,

@@ -14,9 +14,8 @@ import numpy as np
 
 from hand_eye_calib import text
 from hand_eye_calib.assessment.excitation import what_is_missing
-from hand_eye_calib.checks.streams import summarise
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.evidence import Evidence, gather
+from hand_eye_calib.engine.evidence import Evidence, gather, summarise
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3

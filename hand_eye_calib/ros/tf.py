@@ -15,8 +15,8 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
-from hand_eye_calib.geometry.frames import FrameTree, checked_pose
-from hand_eye_calib.geometry.se3 import Extrinsic, turned
+from hand_eye_calib.geometry.frames import Extrinsic, FrameTree, checked_pose
+from hand_eye_calib.geometry.se3 import turned
 from hand_eye_calib.io.bags.messages import transform_of
 from hand_eye_calib.io.installed import open_installed, stated
 from hand_eye_calib.live.log import NodeLog

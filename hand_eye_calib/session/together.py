@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.assessment.change import UNKNOWN, Change, moved
 from hand_eye_calib.assessment.covariance import combined
-from hand_eye_calib.assessment.moved import UNKNOWN, Change, moved, scatter_of_recordings
+from hand_eye_calib.assessment.moved import scatter_of_recordings
 from hand_eye_calib.engine.offline import calibrate
 from hand_eye_calib.errors import HandEyeCalibError, InputError, located
-from hand_eye_calib.geometry.se3 import Extrinsic, deviation, turned, xyz_rpy
+from hand_eye_calib.geometry.frames import Extrinsic
+from hand_eye_calib.geometry.se3 import deviation, turned, xyz_rpy
 from hand_eye_calib.geometry.trajectory import TrajectoryLike
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration, Verdict, data_frame

@@ -22,7 +22,7 @@ from hand_eye_calib.cli.reporting import write_report
 from hand_eye_calib.engine import evidence
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import Extrinsic
+from hand_eye_calib.geometry.frames import Extrinsic
 from hand_eye_calib.report.figures import _VIEWS
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict

@@ -15,8 +15,9 @@ from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks import hypotheses
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.checks.streams import check_stream, frozen_share, summarise
+from hand_eye_calib.checks.streams import check_stream, frozen_share
 from hand_eye_calib.cli.main import main
+from hand_eye_calib.engine.evidence import summarise
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
