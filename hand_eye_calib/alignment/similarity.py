@@ -263,13 +263,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     scales[scales <= 1e-3] = 1.0  # opposite or no motion: a bad candidate, but one for every form
     translations = -se3.times(to_translation, scales[:, None] * vectors + np.eye(10)[9])
     Ts = se3.from_rotation_translation(np.array(rotations), translations)
-    coefficients = quadratic_form.coefficients(ranked)
-    # In the smaller unit of length: otherwise a scale of zero would cost least.
-    costs, of_child = [], coefficients.reshape(-1, 2, 3, 4)[:, 1, :, 3]
-    child_lengths = of_child.copy()
-    for T, scale in zip(Ts, scales, strict=True):
-        of_child[:] = child_lengths * scale
-        costs.append(median(quadratic_form.costs(coefficients, T)) / min(scale, 1.0) ** 2)
+    costs = quadratic_form.median_costs(quadratic_form.coefficients(ranked), Ts, scales)
     Ts[:, :3, 3] *= units[0]
     scales *= units[0] / units[1]
     return [(Ts[k], float(scales[k])) for k in np.argsort(costs)[:_REFINED_STARTS]]

@@ -19,6 +19,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.stats import medians
 
 DIMENSION = 13
 
@@ -90,6 +91,15 @@ def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
     """Costs ``|A X - X B|_F^2`` (K,) at one X, from the :func:`coefficients` of the pairs."""
     residuals = coefficients @ (_RESIDUAL @ T_parent_child.ravel()[_X_IN_T])
     return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
+
+
+def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -> FloatArray:
+    """Medians (S,) of the costs at each X (S, 4, 4), the child's translations times its scale, in
+    the smaller unit of length: otherwise a scale of zero would cost least.
+    """
+    at = np.tensordot(Ts.reshape(-1, 16)[:, _X_IN_T], _RESIDUAL, axes=(1, 2))
+    at.reshape(-1, 2, 3, 4, 12)[:, 1, :, 3] *= scales[:, None, None]
+    return medians(((coefficients @ at) ** 2).sum(axis=2)) / np.minimum(scales, 1.0) ** 2
 
 
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
