@@ -110,16 +110,17 @@ _KIND = _both(
 )
 
 
-def _prior(axis: str) -> Any:
-    unit = text.AXIS_UNITS[axis]
-    example = "1.85+/-0.02 or 185cm+/-2cm" if unit == "m" else "-90deg+/-2deg"
-    return option(
+_EXAMPLES = {"m": "1.85+/-0.02 or 185cm+/-2cm", "rad": "-90deg+/-2deg"}
+_PRIOR: dict[str, Any] = {
+    axis: option(
         "",
         f"Prior on {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, "
-        f"such as {example}. Empty for none.",
+        f"such as {_EXAMPLES[unit]}. Empty for none.",
         unit=unit,
         parse=text.parse_prior,
     )
+    for axis, unit in text.AXIS_UNITS.items()
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,12 +238,12 @@ class CalibratorConfig(OptionSet):
     child_quaternion: str = _QUATERNION["child"]
     parent_kind: str = _KIND["parent"]
     child_kind: str = _KIND["child"]
-    prior_x: str = _prior("x")
-    prior_y: str = _prior("y")
-    prior_z: str = _prior("z")
-    prior_roll: str = _prior("roll")
-    prior_pitch: str = _prior("pitch")
-    prior_yaw: str = _prior("yaw")
+    prior_x: str = _PRIOR["x"]
+    prior_y: str = _PRIOR["y"]
+    prior_z: str = _PRIOR["z"]
+    prior_roll: str = _PRIOR["roll"]
+    prior_pitch: str = _PRIOR["pitch"]
+    prior_yaw: str = _PRIOR["yaw"]
     target_translation: float = option(
         0.02,
         "Standard deviation along each axis that is good enough; the verdict and the stop rule use "

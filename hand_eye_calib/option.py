@@ -10,6 +10,8 @@ from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.text import shown_value
 
 OptionValue: TypeAlias = bool | int | float | str
+#: Values of options by their public names: the dataclass that takes them checks their types.
+Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
 _GROUPS = ("keyframe", "prior", "target")

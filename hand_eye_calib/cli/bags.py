@@ -16,6 +16,7 @@ from hand_eye_calib.io.bags.messages import PoseTable
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.sources import Source, source_of
 from hand_eye_calib.io.trajectory_files.table import seconds
+from hand_eye_calib.option import Options
 
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
 # A part may begin before the last poses of the one before it are written.
@@ -89,7 +90,7 @@ def _read_bags(
     with PoseBag(*paths) as bag:
         sources, measures = select(bag, wanted, config)
         refuse_recordings(paths, sources.values())
-        of_streams: dict[str, Any] = {f"{stream}_measures": measures[stream] for stream in STREAMS}
+        of_streams: Options = {f"{stream}_measures": measures[stream] for stream in STREAMS}
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
         bag.shown = with_progress
         poses = bag.poses(sources["parent"], sources["child"], config.max_gap, measures)
@@ -102,7 +103,7 @@ def _read_bags(
         return Recording(calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings))
 
 
-def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Any]) -> None:
+def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]) -> None:
     """Give every pose to the engine. The first message that cannot be used is an InputError with
     topic and stamp.
     """
@@ -177,7 +178,7 @@ def journal_in(path: Path | str) -> Path | None:
     return next((each for each in (path, path / "journal") if has_session(each)), None)
 
 
-def read_journal_of(directory: Path, options: Mapping[str, Any]) -> Recording:
+def read_journal_of(directory: Path, options: Options) -> Recording:
     """Read the journal of a session of the node; the options go before those of the session."""
     from hand_eye_calib.io.journal import read_journal
     from hand_eye_calib.live.session import give

@@ -7,7 +7,7 @@ import argparse
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli import options
 from hand_eye_calib.cli.options import note, print_result, waiting_for
@@ -15,6 +15,7 @@ from hand_eye_calib.errors import ConfigError
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
+    from hand_eye_calib.plain import Document
 
 EXAMPLES = """\
 examples:
@@ -192,7 +193,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
             }
             for each in bag.topics.values()
         ]
-        document: dict[str, Any] = {"bag": str(bag), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
+        document: Document = {"bag": str(bag), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
         document |= {"duration_s": bag.duration_s, "topics": topics, "warnings": bag.warnings}
     document = as_given(document)
     note(*document["warnings"])

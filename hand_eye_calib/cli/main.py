@@ -10,8 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from hand_eye_calib.cli.options import Exit, as_typed, fail
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError
@@ -105,12 +104,6 @@ def exit_code_of(run: Callable[[], int]) -> int:
         return Exit.INTERRUPTED
 
 
-def module_of(command: str) -> ModuleType:
-    """The module of a command, with ``add_arguments`` and ``run``."""
-    name = "calibrate" if command == "replay" else command
-    return import_module(f"hand_eye_calib.cli.{name}")
-
-
 def named_command() -> int:
     """Entry point of the executables that are called like a command, as in ``ros2 run
     hand_eye_calib replay BAG``.
@@ -129,23 +122,24 @@ class CommandParser(argparse.ArgumentParser):
 
 def _run(argv: Sequence[str]) -> int:
     command = next((word for word in argv if not word.startswith("-")), None)
-    look: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
-    look["allow_abbrev"] = False
     parser = CommandParser(
         prog="hand_eye_calib",
         description="Extrinsic calibration of two sensors on one rigid body from their motion.",
         epilog=_EPILOG,
-        **look,
     )
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     if command is not None and command not in COMMANDS:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    added = {each: commands.add_parser(each, help=COMMANDS[each], **look) for each in COMMANDS}
+    added = {each: commands.add_parser(each, help=COMMANDS[each]) for each in COMMANDS}
+    for one in (parser, *added.values()):
+        one.formatter_class, one.allow_abbrev = argparse.RawDescriptionHelpFormatter, False
     if command is not None:
+        file = "calibrate" if command == "replay" else command
+        module = import_module(f"hand_eye_calib.cli.{file}")
         added[command].description = COMMANDS[command]
-        module_of(command).add_arguments(added[command])
+        module.add_arguments(added[command])
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
         word = next((each for each in rest if each.startswith("-")), rest[0]).partition("=")[0]
@@ -159,5 +153,5 @@ def _run(argv: Sequence[str]) -> int:
         parser.print_help()
     else:
         arguments.passed_on, arguments.typed = rest, list(argv)
-        return int(module_of(command).run(arguments))
+        return int(module.run(arguments))
     return 0

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import hand_eye_calib.config as config
 from hand_eye_calib.errors import ConfigError, printable
-from hand_eye_calib.option import OptionField, check_value, did_you_mean, option_name
+from hand_eye_calib.option import Options, OptionValue, check_value, did_you_mean
 from hand_eye_calib.text import quantities
 
 _Item = TypeVar("_Item")
@@ -27,13 +27,10 @@ _Item = TypeVar("_Item")
 STREAMS = ("parent", "child")
 OPTION_FIELDS = config.CalibratorConfig.by_name()
 
-Options = dict[str, Any]
-
 _NODE_OPTIONS = config.NodeConfig.by_name()
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 _NODES = ("calibrator", "**", "*", "")
 _OF_ROS = "ros__parameters"
-_DEST = "option "
 _AXES = ", ".join(name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name)
 
 # What most people set: the help has these options first.
@@ -224,9 +221,10 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
         (group if name in _COMMON else rare).add_argument(
             f"--{flag(name)}",
-            dest=_DEST + name,
-            default=argparse.SUPPRESS,
-            type=argument_type(partial(_value, field), f"{name} "),
+            dest="options",
+            action="append",
+            default=[],
+            type=argument_type(partial(_named, name), f"{name} "),
             metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
@@ -235,41 +233,38 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         "what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; AXIS "
         f"is one of {_AXES}; may be repeated"
     )
-    add("--prior", metavar=metavar, action="append", type=_prior, default=[], help=prior)
+    add("--prior", metavar=metavar, dest="options", action="append", type=_prior, help=prior)
     file = "YAML file with these options by name, or a ROS parameter file"
     add("--config", metavar="FILE", type=Path, help=file)
 
 
 @argument_type
-def _prior(text: str) -> tuple[str, Any]:
+def _prior(text: str) -> tuple[str, OptionValue]:
     axis, equals, value = text.partition("=")
     name = f"prior.{axis}"
     if not equals or name not in OPTION_FIELDS:
         raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}")
-    return name, check_value(OPTION_FIELDS[name], value)
+    return _named(name, value)
 
 
-def _value(field: OptionField, value: Any) -> Any:
-    """The value of an option, from text or as YAML has it; lengths and angles may name a unit."""
+def _named(name: str, value: object) -> tuple[str, OptionValue]:
+    """An option and its value, from text or as YAML has it; lengths and angles may name a unit."""
+    field = OPTION_FIELDS[name]
     kind, unit = type(field.default), field.metadata["unit"]
     if isinstance(value, str) and kind in (int, float):
         if unit in ("m", "rad"):
-            return check_value(field, *quantities(option_name(field), [unit], [value], ""))
+            return name, check_value(field, *quantities(name, [unit], [value], ""))
         with suppress(ValueError):  # check_value says what it should be
             value = kind(value)
-    return check_value(field, value)
+    return name, check_value(field, value)
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
     """The options that were set, by their public names: the command line before the file, of which
     a ConfigError says what does not exist or cannot be.
     """
-    options = _read_config(arguments.config) if arguments.config else {}
-    options |= dict(arguments.prior)
-    for name, value in vars(arguments).items():
-        if name.startswith(_DEST):
-            options[name.removeprefix(_DEST)] = value
-    return options
+    of_file = _read_config(arguments.config) if arguments.config else {}
+    return {**of_file, **dict(arguments.options)}
 
 
 def _read_config(path: Path) -> Options:
@@ -280,14 +275,15 @@ def _read_config(path: Path) -> Options:
     if not isinstance(document, dict | None):
         found = type(document).__name__
         raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
-    options, ignored, of_others = {}, [], []
+    options: dict[str, OptionValue] = {}
+    ignored, of_others = [], []
     for name, value in _flat(document or {}):
         node, is_of_ros, option = name.rpartition(f"{_OF_ROS}.")
         if is_of_ros and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
             of_others.append(f"/{node.strip('/.')}")
         elif option in OPTION_FIELDS:
             try:
-                options[option] = _value(OPTION_FIELDS[option], value)
+                options |= [_named(option, value)]
             except ConfigError as error:
                 # In quotes it keeps the spelling of the file.
                 text = str(error).replace(option, repr(option), 1)

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.options import (
     Exit,
@@ -18,6 +18,7 @@ from hand_eye_calib.cli.options import (
     waiting_for,
 )
 from hand_eye_calib.errors import ConfigError, printable
+from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
@@ -36,7 +37,7 @@ _OPEN = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
 
 def deliver(
     calibration: Calibration,
-    inputs: dict[str, Any],
+    inputs: Document,
     arguments: argparse.Namespace,
     snapshot: "Snapshot | None" = None,
     bag: Path | None = None,

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, flag, note, waiting_for, with_progress
-from hand_eye_calib.engine.run import Options, run
+from hand_eye_calib.engine.run import run
 from hand_eye_calib.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.option import Options
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 

@@ -1,7 +1,7 @@
 """A rig of three sensors or more: calibrated, printed and saved."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.options import fail, note, options_from, print_result, waiting_for
 from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
@@ -12,6 +12,7 @@ from hand_eye_calib.results.document import transforms_of
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
+    from hand_eye_calib.plain import Document
     from hand_eye_calib.session.rig import RigCalibration
 
 
@@ -35,7 +36,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         refuse_recordings(arguments.paths, sources)
         with PoseBag(*arguments.paths) as bag:
             trajectories, notes = read_sources(bag, [(each, "auto") for each in sources])
-            inputs: dict[str, Any] = {"bag": str(bag), "topics": topics}
+            inputs: Document = {"bag": str(bag), "topics": topics}
             if arguments.out:
                 inputs["files"] = [fingerprint(file) for file in bag.files]
     else:

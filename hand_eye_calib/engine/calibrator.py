@@ -18,13 +18,9 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine import snapshot as snapshots
 from hand_eye_calib.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
+from hand_eye_calib.geometry import trajectory
 from hand_eye_calib.geometry.frames import check_pose
-from hand_eye_calib.geometry.trajectory import (
-    FARTHEST_M,
-    QUATERNION_NORM_TOLERANCE,
-    REACH,
-    Trajectory,
-)
+from hand_eye_calib.geometry.trajectory import REACH, Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs, slower_stream
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
@@ -246,8 +242,8 @@ class Calibrator:
         InputError
             If a value is not finite or the quaternion is not of unit length.
         """
-        is_unit = abs(math.hypot(*quat_xyzw) - 1.0) <= QUATERNION_NORM_TOLERANCE
-        if not (is_unit and math.hypot(*position) <= FARTHEST_M):
+        is_unit = abs(math.hypot(*quat_xyzw) - 1.0) <= trajectory.QUATERNION_NORM_TOLERANCE
+        if not (is_unit and math.hypot(*position) <= trajectory.FARTHEST_M):
             check_pose(*position, *quat_xyzw)  # says what is wrong, if anything is
         buffer, limits = self._buffers[stream], self._limits
         is_full = len(buffer) >= limits.capacity

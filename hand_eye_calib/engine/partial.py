@@ -26,7 +26,8 @@ from hand_eye_calib.gls import increments
 from hand_eye_calib.gls import positions as of_positions
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
-from hand_eye_calib.results.records import RateBias, Residuals
+from hand_eye_calib.results.context import RateBias
+from hand_eye_calib.results.records import Residuals
 
 # Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
 # at most, of two 0.5 and more.

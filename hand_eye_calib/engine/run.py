@@ -4,9 +4,9 @@ The only place that says so. The command line, Python, the node, batches and rig
 or :func:`review` for a result that they have already.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,12 +16,12 @@ from hand_eye_calib.checks.findings import Finding, Severity, answered, finding,
 from hand_eye_calib.config import METHODS, CalibratorConfig
 from hand_eye_calib.engine.snapshot import MOST_MOVED_S, STREAMS, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.option import Options
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 
 #: Called with the share that is done, 0 to 1, and the step that begins.
 Progress: TypeAlias = Callable[[float, str], None]
-Options: TypeAlias = Mapping[str, Any]
 
 # What a clock that differs asks for.
 _ESTIMATED: Options = {"time_offset": "estimate"}

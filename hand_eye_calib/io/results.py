@@ -140,7 +140,7 @@ def keep_earlier_results(directory: str | Path) -> str:
     return f"; the files that were there are in {previous}" if found else ""
 
 
-def fingerprint(path: str | Path) -> dict[str, Any]:
+def fingerprint(path: str | Path) -> dict[str, str | int]:
     """Name, size and SHA-256 of an input file, for the provenance; read piece by piece."""
     with open_regular(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -83,7 +83,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
 
 
-def _stacks(path: str | Path) -> list[dict[str, Any]]:
+def _stacks(path: str | Path) -> list[dict[str, FloatArray]]:
     """The samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
     try:
         with np.load(path, allow_pickle=False) as stacks:

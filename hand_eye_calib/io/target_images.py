@@ -116,10 +116,10 @@ def read_camera(path: str | Path) -> Camera:
 
 def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
     """Intrinsics of a CameraInfo message of ROS; of rectified images the projection counts."""
-    of = {name.lower(): value for name, value in vars(info).items()}  # in ROS 1 K, D and P
+    k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
     if is_rectified:
-        return Camera.of(where, np.reshape(of["p"], (3, 4))[:, :3], [])
-    return Camera.of(where, of["k"], of["d"], of["distortion_model"])
+        return Camera.of(where, np.reshape(p, (3, 4))[:, :3], [])
+    return Camera.of(where, k, d, info.distortion_model)
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.run import Options, with_options
+from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.log import GOES_ON_S, ONCE_S, NodeLog
@@ -26,6 +26,7 @@ from hand_eye_calib.live.state import (
     ResultState,
     by_axis,
 )
+from hand_eye_calib.option import Options
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.context import Comparison

@@ -18,7 +18,6 @@ import numpy as np
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.io.bags.messages import measured_as
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.live.session import LiveSession
@@ -194,16 +193,6 @@ class PoseInput:
     def resume(self) -> None:
         """Go on where a session on disk has ended."""
         self._guard.resume(self._session.engines.statistics(self.name).last_stamp_ns)
-
-    def measures_as(self, type_name: str) -> str:
-        """What messages of a type (empty for transforms) are read as here.
-
-        Raises
-        ------
-        ConfigError
-            If they cannot be used.
-        """
-        return measured_as(type_name, self._wanted, self.topic)
 
     # -------------------------------------------------------------- messages
 

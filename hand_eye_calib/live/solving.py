@@ -17,16 +17,17 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.check import CheckResult, can_check
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.run import Options, check, review, with_options
+from hand_eye_calib.engine.run import check, review, with_options
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.live.state import GRACE_S
+from hand_eye_calib.option import Options
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 
@@ -94,29 +95,28 @@ def answer(job: Job) -> Answer:
     calibration is the one with these.
     """
     start_s = time.monotonic()
-    found: dict[str, Any] = {}
-    calibration = None
+    done = Answer(job.session, 0.0, is_checked=job.check)
     try:
         as_came = job.calibrator.snapshot()
         as_sent = with_options(as_came, job.options)
         snapshot = as_sent.resolved
-        found["time_offset"] = snapshot.time_offset
-        found["seen"] = excitation(snapshot.pose_pairs)
-        calibration = snapshot.estimate()
+        done = replace(done, time_offset=snapshot.time_offset)
+        done = replace(done, seen=excitation(snapshot.pose_pairs))
+        done = replace(done, calibration=snapshot.estimate())
     except Exception as error:  # the node reports it
-        found["failure"] = _failure(error)
+        done = replace(done, failure=_failure(error))
     try:
         if job.check and can_check(*as_came.streams):
-            if calibration is None:
-                found["check"] = check(as_sent)
+            if done.calibration is None:
+                done = replace(done, check=check(as_sent))
             else:
-                run = review(calibration, as_sent, job.options)
-                calibration = run.calibration if run.options else calibration
-                found |= {"check": run.check, "options": dict(run.options), "told": run.told}
+                run = review(done.calibration, as_sent, job.options)
+                done = replace(done, check=run.check, options=dict(run.options), told=run.told)
+                if run.options:
+                    done = replace(done, calibration=run.calibration)
     except Exception as error:  # the node reports it
-        found.setdefault("failure", _failure(error))
-    seconds = time.monotonic() - start_s
-    return Answer(job.session, seconds, calibration=calibration, is_checked=job.check, **found)
+        done = replace(done, failure=done.failure or _failure(error))
+    return replace(done, seconds=time.monotonic() - start_s)
 
 
 def _failure(error: Exception) -> Failure:

@@ -1,4 +1,5 @@
-"""Context of a calibration: other recordings, the goal of the session, what is installed.
+"""What only some calibrations have: other recordings, the goal of the session, what is installed, a
+bias of rates.
 
 All are plain values under names, as in :mod:`hand_eye_calib.results.records`.
 """
@@ -7,6 +8,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from hand_eye_calib.results.records import AxisDifference
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateBias:
+    """Bias of angular rates, in the axes of the sensor that has it (``of``), rad/s."""
+
+    of: str
+    rad_per_s: tuple[float, ...]
+    sigma: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)

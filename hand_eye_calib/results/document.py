@@ -270,7 +270,7 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     """Build a result from a document of the right format. Raises KeyError, TypeError or ValueError
     if a value is missing or was changed.
     """
-    from hand_eye_calib.results.context import Comparison, Progress, Together
+    from hand_eye_calib.results.context import Comparison, Progress, RateBias, Together
 
     readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), _transform_of)
     readers |= dict.fromkeys(_COVARIANCES, _covariance_of)
@@ -279,7 +279,7 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
         T_child_parent = se3.inverse(arrays["T_parent_child"])
         arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
     known = {name: each for name, each in data.items() if name not in _NOT_IN_FILES}
-    types = {each.__name__: each for each in (Comparison, Progress, Together)}
+    types = {each.__name__: each for each in (Comparison, Progress, RateBias, Together)}
     result: _OfResult = from_plain(of, known | arrays, **types)
     if tuple(dof.name for dof in result.observability) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")

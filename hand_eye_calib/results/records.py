@@ -220,15 +220,6 @@ class Noise:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateBias:
-    """Bias of angular rates, in the axes of the sensor that has it (``of``), rad/s."""
-
-    of: str
-    rad_per_s: tuple[float, ...]
-    sigma: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class ClockRate:
     """By how much the time offset changes with time, in parts per million.
 

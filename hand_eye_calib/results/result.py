@@ -16,7 +16,7 @@ from hand_eye_calib.results import records
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from hand_eye_calib.results.context import Comparison, Progress, Together
+    from hand_eye_calib.results.context import Comparison, Progress, RateBias, Together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +133,7 @@ class Result:
     clock_rate: records.ClockRate | None = None
     scale: float = 1.0
     scale_sigma: float = 0.0
-    rate_bias: records.RateBias | None = None
+    rate_bias: "RateBias | None" = None
     T_world_world: FloatArray | None = None
     cov_world_world: FloatArray | None = None
 

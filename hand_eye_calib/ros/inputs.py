@@ -1,6 +1,6 @@
 """The subscriptions of the node's inputs: from a topic, or from transforms, to poses."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -29,6 +29,9 @@ _, *_TYPES = POSE_TYPES  # without auto
 
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
+# What rclpy says of a message: its number at its publisher, and when it came (ns).
+MessageInfo = Mapping[str, int]
+
 Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
 
 
@@ -39,7 +42,7 @@ class RosInput(PoseInput):
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
-        self._subscribed: list[tuple[Subscription, Callable[[Any, dict[str, Any]], None]]] = []
+        self._subscribed: list[tuple[Subscription, Callable[[Any, MessageInfo], None]]] = []
 
     def take_waiting(self) -> bool:
         """Take the messages that wait in the queues; whether there were any."""
@@ -102,7 +105,7 @@ class TopicInput(RosInput):
         return "it is published best effort, and qos_overrides ask for reliable: leave them out"
 
     def _subscribe(self, type_name: str) -> None:
-        measures = self.measures_as(type_name)
+        measures = messages.measured_as(type_name, self._wanted, self.topic)
         self._session.set_measures(self.name, measures)
         self._read = messages.MessageReader(type_name, measures, self._session.origin(self.name))
         # With two arguments, rclpy passes the info as well, which its annotations do not know.
@@ -125,7 +128,7 @@ class TopicInput(RosInput):
         self._subscribed = [(subscription, callback)]
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
-    def _receive(self, data: bytes, info: dict[str, Any]) -> None:
+    def _receive(self, data: bytes, info: MessageInfo) -> None:
         # With several publishers, or none any more, the numbers of lost messages are not known.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
@@ -150,14 +153,14 @@ class TfInput(RosInput):
 
     def configure(self, config: CalibratorConfig) -> None:
         super().configure(config)
-        self.measures_as("")
+        messages.measured_as("", self._wanted, self.topic)  # or it raises
         self._stream.max_gap_s = config.max_gap
 
     def discover(self) -> None:
         """Say what is missing; to be called often."""
         self.problem = self._stream.describe_missing()
 
-    def _hear(self, topic: str, message: Any, info: dict[str, Any]) -> None:
+    def _hear(self, topic: str, message: Any, info: MessageInfo) -> None:
         for transform in map(messages.transform_of, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):

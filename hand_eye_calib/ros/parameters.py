@@ -9,7 +9,7 @@ from rclpy.parameter import Parameter
 
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.option import OptionField, check_value, did_you_mean
+from hand_eye_calib.option import OptionField, Options, check_value, did_you_mean
 
 _OF_NODE = NodeConfig.by_name()
 FIELDS = CalibratorConfig.by_name() | _OF_NODE
@@ -67,8 +67,8 @@ class Parameters:
         ]
         if overrides.get("journal") is False:
             overrides["journal"] = "off"  # of which YAML makes a false, without quotes
-        given = {name: field for name, field in FIELDS.items() if name in overrides}
-        self.given = {name: check_value(field, overrides[name]) for name, field in given.items()}
+        ours = [name for name in FIELDS if name in overrides]
+        self.given: Options = {name: check_value(FIELDS[name], overrides[name]) for name in ours}
         self.calibrator, self.node = _configs(self.given)
         check(self.node)
         self._check_node, self._on_change = check, on_change
@@ -78,9 +78,9 @@ class Parameters:
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
-    def _proposed(self, parameters: list[Parameter]) -> dict[str, Any]:
+    def _proposed(self, parameters: list[Parameter]) -> Options:
         ours = {each.name: each.value for each in parameters if each.name in FIELDS}
-        return self.given | {name: check_value(FIELDS[name], ours[name]) for name in ours}
+        return {**self.given, **{name: check_value(FIELDS[name], ours[name]) for name in ours}}
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -97,7 +97,7 @@ class Parameters:
             self._on_change()
 
 
-def _configs(values: dict[str, Any]) -> tuple[CalibratorConfig, NodeConfig]:
+def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
     of_node = {name: value for name, value in values.items() if name in _OF_NODE}
     of_calibrator = {name: value for name, value in values.items() if name not in _OF_NODE}
     return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(of_node)

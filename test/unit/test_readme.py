@@ -4,12 +4,13 @@ import argparse
 import dataclasses
 import re
 import shlex
+from importlib import import_module
 
 import numpy as np
 import pytest
 from source_code import ROOT
 
-from hand_eye_calib.cli.main import COMMANDS, main, module_of
+from hand_eye_calib.cli.main import COMMANDS, main
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.io import files
 from hand_eye_calib.option import option_name
@@ -163,7 +164,8 @@ def test_command_parses(words):
     name, *arguments = words
     assert name in COMMANDS
     parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
-    module_of(name).add_arguments(parser)
+    name = "calibrate" if name == "replay" else name
+    import_module(f"hand_eye_calib.cli.{name}").add_arguments(parser)
     if name == "calibrator":
         assert arguments[:1] in ([], ["--ros-args"])
     elif arguments:

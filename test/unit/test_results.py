@@ -23,8 +23,8 @@ from hand_eye_calib.io.results import load_result, save_result
 from hand_eye_calib.io.yaml_files import yaml_text
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.results.context import AxisProgress, Progress
-from hand_eye_calib.results.records import CorrelatedError, Noise, RateBias
+from hand_eye_calib.results.context import AxisProgress, Progress, RateBias
+from hand_eye_calib.results.records import CorrelatedError, Noise
 
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 

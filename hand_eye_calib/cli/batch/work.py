@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hand_eye_calib.cli.bags import read_recording
-from hand_eye_calib.cli.options import STREAMS, Options
+from hand_eye_calib.cli.options import STREAMS
 from hand_eye_calib.cli.present import exit_code
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, required
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.files import limit_memory
+from hand_eye_calib.option import Options
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result

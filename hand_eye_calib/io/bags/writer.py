@@ -27,7 +27,7 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
     """
     path = Path(path)
     library = rosbags(1 if storage == "rosbag1" else 2)
-    about: dict[str, Any] = {}
+    about: dict[str, object] = {}
     if storage != "rosbag1":
         about = {"version": 9, "storage_plugin": library.StoragePlugin[storage.upper()]}
     with writing(path):
