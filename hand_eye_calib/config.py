@@ -291,7 +291,7 @@ class CalibratorConfig(OptionSet):
             return "rotations"
         if found != {"positions"} or self.parent_measures == self.child_measures:
             raise ConfigError(
-                "positions show a lever arm only beside poses of the other sensor; the parent "
+                "positions determine a lever arm only beside poses of the other sensor; the parent "
                 f"measures {self.parent_measures}, the child {self.child_measures}"
             )
         return "positions"

@@ -180,8 +180,8 @@ class TestRefusedInput:
         peer.wait_matched(peer.publisher(NavSatFix, "parent_odom"))
         wrong = peer.publisher(NavSatFix, "child_odom")
         node.wait_for_log(
-            "/child_odom is not used: positions show a lever arm only beside poses of the other "
-            "sensor; the parent measures positions, the child positions"
+            "/child_odom is not used: positions determine a lever arm only beside poses of the "
+            "other sensor; the parent measures positions, the child positions"
         )
         peer.node.destroy_publisher(wrong)
         peer.wait_matched(peer.publisher(Odometry, "child_odom"))
@@ -195,7 +195,7 @@ class TestRefusedInput:
             ),
             (
                 ["child_measures:=positions", "parent_measures:=positions"],
-                "positions show a lever arm only beside poses of the other sensor",
+                "positions determine a lever arm only beside poses of the other sensor",
             ),
             (
                 ["child_measures:=positions", "monitor:=true", "installed:=1 0 0 0 0 0"],

@@ -451,7 +451,7 @@ class MessageReader:
         if len(beyond):
             raise InputError(
                 "found latitude {:.7g} and longitude {:.7g}: no latitude is beyond 90 deg, no "
-                "longitude beyond 360; if they are swapped, mend their source".format(*beyond[0])
+                "longitude beyond 360; if they are swapped, repair their source".format(*beyond[0])
             )
         lat, lon = np.radians(values[rows, :2]).T
         return self._origin.local(lat, lon, values[rows, 2])
