@@ -29,9 +29,6 @@ _, *_TYPES = POSE_TYPES  # without auto
 
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
-# What rclpy says of a message: its number at its publisher, and when it came (ns).
-MessageInfo = Mapping[str, int]
-
 Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
 
 
@@ -42,7 +39,7 @@ class RosInput(PoseInput):
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
-        self._subscribed: list[tuple[Subscription, Callable[[Any, MessageInfo], None]]] = []
+        self._subscribed: list[tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]] = []
 
     def take_waiting(self) -> bool:
         """Take the messages that wait in the queues; whether there were any."""
@@ -128,7 +125,7 @@ class TopicInput(RosInput):
         self._subscribed = [(subscription, callback)]
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
-    def _receive(self, data: bytes, info: MessageInfo) -> None:
+    def _receive(self, data: bytes, info: Mapping[str, int]) -> None:
         # With several publishers, or none any more, the numbers of lost messages are not known.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
@@ -160,7 +157,7 @@ class TfInput(RosInput):
         """Say what is missing; to be called often."""
         self.problem = self._stream.describe_missing()
 
-    def _hear(self, topic: str, message: Any, info: MessageInfo) -> None:
+    def _hear(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         for transform in map(messages.transform_of, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
