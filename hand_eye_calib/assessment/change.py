@@ -11,7 +11,8 @@ import numpy as np
 
 from hand_eye_calib import stats
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.results.records import AXES, AxisDifference
+from hand_eye_calib.results.context import AxisDifference
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.text import amount, listing
 
 # Standard deviations (m, rad) that stand for "nothing known", and from which on one does.

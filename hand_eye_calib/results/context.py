@@ -7,8 +7,6 @@ All are plain values under names, as in :mod:`hand_eye_calib.results.records`.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from hand_eye_calib.results.records import AxisDifference
-
 
 @dataclass(frozen=True, kw_only=True)
 class RateBias:
@@ -102,6 +100,18 @@ class Progress:
     limiting_axis: str = ""
     will_not_get_there: bool = False
     axes: Mapping[str, AxisProgress] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class AxisDifference:
+    """Difference on one axis (m, rad), its standard deviation (infinite if unknown), the change
+    that would have been seen nine times out of ten, and the verdict: same, moved or cannot tell.
+    """
+
+    difference: float
+    sigma: float
+    visible: float
+    verdict: str
 
 
 @dataclass(frozen=True, kw_only=True)

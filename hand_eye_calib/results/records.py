@@ -278,17 +278,5 @@ class AxisScatter:
     excess_over_own: float | None = None
 
 
-@dataclass(frozen=True)
-class AxisDifference:
-    """Difference on one axis (m, rad), its standard deviation (infinite if unknown), the change
-    that would have been seen nine times out of ten, and the verdict: same, moved or cannot tell.
-    """
-
-    difference: float
-    sigma: float
-    visible: float
-    verdict: str
-
-
 #: Axis (x, y, z, roll, pitch, yaw) to the scatter of other answers about a result.
 CrossCheck: TypeAlias = Mapping[str, AxisScatter]

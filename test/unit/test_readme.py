@@ -164,8 +164,7 @@ def test_command_parses(words):
     name, *arguments = words
     assert name in COMMANDS
     parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
-    name = "calibrate" if name == "replay" else name
-    import_module(f"hand_eye_calib.cli.{name}").add_arguments(parser)
+    import_module(f"hand_eye_calib.cli.{name.replace('replay', 'calibrate')}").add_arguments(parser)
     if name == "calibrator":
         assert arguments[:1] in ([], ["--ros-args"])
     elif arguments:
@@ -198,9 +197,8 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["simulate", "--out", "drives", "--seed", "3"]) == 0
     for sensor, name in ((1, "lidar"), (2, "camera")):
-        (tmp_path / f"{name}.tum").write_bytes(
-            (tmp_path / "drives" / "run_01" / f"T_S{sensor}_W{sensor}.txt").read_bytes()
-        )
+        drive = tmp_path / "drives" / "run_01" / f"T_S{sensor}_W{sensor}.txt"
+        drive.rename(tmp_path / f"{name}.tum")
     (block,) = re.findall(r"```python\n(.*?)```", PAGES["README.md"], re.DOTALL)
     names = {}
     exec(compile(block, "README.md", "exec"), names)

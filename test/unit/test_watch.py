@@ -29,8 +29,8 @@ from hand_eye_calib.live.state import (
     SavedState,
 )
 from hand_eye_calib.plain import from_plain, plain
+from hand_eye_calib.results import context
 from hand_eye_calib.results.context import AxisProgress, Comparison, Difference, Progress
-from hand_eye_calib.results.records import AxisDifference
 from hand_eye_calib.watch import terminal
 from hand_eye_calib.watch.board import AXES, Board, Tone
 from hand_eye_calib.watch.web import WebServer, fragment
@@ -195,7 +195,7 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
 
 
 def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
-    differs = AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
+    differs = context.AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
     axes = dict.fromkeys(AXES, differs) | {"yaw": replace(differs, sigma=INF)}
     difference = Difference(first="a", second="b", verdict="moved", sentence="", axes=axes)
     comparison = Comparison(
