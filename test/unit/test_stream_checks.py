@@ -151,6 +151,8 @@ class TestWhichStreamAndWhatToDo:
             parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0
         )
         assert grave(known) == []
+        tiny = [each.options for each in check_streams(parent, child.scaled(2e5)).findings]
+        assert {"scale": pytest.approx(5e-6, rel=0.005)} in tiny
         # The solve may have found a scale of its own beside the unit.
         found = check_streams(parent.scaled(1000.0), child, scale=1.17).findings
         assert [each.options for each in found if each.code == "units"] == [{"parent_scale": 0.001}]
