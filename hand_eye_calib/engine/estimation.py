@@ -220,14 +220,19 @@ def solve_poses(
     )
 
 
+def odometry_share(config: CalibratorConfig) -> float:
+    """Share of the common-mode floor, that of two odometries, which these sensors have."""
+    return [config.parent_kind, config.child_kind].count("odometry") / 2
+
+
 def _floor(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
     """Common-mode floor (6, 6) of the errors of the sensors that are odometries."""
-    found, odometries = solved.solution, [config.parent_kind, config.child_kind].count("odometry")
+    found, share = solved.solution, odometry_share(config)
     speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
     if isinstance(found, AdaptiveSolution):
-        return odometries / 2 * covariance.common_mode_floor(speed_m_s)
+        return share * covariance.common_mode_floor(speed_m_s)
     T = found.T_parent_child
-    return odometries / 2 * covariance.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
+    return share * covariance.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
 
 
 def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:

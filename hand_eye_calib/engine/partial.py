@@ -13,12 +13,12 @@ from functools import partial
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.assessment.covariance import Assessment, assess_lever_arm, assess_rotation
+from hand_eye_calib.assessment import covariance
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.checks.check import in_other_units
 from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.estimation import calibration_of, residuals_of
+from hand_eye_calib.engine import estimation
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator as adaptive_estimator
@@ -70,13 +70,14 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         ) from None
     sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
-    fused = fuse(assess_lever_arm(poses, solution, T, solution.covariance), config.prior())
+    assessment = covariance.assess_lever_arm(poses, solution, T, solution.covariance)
+    fused = fuse(assessment, config.prior())
     findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child)
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
     offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
-    return calibration_of(
+    return estimation.calibration_of(
         solution,
         fused,
         _steps(solution, stamps_ns, poses, positions),
@@ -118,7 +119,7 @@ def _steps(
 
 def _of_path(
     solution: of_positions.LeverArmSolution,
-    fused: Assessment,
+    fused: covariance.Assessment,
     stamps_ns: IntArray,
     poses: FloatArray,
     positions: FloatArray,
@@ -146,10 +147,13 @@ def _of_path(
     return (finding("unrelated", severity=severity, share=share, text=text),)
 
 
-def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+def estimate_rotation(
+    pose_pairs: PosePairs, config: CalibratorConfig, cross_check: bool = True
+) -> Calibration:
     """Solve and assess synchronised rotations, on one clock: a result without frame names whose
     translation is zero, and unknown. Positions are not looked at. The poses already have the time
     offset of the options, in seconds; a scale there is a ConfigError, as rotations have none.
+    With a ``cross_check`` it is compared with DNLO's answers from the same rotations.
     """
     if config.scale not in ("none", "auto"):
         config.require_poses(f"scale {config.scale}")
@@ -164,17 +168,19 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
     findings = _of_rotation(Ts_pw_p, Ts_cw_c, T)
     if findings and has_rates:
         findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
-    fused = fuse(assess_rotation(Ts_pw_p, solution), config.prior())
+    fused = fuse(covariance.assess_rotation(Ts_pw_p, solution), config.prior())
     pairs, weights = motion_pairs(Ts_pw_p, Ts_cw_c, "B1"), (~solution.jumps).astype(float)
-    return calibration_of(
+    floor = estimation.odometry_share(config) * covariance.common_mode_floor()
+    result = estimation.calibration_of(
         solution,
         fused,
-        residuals_of(pairs, T, weights, stamps_ns),
+        estimation.residuals_of(pairs, T, weights, stamps_ns),
         stamps_ns,
         config,
         status=fused.status(solution.converged, slice(3, 6)),
         reference="increments",
         measured="rotations",
+        floor=floor * np.repeat([0.0, 1.0], 3),
         noise=solution.describe(stamps_ns),
         T_method=T,
         time_offset_s=float(config.time_offset) + solution.time_offset_s,
@@ -182,6 +188,11 @@ def estimate_rotation(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibr
         rate_bias=_rate_bias(solution, config) if has_rates else None,
         findings=findings,
     )
+    if not cross_check:
+        return result
+    rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
+    others, halves = estimation.other_answers(result, config, rotations)
+    return replace(result, cross_check=estimation.compare_answers(result, others, halves))
 
 
 def _rotation(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -149,7 +149,7 @@ class Snapshot:
         if len(pairs) < config.min_pairs:
             raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
         if config.measured != "poses":
-            result = resolved._estimate_part()
+            result = resolved._estimate_part(cross_check is not False)
         else:
             solved = solve_poses(pairs, config, resolved.time_offset)
             if cross_check or (cross_check is None and config.reference == "auto"):
@@ -163,15 +163,15 @@ class Snapshot:
             warnings=self.warnings + result.warnings,
         )
 
-    def _estimate_part(self) -> Calibration:
+    def _estimate_part(self, cross_check: bool) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
         from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
 
         for name, allowed in _OF_PARTS_ALONE.items():
             if getattr(self.config, name) not in allowed:
                 self.config.require_poses(f"{name} {getattr(self.config, name)}")
-        of_positions = self.config.measured == "positions"
-        estimate = estimate_lever_arm if of_positions else estimate_rotation
+        rotation = partial(estimate_rotation, cross_check=cross_check)
+        estimate = estimate_lever_arm if self.config.measured == "positions" else rotation
         result = estimate(self.pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, float(self.config.time_offset)
         if not abs(found_s - given_s) < UNASKED_S:
