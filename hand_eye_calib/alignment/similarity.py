@@ -126,7 +126,7 @@ def fit_similarity(
     twists: tuple[FloatArray, FloatArray] | None = None,
     start: SimilarityFit | FloatArray | None = None,
     same_unit: bool = False,
-    most: float = np.inf,
+    most: float | None = None,
 ) -> SimilarityFit:
     """Fit X, the scale and, with twists, the time offset.
 
@@ -143,7 +143,7 @@ def fit_similarity(
         Keep the scale at 1. A sensor that the body only rotates about hardly moves, and any small
         scale would do.
     most : float
-        Starts that leave more than this share unexplained are not refined.
+        Starts that leave more than this share unexplained are not refined; by default, all are.
 
     Returns
     -------
@@ -157,7 +157,7 @@ def fit_similarity(
     fits: list[SimilarityFit] = []
     for T, scale in starts:
         scale = 1.0 if same_unit else scale
-        if most == np.inf or problem.shares(problem.rows(T, scale)[1], scale)[1] < most:
+        if most is None or problem.shares(problem.rows(T, scale)[1], scale)[1] < most:
             fits.append(problem.describe(*problem.refine(T, scale)))
             if fits[-1].unexplained < EXPLAINED:
                 break

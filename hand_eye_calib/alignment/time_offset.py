@@ -335,7 +335,7 @@ def offset_over(
     max_gap_s: float,
     start: SimilarityFit | FloatArray | None,
     least_s: float,
-    most: float = np.inf,
+    most: float | None = None,
 ) -> TimeOffset:
     """Offset and fit over motions of ``lag_s``, from the coarse offset and a fit, or X, to start
     at; no fit if there are too few. A clearly smaller offset than ``least_s`` is not refined,
@@ -360,7 +360,7 @@ def offset_over(
         twists = (steps / spans_s[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
         start = fit = fit_similarity(pairs, of_child, start=start, most=most)
-        if not fit.explains_translation and most == np.inf:
+        if not fit.explains_translation and most is None:
             # A body that rotates about one of its sensors shows no scale.
             in_one_unit = fit_similarity(pairs, of_child, same_unit=True)
             start = fit = in_one_unit if in_one_unit.explains_translation else fit

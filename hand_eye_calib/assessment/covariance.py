@@ -36,13 +36,8 @@ from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
 from hand_eye_calib.gls.normal import answers_without, multiplied
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
-from hand_eye_calib.results.records import (
-    AXES,
-    ROTATIONS,
-    DofObservability,
-    DofVerdict,
-    SolveStatus,
-)
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.stats import CHI2, median
 

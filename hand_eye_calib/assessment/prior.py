@@ -21,13 +21,8 @@ from hand_eye_calib.assessment.covariance import (
 )
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent
-from hand_eye_calib.results.records import (
-    AXES,
-    ROTATIONS,
-    TRANSLATIONS,
-    DofObservability,
-    DofVerdict,
-)
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS
 
 # Axis name to (value, standard deviation), in m and rad.
 Prior: TypeAlias = Mapping[str, tuple[float, float]]

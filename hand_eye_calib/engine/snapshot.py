@@ -119,8 +119,9 @@ class Snapshot:
                 for stream, Ts in zip(STREAMS, (kept.Ts_pw_p, kept.Ts_cw_c), strict=True)
             )
             kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
-        made = pair_poses(self.config, self.parent, self.child, self.paired_at, kept)
-        pairs, most = PosePairs.concatenate(kept, made), self.config.max_pairs
+        pairs = pair_poses(self.config, self.parent, self.child, self.paired_at, kept)
+        pairs = PosePairs.concatenate(kept, pairs) if len(kept) else pairs
+        most = self.config.max_pairs
         return downsample(pairs, most) if len(pairs) > most else pairs
 
     def estimate(self, cross_check: bool | None = None) -> Calibration:
@@ -312,4 +313,7 @@ def pair_poses(
     if len(kept):
         made = made[made.stamps_ns > kept.stamps_ns[-1]]
     least = config.keyframe_min_translation, config.keyframe_min_rotation
-    return made[select_keyframes(made, *least, config.keyframe_min_interval, previous=kept[-1:])]
+    least_s = config.keyframe_min_interval
+    if not any((*least, least_s)):
+        return made
+    return made[select_keyframes(made, *least, least_s, previous=kept[-1:])]

@@ -318,6 +318,19 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
     return start @ exp(np.asarray(fraction, dtype=float)[..., None] * step)
 
 
+def chained(steps: FloatArray) -> FloatArray:
+    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on; or
+    poses.
+    """
+    rotations = np.concatenate([np.eye(steps.shape[-1])[None], steps])
+    # Products of all up to each, in as many passes as their number has binary digits.
+    span = 1
+    while span < len(rotations):
+        rotations[span:] = rotations[:-span] @ rotations[span:]
+        span *= 2
+    return rotations
+
+
 def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
     """Poses (N, 4, 4) that were written in another convention than they were read in: ``invert``
     ("none", "poses" or "orientations") says what was of the world in the sensor, ``quaternion``

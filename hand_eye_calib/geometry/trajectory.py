@@ -42,19 +42,6 @@ STEADY, CLEARLY = 0.05, 4.0
 _CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
 
 
-def chained(steps: FloatArray) -> FloatArray:
-    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on; or
-    poses.
-    """
-    rotations = np.concatenate([np.eye(steps.shape[-1])[None], steps])
-    # Products of all up to each, in as many passes as their number has binary digits.
-    span = 1
-    while span < len(rotations):
-        rotations[span:] = rotations[:-span] @ rotations[span:]
-        span *= 2
-    return rotations
-
-
 def scatter_of_direction(poses: FloatArray) -> float:
     """How much the direction of a sensor's motion scatters in its own axes: 0 if it is always the
     same, as on vehicles, 1 if it goes everywhere, or if there are too few steps.
@@ -72,28 +59,6 @@ def scatter_of_direction(poses: FloatArray) -> float:
     directions = steps[is_step] / lengths[is_step, None]
     in_sensor = np.einsum("nji,nj->ni", rotations[rows[:-1][is_step]], directions)
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
-
-
-class RateIntegrator:
-    """Integrates the angular rates of one sensor as they come in, in parts of any length."""
-
-    def __init__(self) -> None:
-        self._last: tuple[IntArray, FloatArray] | None = None
-        self._rotation = np.eye(3)
-
-    def rotations(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-        """Orientations (M, 3, 3) of the sensor in its own first axes at the stamps (M,) of the next
-        rates (M, 3), rad/s, about its axes. Between two stamps the mean of both counts; a step back
-        in time is a rotation back.
-        """
-        last_ns, last_rate = self._last or (stamps_ns[:1], rates[:1])
-        intervals_s = np.diff(np.concatenate([last_ns, stamps_ns])) * 1e-9
-        means = 0.5 * (rates + np.concatenate([last_rate, rates[:-1]]))
-        steps = se3.rotation_exp(means * intervals_s[:, None])
-        rotations = self._rotation @ chained(steps)[1:]
-        self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
-        self._rotation = se3.nearest_rotation(rotations[-1])  # rounding adds up over hours
-        return rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +220,8 @@ class Trajectory(Columns):
         """
         rates = np.asarray(rates, dtype=float).reshape(-1, 3)
         _check_finite("rate", rates)
+        from hand_eye_calib.geometry.rates import RateIntegrator
+
         rotations = RateIntegrator().rotations(np.asarray(stamps_ns), rates)
         poses = se3.from_rotation_translation(rotations, np.zeros_like(rates))
         return cls(stamps_ns, poses, sensor_frame, "", "rates")

@@ -161,12 +161,12 @@ class AdaptiveSolution(ModelSolution):
         sigmas = np.exp(0.5 * self.levels)
         lasting = tuple(
             CorrelatedError(
-                kind=process.kind,
-                part=process.part,
+                kind=kind,
+                part=part,
                 sigma=float(sigmas[at]),
                 tau_s=float(np.exp(self.levels[at + 1])),
             )
-            for process, at in zip(self.model.slow, range(N_FAST, len(sigmas), 2), strict=True)
+            for (kind, part), at in zip(self.model.slow, range(N_FAST, len(sigmas), 2), strict=True)
         )
         return Noise(
             in_words=(),
@@ -276,10 +276,12 @@ def solve(
 
 def _solved(problem: Problem) -> AdaptiveSolution:
     first = _passed(problem, start(problem), STAGES[:_FIRST])
-    kept = _strided(problem, first)
-    if len(kept) < len(problem.streams):
-        fewer = replace(problem, streams=problem.streams[kept], _last=[])
-        return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
+    # A camera that sees a target: its errors repeat, and exceed the rotation from pose to pose.
+    if first.model.centre != "sensors" and problem.is_noisy(first):
+        kept = _strided(problem, first)
+        if len(kept) < len(problem.streams):
+            fewer = replace(problem, streams=problem.streams[kept], _last=[])
+            return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
     fit = _passed(problem, first, STAGES[_FIRST:])
     if not is_settled(problem, fit):
         problem = replace(problem, without=problem.without | {"lasting"})
@@ -296,14 +298,9 @@ def _passed(problem: Problem, fit: Fit, stages: Sequence) -> Fit:
 
 
 def _strided(problem: Problem, fit: Fit) -> IntArray:
-    """Poses to keep: all, but of a camera that sees a target, whose errors repeat from pose to pose
-    and exceed the rotation between them, only every so many.
-    """
+    """Poses to keep: every so many, so that the rotation between them exceeds their noise."""
     tuning, streams = problem.tuning, problem.streams
-    every = np.arange(len(streams))
-    if fit.model.centre == "sensors" or not problem.is_noisy(fit):
-        return every
-    every = every[~fit.outliers.spikes]
+    every = np.flatnonzero(~fit.outliers.spikes)
     most = max((s for s in tuning.strides if len(every) >= s * tuning.fewest_strides), default=1)
     noise = np.exp(0.5 * fit.levels[ROTATION])
     rotations = streams.Ts_pw_p[every, :3, :3]
@@ -338,8 +335,8 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
     unseen = np.zeros(6)
-    for process, level in zip(fit.model.slow, fit.levels[N_FAST::2], strict=True):
-        if process.kind == "body":
+    for (kind, _), level in zip(fit.model.slow, fit.levels[N_FAST::2], strict=True):
+        if kind == "body":
             unseen[:3] += problem.tuning.unseen_share * np.exp(level)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     final = fit.moved(normal.step, columns)

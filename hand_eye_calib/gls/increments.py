@@ -28,7 +28,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Columns, chained
+from hand_eye_calib.geometry.trajectory import Columns
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import motions
 from hand_eye_calib.stats import median
@@ -249,5 +249,5 @@ def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
     """Poses (N, 4, 4) at the origin, freed of a bias (3,), rad/s, of the rates they come from."""
     rotations = motions(Ts_cw_c[:-1], Ts_cw_c[1:])[:, :3, :3]
     by_rate = _by_rate_bias(rotations, np.diff(stamps_ns) * 1e-9)
-    freed = chained(rotations @ se3.rotation_exp(-by_rate @ bias))
+    freed = se3.chained(rotations @ se3.rotation_exp(-by_rate @ bias))
     return se3.from_rotation_translation(freed, np.zeros((len(freed), 3)))

@@ -9,7 +9,7 @@ the parent's world, each with one variance; so are the scale and the direction o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,21 +34,16 @@ PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
 TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
 
-class Slow(NamedTuple):
-    """A process of time-correlated errors: ``kind`` body or world, ``part`` translation or
-    rotation; or of the path, scale or direction.
-    """
-
-    kind: str
-    part: str
-
+#: A process of time-correlated errors, by its kind and its part: of the body or the world,
+#: translation or rotation; of the path, scale or direction.
+Slow: TypeAlias = tuple[str, str]
 
 # No rotation fixed to the body: a mount that wanders. X would forget what it knows, and no
 # recording gains by it.
-LASTING = (
-    Slow("body", "translation"),
-    *(Slow("world", part) for part in PARTS),
-    *(Slow("path", part) for part in PATH_PARTS),
+LASTING: tuple[Slow, ...] = (
+    ("body", "translation"),
+    *(("world", part) for part in PARTS),
+    *(("path", part) for part in PATH_PARTS),
 )
 
 
@@ -97,12 +92,12 @@ class NoiseModel:
         both = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         is_swung = self.centre != "sensors"
         ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
-        for process in self.slow:
-            if process.kind == "path":
-                behind.append(-linearisation.by_path[process.part])
+        for kind, part in self.slow:
+            if kind == "path":
+                behind.append(-linearisation.by_path[part])
                 ahead.append(np.zeros_like(behind[-1]))
                 continue
-            directions = _directions(process, streams, to_child)
+            directions = _directions(kind, part, streams, to_child)
             ahead.append(directions[1:])
             behind.append(linearisation.adjoints @ directions[:-1])
         return StateSpace(
@@ -114,7 +109,7 @@ class NoiseModel:
             white=(TRANSLATIONS[None], self._swing(streams, to_child) if is_swung else both[None]),
             walk=(TRANSLATIONS, both),
             twists=twists,
-            sizes=tuple(part.shape[2] for part in ahead[1:]),
+            sizes=tuple(each.shape[2] for each in ahead[1:]),
             weights=weights,
             cut=cut,
             prior=prior,
@@ -165,7 +160,7 @@ class NoiseModel:
         precision[taus], lower[taus] = TUNING.tau_precision, shortest
         upper[taus] = max(np.log(TUNING.longest_share * self.duration_s), shortest)
         # One that lasts is a bias or a mount askew, which have parameters.
-        is_direction = [each.part == "direction" for each in self.slow]
+        is_direction = [part == "direction" for _, part in self.slow]
         upper[taus] = np.where(is_direction, shortest + np.log(TUNING.first_tau), upper[taus])
         return Prior(mean, precision, lower, upper)
 
@@ -177,7 +172,7 @@ class NoiseModel:
         longest = max(TUNING.last_tau * self.duration_s, shortest)
         first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
         first |= dict.fromkeys(PATH_PARTS, TUNING.first_of_path)
-        starts = [[first[each.part], 0.5 * np.log(shortest * longest)] for each in processes]
+        starts = [[first[part], 0.5 * np.log(shortest * longest)] for _, part in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
     def lasting(
@@ -186,20 +181,19 @@ class NoiseModel:
         """The lasting part (N, 6) of the error c that states (N, d) make, in the child's frame."""
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         error, start = np.zeros((len(states), 6)), WHITE
-        for process in self.slow:
-            if process.kind != "path":
-                directions = _directions(process, streams, to_child)
+        for kind, part in self.slow:
+            if kind != "path":
+                directions = _directions(kind, part, streams, to_child)
                 error += se3.times(directions, states[:, start : start + 3])
-            start += 1 if process.part == "scale" else 3
+            start += 1 if part == "scale" else 3
         return error
 
 
-def _directions(process: Slow, streams: Streams, to_child: FloatArray) -> FloatArray:
+def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) -> FloatArray:
     """Matrices (N, 6, 3) from a process to the error c."""
-    part = PARTS[process.part]
-    if process.kind == "body":
-        return np.broadcast_to(np.eye(6)[:, part], (len(streams), 6, 3))
-    return to_child[:, part] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
+    if kind == "body":
+        return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
+    return to_child[:, PARTS[part]] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
 
 
 def whole(levels: FloatArray) -> FloatArray:

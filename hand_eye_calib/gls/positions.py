@@ -35,7 +35,6 @@ from hand_eye_calib.gls.noise_model import (
     WALK_ROTATION,
     WALK_TRANSLATION,
     NoiseModel,
-    Slow,
 )
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.gls.outliers import Outliers, bridged, innovations, judged
@@ -257,7 +256,7 @@ class _State:
         fit, _ = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
         best, loss = replace(self, levels=fit.levels), fit.loss - TUNING.least_gain
         for kind in kinds:
-            model, levels = self.model.with_lasting((Slow(kind, "translation"),), fit.levels)
+            model, levels = self.model.with_lasting(((kind, "translation"),), fit.levels)
             rival, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
             if rival.loss < loss:
                 best, loss = replace(self, model=model, levels=rival.levels), rival.loss

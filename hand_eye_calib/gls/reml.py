@@ -39,15 +39,16 @@ def fit(
     space: StateSpace,
     start: FloatArray,
     prior: Prior,
+    settled: float = TUNING.settled_loss,
     smaller: Callable[[FloatArray, FloatArray], Rest] | None = None,
 ) -> tuple[Posterior, FloatArray]:
     """The posterior at the levels of the least loss near a start, by Newton steps within a radius;
-    and the average information (m, m). What ``smaller`` leaves out on the way stays out.
+    and the average information (m, m). Steps end if one promises to lower the loss by less than
+    ``settled``. What ``smaller`` leaves out on the way stays out.
     """
     levels = np.clip(start, prior.lower, prior.upper)
     posterior, radius = Posterior(space, levels), TUNING.first_radius
     loss = posterior.loss + prior.loss(levels)
-    settled = TUNING.settled_loss * (len(levels) if smaller else 1)
     for _ in range(TUNING.max_steps):
         gradient, information = derivatives(posterior)
         if smaller and (rest := smaller(levels, information)):

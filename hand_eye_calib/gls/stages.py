@@ -352,7 +352,9 @@ def lasting(problem: Problem, fit: Fit) -> Fit:
         faint, prior = faint[left], reml.Prior(*np.array(prior)[:, left])
         return problem.space(free, kept, model), levels[left], prior
 
-    found, information = reml.fit(problem.space(free, kept, model), levels, prior, smaller)
+    settled = TUNING.settled_loss * len(levels)
+    space = problem.space(free, kept, model)
+    found, information = reml.fit(space, levels, prior, settled, smaller)
     before = Posterior(problem.space(free, kept), fit.levels)
     if before.loss - found.loss < tuning.least_gain:
         return fit

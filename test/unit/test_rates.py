@@ -15,7 +15,8 @@ from hand_eye_calib.engine.run import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import RateIntegrator, Trajectory
+from hand_eye_calib.geometry.rates import RateIntegrator
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import MessageReader, unpack_poses
 from hand_eye_calib.io.bags.writer import write_bag
 from hand_eye_calib.results.document import usable_numbers

@@ -22,7 +22,8 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, printable, required
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Columns, RateIntegrator, Trajectory
+from hand_eye_calib.geometry.rates import RateIntegrator
+from hand_eye_calib.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.io.bags.storage import MessageKind
 from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.geodetic import LocalOrigin

@@ -18,7 +18,6 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import ConfigError, InputError, located, printable
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import chained
 from hand_eye_calib.io.bags import messages
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
@@ -243,7 +242,7 @@ class FieldReading(Reading):
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
     """Poses (N, 7) of velocities (N, 6), m/s and rad/s, in the sensor's own frame."""
     steps = (twists[1:] + twists[:-1]) / 2 * (np.diff(stamps_ns) * 1e-9)[:, None]
-    return se3.to_rows(chained(se3.exp(steps)))
+    return se3.to_rows(se3.chained(se3.exp(steps)))
 
 
 class TransformReading(Reading):
