@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = options.options_from(arguments)
     sources, (first, second), repairs = _opened(arguments, given)
     snapshot = whole_snapshot(first, second, given)
-    config, parent, child = snapshot.config, snapshot.parent, snapshot.child
+    config, (parent, child) = snapshot.config, snapshot.unpaired
     with waiting_for("checking the streams"):
         checked = check(snapshot, None if config.measured == "poses" else snapshot.estimate())
     of_files = [finding("disorder", text=text) for text in repairs]

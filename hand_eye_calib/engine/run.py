@@ -139,7 +139,7 @@ def _reviewed(first: Run, settled: Collection[str], known: Run | None = None) ->
     is_free = not METHODS[snapshot.config.method].uses_reference
     if (clock := first.check.offset) and is_free and snapshot.config.reference == "auto":
         # Of a rate, and of DNLO, which has no offset of its own, only the check knows.
-        left_s = clock.largest_s(snapshot.child.duration_s)
+        left_s = clock.largest_s(snapshot.unpaired[1].duration_s)
         if clock.spread_s < 0.5 * left_s:
             moved_s = max(abs(moved_s), left_s - 0.5 * clock.spread_s)
     most_s = _MOST_MOVED_POSITIONS_S if calibration.measured == "positions" else MOST_MOVED_S

@@ -69,15 +69,13 @@ class Snapshot:
     time_offset: TimeOffset | None = None
 
     @property
-    def parent(self) -> Trajectory:
-        """Trajectory of the parent's poses that are not paired yet, in the usual convention."""
-        return _put_right(self.buffered_parent, "parent", self.config)
-
-    @property
-    def child(self) -> Trajectory:
-        """Trajectory of the child's, alike; its stamps are corrected for a clock rate."""
+    def unpaired(self) -> tuple[Trajectory, Trajectory]:
+        """Trajectories of the poses of parent and child that are not paired yet, in the usual
+        convention; the child's stamps are corrected for a clock rate.
+        """
+        parent = _put_right(self.buffered_parent, "parent", self.config)
         child = _put_right(self.buffered_child, "child", self.config)
-        return self.time_offset.steadied(child) if self.time_offset else child
+        return parent, self.time_offset.steadied(child) if self.time_offset else child
 
     @cached_property
     def resolved(self) -> "Snapshot":
@@ -87,7 +85,7 @@ class Snapshot:
         """
         if not isinstance(self.config.time_offset, str):
             return self
-        found = self.time_offset or estimated_time_offset(self.config, self.parent, self.child)
+        found = self.time_offset or estimated_time_offset(self.config, *self.unpaired)
         config = replace(self.config, time_offset=found.seconds)
         return replace(self, config=config, time_offset=found)
 
@@ -119,7 +117,7 @@ class Snapshot:
                 for stream, Ts in zip(STREAMS, (kept.Ts_pw_p, kept.Ts_cw_c), strict=True)
             )
             kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
-        pairs = pair_poses(self.config, self.parent, self.child, self.paired_at, kept)
+        pairs = pair_poses(self.config, *self.unpaired, self.paired_at, kept)
         pairs = PosePairs.concatenate(kept, pairs) if len(kept) else pairs
         most = self.config.max_pairs
         return downsample(pairs, most) if len(pairs) > most else pairs
@@ -189,7 +187,7 @@ class Snapshot:
         """Trajectories of the whole session, each on its own clock: as they came in, or at the
         stamps of the pairs if some were made.
         """
-        streams = [self.parent, self.child]
+        streams = [*self.unpaired]
         if len(self.kept):
             pairs, offset_s = self.pose_pairs, float(self.resolved.config.time_offset)
             streams = [Trajectory(pairs.stamps_ns, Ts) for Ts in (pairs.Ts_pw_p, pairs.Ts_cw_c)]
@@ -202,7 +200,8 @@ class Snapshot:
 
     def _what_is_missing(self, n_pairs: int) -> str:
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
-        parent, child = self.parent, self.child.shifted(float(self.config.time_offset))
+        parent, child = self.unpaired
+        child = child.shifted(float(self.config.time_offset))
         for name, stream in zip(STREAMS, (parent, child), strict=True):
             if len(stream) == 0:
                 return f"{needed}: no poses on the {name} stream"

@@ -280,8 +280,16 @@ class Trajectory(Columns):
 
     @cached_property
     def _bends(self) -> tuple[FloatArray, FloatArray]:
-        alike = self._alike
-        return bends(self.stamps_ns, self.poses) if alike is None else alike._bends
+        """Change (N, 6) of the twist per second at each of the poses, zero at the ends; and the
+        share (N - 1, 6) of motion in those at both ends of each interval.
+        """
+        if self._alike is not None:
+            return self._alike._bends
+        spans_s = np.diff(self.stamps_ns)[:, None] * 1e-9
+        twists = se3.log(se3.inverse(self.poses[:-1]) @ self.poses[1:]) / spans_s
+        changes = np.zeros((len(self), 6))
+        changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
+        return changes, _shares_of_motion(changes)
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
@@ -375,17 +383,6 @@ def check_poses(poses: FloatArray) -> None:
         )
 
 
-def bends(stamps_ns: IntArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Change (N, 6) of the twist per second at each of the poses (N, 4, 4) at stamps (N,), zero at
-    the ends; and the share (N - 1, 6) of motion in those at both ends of each interval.
-    """
-    spans_s = np.diff(stamps_ns)[:, None] * 1e-9
-    twists = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / spans_s
-    changes = np.zeros((len(poses), 6))
-    changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
-    return changes, _shares_of_motion(changes)
-
-
 def corners(
     stamps_ns: IntArray,
     changes: FloatArray,
@@ -402,9 +399,9 @@ def corners(
     well are alike. The share of motion follows from the poses nearby. What is left of white noise
     halfway between two poses is between 0.71 (a constant twist) and 0.80 of it.
 
-    Of poses at stamps (N,) with these :func:`bends`, ``start`` (M,) are the indices of those before
-    each wanted one, ``fraction`` (M,) is of the interval to the next. Returns xi (M, 6) in
-    ``T_world_sensor exp(xi)``.
+    Of poses at stamps (N,) with these changes of their twists, of which these shares are motion,
+    ``start`` (M,) are the indices of those before each wanted one, ``fraction`` (M,) is of the
+    interval to the next. Returns xi (M, 6) in ``T_world_sensor exp(xi)``.
     """
     at_start, at_end = changes[start], changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0

@@ -9,6 +9,8 @@ numpy's overhead grows with the logarithm of the number of blocks.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
@@ -110,6 +112,7 @@ class Factor:
             np.matmul(transposed(inverse), own, out=solved[1::2])
         return solved
 
+    @cached_property
     def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
         """Blocks of the inverse on the diagonal (n, d, d) and below it (n - 1, d, d)."""
         shape = (self._n_last, self._size) * 2

@@ -90,7 +90,7 @@ def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Fl
         white[:, :, 0],
         (combined(levels, space.white) + along[:, :, None] * space.twists[:, None])
         / weights[:, None, None],
-        posterior.selected_inverse[0][:, :WHITE, :WHITE]
+        posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
         + white[:, :, 1:] @ transposed(white[:, :, 1:]),
         spikes,
     )

@@ -272,7 +272,7 @@ class _State:
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], states)
-        spread = posterior.selected_inverse[0][:, range(3), range(3)]
+        spread = posterior.factor.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)

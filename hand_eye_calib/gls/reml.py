@@ -111,7 +111,7 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     states, walk = posterior.restricted()
     white = states[:, :WHITE]
     moments = white @ transposed(white)
-    moments += posterior.selected_inverse[0][:, :WHITE, :WHITE]
+    moments += posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
     moments *= space.weights[:, None, None]
     excess = precision - precision @ moments @ precision
     excess[space.weights == 0.0] = 0.0
@@ -130,7 +130,7 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 
 def walk_covariance(posterior: Posterior) -> FloatArray:
     """Covariance (n, 6, 6) of the walk's increments for known parameters."""
-    covariance, below = posterior.selected_inverse
+    covariance, below = posterior.factor.selected_inverse
     space, back = posterior.space, transposed(posterior.space.behind)
     half = space.ahead_times(covariance[1:])
     own = space.ahead_times(transposed(half)) + transposed(back) @ covariance[:-1] @ back
@@ -142,7 +142,7 @@ def walk_covariance(posterior: Posterior) -> FloatArray:
 
 def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
     phi, rest, group = process.phi, process.rest, process.states
-    covariance, below = posterior.selected_inverse
+    covariance, below = posterior.factor.selected_inverse
     own = states[:, group]
     here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
     ahead = np.einsum("nii->n", below[:, group, group])

@@ -18,7 +18,6 @@ whitened columns ``Y = L^-1 U' W Z``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -164,7 +163,8 @@ class Posterior:
         Factors of the latter: zero for increments that are no evidence.
     markov : list of Markov
     factor : Factor
-        Of the precision P of all states.
+        Of the precision P of all states. Its ``selected_inverse`` are their covariances for known
+        parameters: of each pose's (N, d, d), and between each pose's and the one's before.
     log_determinant : float
         log|V|, increments that are no evidence left out.
     whitened : (N, d, p + 1) array
@@ -249,13 +249,6 @@ class Posterior:
                 states = range(size)[process.states]
                 diagonal[0, states, states] += 1.0 / process.variance
         return diagonal, below
-
-    @cached_property
-    def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
-        """Covariances of the states for known parameters: of each pose's (N, d, d), and between
-        each pose's and the one's before (n, d, d).
-        """
-        return self.factor.selected_inverse()
 
     def halves(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """W Z and Y, (n, 6, k) and (N, d, k), of columns Z (n, 6, k)."""

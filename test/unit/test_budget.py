@@ -13,20 +13,19 @@ from source_code import SOURCE, imports_of, room_of
 
 ROOT = SOURCE.parent
 
-# What may not be exceeded: the sizes of today, which may only be lowered, but lines, constants and
-# long functions, which have goals of 30,000, 400 and 10. Goal still ahead:
-# 450 functions entered by ``calibrate a b``.
+# What may not be exceeded: the sizes of today, which may only be lowered. Goal still ahead: 450
+# functions entered by ``calibrate a b``.
 LIMITS = {
-    "lines": 29_540,
-    "lines of code": 19_000,
+    "lines": 29_500,
+    "lines of code": 18_990,
     "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
     "rooms": 28,
     "floors": 17,
     "arrows between rooms": 166,
-    "functions entered by calibrate": 547,
-    "files entered by calibrate": 50,
+    "functions entered by calibrate": 513,
+    "files entered by calibrate": 49,
     "lines of reproduction": 6_960,
     "lines of tests": 19_000,
     "words of documentation": 34_900,

@@ -149,7 +149,7 @@ def test_a_stream_on_its_own_does_not_fill_the_memory():
     calibrator = Calibrator(CalibratorConfig(reference="B3"), BufferLimits(capacity=100))
     feed(calibrator, "parent", parent)
     assert calibrator.statistics("parent").dropped_unpaired > 0
-    assert len(calibrator.snapshot().parent) <= 100
+    assert len(calibrator.snapshot().unpaired[0]) <= 100
     feed(calibrator, "child", child)
     assert len(calibrator.snapshot().pose_pairs) > 20
 
@@ -193,7 +193,7 @@ def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
     parent, child = long_drive(child_every=child_every)
     calibrator = play(by_stamp(parent, child), max_gap=1.0)
     assert np.array_equal(calibrator.snapshot().pose_pairs.stamps_ns, child.stamps_ns)
-    assert len(calibrator.snapshot().parent) < 150
+    assert len(calibrator.snapshot().unpaired[0]) < 150
     np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert not calibrator.add_pose("parent", parent.stamps_ns[0] + 1, [0.0] * 3, [0.0, 0, 0, 1])
     assert calibrator.statistics("parent").refused_late == 1
@@ -287,7 +287,7 @@ def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
     parent, child = noisy_pair(parked, 0, 1e-4, 5e-4)
     sound = play(by_stamp(parent, child), max_pairs=max_pairs).snapshot()
     assert check(sound).findings == ()
-    assert len(sound.parent) < 150 < 250 < len(sound.streams[0])
+    assert len(sound.unpaired[0]) < 150 < 250 < len(sound.streams[0])
     late = play(by_stamp(parent, reordered(child)), max_pairs=max_pairs, time_offset=0.5).snapshot()
     assert [finding.code for finding in check(late).findings][0] == "quaternion_order"
     assert late.streams[1].stamps_ns[0] in child.stamps_ns

@@ -145,10 +145,10 @@ def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):
 
 
 def test_a_clock_that_was_given_as_right_is_left_by_the_noise_model_too(late):
-    shifted = replace(late, buffered_child=late.child.shifted(0.04))  # 0.01 s remain
-    found = hec.calibrate(late.parent, shifted.child)
+    shifted = replace(late, buffered_child=late.buffered_child.shifted(0.04))  # 0.01 s remain
+    found = hec.calibrate(late.buffered_parent, shifted.buffered_child)
     assert found.time_offset_s == pytest.approx(0.01, abs=0.003)
-    result = hec.calibrate(late.parent, shifted.child, time_offset=0.0)
+    result = hec.calibrate(late.buffered_parent, shifted.buffered_child, time_offset=0.0)
     assert (result.time_offset_s, result.time_offset_sigma_s) == (0.0, 0.0)
 
 
@@ -218,7 +218,7 @@ def test_a_clock_that_the_user_set_stays(late, options):
 
 
 def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
-    child = late.child.shifted(5.0)
+    child = late.buffered_child.shifted(5.0)
     found = run(replace(late, buffered_child=child)).calibration
     assert found.time_offset_s == pytest.approx(-5.0, abs=0.1)
     assert found.verdict is not Verdict.USE

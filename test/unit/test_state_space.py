@@ -191,7 +191,7 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
     np.testing.assert_allclose(squares, flat.T @ inverse @ flat, rtol=1e-12, atol=1e-12)
     assert factor.log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
     blocks = inverse.reshape(n, d, n, d)
-    found, found_below = factor.selected_inverse()
+    found, found_below = factor.selected_inverse
     assert found.shape == (n, d, d)
     assert found_below.shape == (n - 1, d, d)
     for k in range(n):
