@@ -226,7 +226,7 @@ def _check_sizes(
             if fit.has_own_unit:
                 total, sigma = known * fit.scale, known * fit.scale_sigma
                 values: dict[str, Any] = {"scale": total, "sigma": sigma}
-                values["options"] = {"scale": round(total, 4) or round(total, 9)}
+                values["options"] = {"scale": float(f"{total:.4g}")}
                 differs = graded("scale", "child", fit.scale - 1.0, **values)
                 findings.append(in_other_units(fit.scale, fit.scale_sigma, known) or differs)
     return [*filter(None, findings)], fit
