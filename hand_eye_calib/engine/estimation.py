@@ -60,6 +60,7 @@ class Solved:
     assessment: covariance.Assessment
     method: str
     reference: str
+    measured: str = "poses"
     pairs: MotionPairs
     weights: FloatArray
     stamps_ns: IntArray
@@ -105,6 +106,8 @@ class Solved:
             residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns),
             self.stamps_ns,
             config,
+            status=fused.status(found.converged, slice(3 * (self.measured == "rotations"), 6)),
+            measured=self.measured,
             T_method=found.T_parent_child,
             floor=self.floor,
             proved_global=self.proved_global,

@@ -164,35 +164,26 @@ def estimate_rotation(
     stamps_ns = pose_pairs.stamps_ns
     has_rates = "rates" in (config.parent_measures, config.child_measures)
     solution, Ts_cw_c = _rotation(stamps_ns, Ts_pw_p, as_read, has_rates)
-    T = solution.T_parent_child
-    findings = _of_rotation(Ts_pw_p, Ts_cw_c, T)
+    findings = _of_rotation(Ts_pw_p, Ts_cw_c, solution.T_parent_child)
     if findings and has_rates:
         findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
-    fused = fuse(covariance.assess_rotation(Ts_pw_p, solution), config.prior())
-    pairs, weights = motion_pairs(Ts_pw_p, Ts_cw_c, "B1"), (~solution.jumps).astype(float)
+    rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
     floor = estimation.odometry_share(config) * covariance.common_mode_floor()
-    result = estimation.calibration_of(
-        solution,
-        fused,
-        estimation.residuals_of(pairs, T, weights, stamps_ns),
-        stamps_ns,
-        config,
-        status=fused.status(solution.converged, slice(3, 6)),
+    solved = estimation.Solved(
+        solution=solution,
+        assessment=covariance.assess_rotation(Ts_pw_p, solution),
+        method="adaptive",
         reference="increments",
         measured="rotations",
+        pairs=motion_pairs(Ts_pw_p, Ts_cw_c, "B1"),
+        weights=(~solution.jumps).astype(float),
+        stamps_ns=stamps_ns,
+        config=config,
         floor=floor * np.repeat([0.0, 1.0], 3),
-        noise=solution.describe(stamps_ns),
-        T_method=T,
-        time_offset_s=float(config.time_offset) + solution.time_offset_s,
-        time_offset_sigma_s=solution.time_offset_sigma_s,
-        rate_bias=_rate_bias(solution, config) if has_rates else None,
-        findings=findings,
     )
-    if not cross_check:
-        return result
-    rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
-    others, halves = estimation.other_answers(result, config, rotations)
-    return replace(result, cross_check=estimation.compare_answers(result, others, halves))
+    checked = estimation.cross_checked(solved, config, rotations) if cross_check else None
+    rate_bias = _rate_bias(solution, config) if has_rates else None
+    return replace(checked or solved.calibration(), rate_bias=rate_bias, findings=findings)
 
 
 def _rotation(
