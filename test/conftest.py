@@ -25,9 +25,7 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="session", autouse=True)
 def _ros_stays_here(tmp_path_factory):
-    """ROS talks on this machine only and logs into pytest's temporary folder; subprocesses inherit
-    it.
-    """
+    """ROS talks on this machine and logs into pytest's temporary folder; so do subprocesses."""
     patch = pytest.MonkeyPatch()
     patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
@@ -57,7 +55,5 @@ def no_processes(monkeypatch):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Reports of this process have no figures: drawing them takes several times as long as the
-    solve.
-    """
+    """Reports of this process have no figures: drawing takes several times as long as the solve."""
     monkeypatch.setattr("hand_eye_calib.report.report.figures_of", lambda *_: [])

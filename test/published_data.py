@@ -37,16 +37,12 @@ def data_folder():
 
 
 def kitti_short():
-    """KITTI 2011_09_30_drive_0027: parent lidar, child grey camera (Välimäki et al. 2023, section
-    5).
-    """
+    """KITTI 2011_09_30_drive_0027: parent lidar, child grey camera (Välimäki et al. 2023, 5)."""
     return published.load_kitti_short(data_folder() / "valimaki2023")
 
 
 def kitti_long():
-    """KITTI 2011_10_03_drive_0027: parent grey camera, child colour camera (Välimäki et al. 2023,
-    section 5).
-    """
+    """KITTI 2011_10_03_drive_0027: parent grey camera, child colour camera (the same)."""
     return published.load_kitti_long(data_folder() / "valimaki2023")
 
 

@@ -138,9 +138,7 @@ SIMPLE_KITTI_TRUTH = SIMPLE_KITTI.T_parent_child
 
 
 def euroc(estimate, flight):
-    """Visual-inertial odometry of a flight ("vio_stereo", "v2_01") and the true poses of camera
-    0.
-    """
+    """Visual-inertial odometry of a flight ("vio_stereo", "v2_01"), and the truth of camera 0."""
     folder = data_folder() / "euroc_vio"
     files = (folder / f"{estimate}_{flight}.tum", folder / f"cam0_truth_{flight}.tum")
     return Recording(f"euroc {estimate} {flight}", *map(read_trajectory, files))

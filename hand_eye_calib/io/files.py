@@ -7,6 +7,7 @@ than :data:`LARGEST`; the poses that are kept come on top.
 
 import os
 import stat
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
@@ -44,6 +45,11 @@ LONGEST_LINE = 65_536
 _STATM = Path("/proc/self/statm")
 _is_limited = False
 
+# Limits before each reading of those that go on, in several threads perhaps: the last to end puts
+# back those before the first.
+_before: list[tuple[int, int]] = []
+_lock = threading.Lock()
+
 
 def limit_memory() -> None:
     """Limit the memory of reading from now on, where the system can (Linux). That is for commands:
@@ -63,15 +69,20 @@ def reading_memory() -> Iterator[None]:
         return
     import resource
 
-    limits = resource.getrlimit(resource.RLIMIT_AS)
-    # Virtual memory, which is what the limit counts.
-    most = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
-    allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_AS, (min([most, *allowed]), limits[1]))
+    with _lock:
+        limits = resource.getrlimit(resource.RLIMIT_AS)
+        _before.append(limits)
+        # Virtual memory, which is what the limit counts.
+        most = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
+        allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min([most, *allowed]), limits[1]))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, limits)
+        with _lock:
+            if len(_before) == 1:
+                resource.setrlimit(resource.RLIMIT_AS, _before[0])
+            _before.pop()
 
 
 def open_regular(path: str | Path) -> BufferedReader:

@@ -102,9 +102,7 @@ def test_worlds_do_not_matter(method, seed, truth, parent_world, child_world):
     shift=vectors(coordinate),
 )
 def test_zhuang_knows_a_false_minimum(seed, axis, angle, shift):
-    """Sensors that face almost opposite ways: from the identity it often misses the truth, but then
-    says so.
-    """
+    """Sensors that face almost opposite ways: from the identity it often fails, but says so."""
     assume(np.linalg.norm(axis) > 0.1)
     truth = se3.from_rotation_translation(
         se3.rotation_exp(angle * axis / np.linalg.norm(axis)), shift

@@ -234,9 +234,7 @@ def found_codes(parent, child):
 
 
 def fault_table(every=1):
-    """Recording to fault to (whether right, what was found), of every n-th cell; no fault is
-    ``CLEAN``.
-    """
+    """Recording to fault to (whether right, what was found), each n-th cell; none is ``CLEAN``."""
     recordings = real_data.all_recordings()
     table = {}
     for index, recording in enumerate(recordings):

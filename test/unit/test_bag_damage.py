@@ -10,6 +10,7 @@ import faulthandler
 import json
 import os
 import re
+import resource
 import subprocess
 import sys
 
@@ -26,6 +27,7 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.io import files
 from hand_eye_calib.io.bags import storage
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.writer import write_bag, write_streams
@@ -308,6 +310,17 @@ def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, kind):
     assert "takes more memory than any bag should" in errors[0]
     assert mib < MOST_MIB
     assert "Traceback" not in done.stderr
+
+
+def test_readings_in_several_threads_leave_no_limit_behind(monkeypatch):
+    monkeypatch.setattr(files, "_is_limited", True)
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    first, second = files.reading_memory(), files.reading_memory()
+    with first:
+        second.__enter__()
+        assert resource.getrlimit(resource.RLIMIT_AS) != before
+    second.__exit__(None, None, None)
+    assert resource.getrlimit(resource.RLIMIT_AS) == before
 
 
 def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
