@@ -67,7 +67,7 @@ _DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
 
 # Orientations agree better than those of two sensors (in all recordings, 1.3 times) to this angle
-# (rad) and share of the turning, and as copies do to a hundredth of it: rounding to five digits.
+# (rad) and share of the rotation, and as copies do to a hundredth of it: rounding to five digits.
 _ALIKE = np.radians(0.08), 0.005
 
 # Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
@@ -76,7 +76,7 @@ _ALIKE = np.radians(0.08), 0.005
 # quarters of that half differ by less than the first), or what remains is not: it falls as motion
 # does, more steeply than errors that add up. Times when both accelerate so many times more than
 # usual are left out: an impulse is white as well. So is motion that intervals are too long for:
-# noise of orientations is a small share of the squared turning.
+# noise of orientations is a small share of the squared rotation.
 _FLAT, _ABRUPT, _LITTLE_NOISE = 1.75, 4.0, 1e-3
 _SHARED = np.array([3.0, 30.0])
 

@@ -89,7 +89,7 @@ class LiveSession:
         """
         self._is_solved = limits is None
         made = Calibrator(self.calibrator.config, limits or BufferLimits())
-        self.engines = Calibrators(child=made)
+        self.engines, self._n_solved = Calibrators(child=made), 0
 
     def set_measures(self, stream: str, measures: str) -> None:
         """Take what a stream measures, as its message type says, one of config.MEASURES.
