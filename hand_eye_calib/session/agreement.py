@@ -171,14 +171,19 @@ def common_of(
     """
     factors = np.array(list(itertools.product(_FACTORS, repeat=2)) if usual.any() else [(1.0, 1.0)])
     variances = (np.repeat(factors, 3, axis=1) * usual) ** 2
+    spread = covariances + (variances[:, :, None] * np.eye(6))[:, None]
+    weights = np.linalg.inv(spread)
+    each = np.linalg.inv(weights.sum(axis=1))
+    volumes = np.linalg.slogdet(spread)[1].sum(axis=1) - np.linalg.slogdet(each)[1]
     # Half-Cauchy, on a grid of logarithms.
     log_prior = np.log(factors / (1.0 + factors**2)).sum(axis=1)
     T = start
     for _ in range(_ROUNDS):
         errors = deviation(Ts, T)
-        found = [_at_scatter(errors, covariances + np.diag(one)) for one in variances]
-        means, each, likelihoods = map(np.array, zip(*found, strict=True))
-        shares = log_prior + likelihoods
+        means = (each @ np.einsum("gnij,nj->gi", weights, errors)[:, :, None])[:, :, 0]
+        rest = errors - means[:, None]
+        squared = (rest * np.einsum("gnij,gnj->gni", weights, rest)).sum(axis=(1, 2))
+        shares = log_prior - 0.5 * (volumes + squared)  # of the restricted likelihood
         shares = np.exp(shares - shares.max())
         shares /= shares.sum()
         step = shares @ means
@@ -187,19 +192,6 @@ def common_of(
         rotation = se3.rotation_exp(step[3:]) @ T[:3, :3]
         T = se3.from_rotation_translation(rotation, T[:3, 3] + step[:3])
     return T, covariance, np.sqrt(shares @ variances)
-
-
-def _at_scatter(errors: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Mean (6,) of errors (N, 6) of covariances (N, 6, 6), that of the mean (6, 6), and the
-    restricted log likelihood.
-    """
-    weights = np.linalg.inv(spread)
-    covariance = np.linalg.inv(weights.sum(axis=0))
-    mean = covariance @ np.einsum("nij,nj->i", weights, errors)
-    rest = errors - mean
-    squared = (rest * np.einsum("nij,nj->ni", weights, rest)).sum()
-    volume = np.linalg.slogdet(spread)[1].sum() - np.linalg.slogdet(covariance)[1]
-    return mean, covariance, float(-0.5 * (volume + squared))
 
 
 def unknown_directions(covariance: FloatArray) -> FloatArray:
