@@ -7,7 +7,6 @@ import platform
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -18,7 +17,7 @@ from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import transform_arguments, usable_angles, usable_numbers
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
-from hand_eye_calib.version import package_version
+from hand_eye_calib.version import package_version, version_of
 
 FILE_NAME = "extrinsic.yaml"
 RIG_NAME = "rig.yaml"
@@ -119,7 +118,7 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
         "package": "hand_eye_calib",
         "package_version": package_version(),
         "versions": {"python": platform.python_version()}
-        | {name: metadata.version(name) for name in ("numpy", "scipy")},
+        | {name: version_of(name) for name in ("numpy", "scipy")},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "parameters": inputs.pop("options", {}),
         "inputs": inputs,

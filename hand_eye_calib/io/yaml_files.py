@@ -18,8 +18,9 @@ from hand_eye_calib.text import shortened
 
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
-# libyaml is ten times as fast, and part of most builds.
+# libyaml is several times as fast, and part of most builds.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class _Loader(_Base):
@@ -64,9 +65,8 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
 
 def yaml_text(document: Any) -> str:
     """Values of any kind as a YAML file for programs and people."""
-    return yaml.safe_dump(
-        plain(document), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
-    )
+    style: dict[str, Any] = {"default_flow_style": None, "width": 120, "allow_unicode": True}
+    return str(yaml.dump(plain(document), Dumper=_Dumper, sort_keys=False, **style))
 
 
 def _check_events(text: str) -> None:
