@@ -218,7 +218,7 @@ def _masked_correlation(
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """An estimated clock offset.
+    """An estimated clock offset; by default nothing is known of one.
 
     Attributes
     ----------
@@ -237,9 +237,9 @@ class TimeOffset:
         By how much the offset changes with time; None if no fit held, or it was too short.
     """
 
-    seconds: float
-    sigma_s: float
-    correlation: Correlation
+    seconds: float = 0.0
+    sigma_s: float = np.inf
+    correlation: Correlation = Correlation()
     fit: SimilarityFit | None = None
     spread_s: float = np.inf
     rate: ClockRate | None = None
@@ -287,7 +287,8 @@ def estimate_time_offset(
         sigma_s = max(parent.interval_s, child.interval_s) / 5
         return TimeOffset(correlation.offset_s, sigma_s, correlation)
     if correlation.is_clear:
-        return refine_time_offset(parent, child, correlation, max_gap_s)
+        coarse = TimeOffset(correlation.offset_s, correlation=correlation)
+        return refine_time_offset(parent, child, coarse, max_gap_s)
     doubt = correlation.doubt("speeds" if of_speed else "angular rates")
     raise NotEnoughDataError(
         f"the time offset cannot be estimated: {doubt}; drive with more turns and "
@@ -296,27 +297,23 @@ def estimate_time_offset(
 
 
 def refine_time_offset(
-    parent: Trajectory,
-    child: Trajectory,
-    correlation: Correlation,
-    max_gap_s: float,
-    start: SimilarityFit | None = None,
-    least_s: float = 0.0,
+    parent: Trajectory, child: Trajectory, at: TimeOffset, max_gap_s: float, least_s: float = 0.0
 ) -> TimeOffset:
-    """Refine the coarse offset of a correlation; as it is, with a wide sigma, if no fit explains
-    the motion. A ``start`` is a fit of the same streams; without one it is searched for. An offset
-    below ``least_s`` of motions over one time need not be compared with those over others.
+    """Refine an offset ``at`` which the streams are about; the coarse one, with a wide sigma, if no
+    fit explains the motion. An offset below ``least_s`` of motions over one time need not be
+    compared with those over others.
     """
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
-    best, fit = TimeOffset(correlation.offset_s, reach_s / 5, correlation), start
-    held: list[float] = []
+    coarse_s = at.correlation.offset_s
+    best, held = TimeOffset(coarse_s, reach_s / 5, at.correlation), list[float]()
     for lag_s in _LAGS_S:
-        found = offset_over(lag_s, parent, child, correlation, max_gap_s, fit, least_s)
-        if (fit := found.fit) is None:
+        found = offset_over(lag_s, parent, child, at, max_gap_s, least_s)
+        holds = found.fit and found.fit.explains_translation
+        if not holds or abs(found.seconds - coarse_s) > reach_s:
             continue
-        holds = fit.explains_translation and abs(found.seconds - correlation.offset_s) <= reach_s
-        held += [found.seconds] if holds else []
-        if holds and found.sigma_s < best.sigma_s:
+        held.append(found.seconds)
+        at = found
+        if found.sigma_s < best.sigma_s:
             best = found
         if found.largest_s(child.duration_s) < least_s:
             break
@@ -331,29 +328,30 @@ def offset_over(
     lag_s: float,
     parent: Trajectory,
     child: Trajectory,
-    correlation: Correlation,
+    at: TimeOffset,
     max_gap_s: float,
-    start: SimilarityFit | FloatArray | None,
     least_s: float,
+    start: SimilarityFit | FloatArray | None = None,
     most: float | None = None,
 ) -> TimeOffset:
-    """Offset and fit over motions of ``lag_s``, from the coarse offset and a fit, or X, to start
+    """Offset and fit over motions of ``lag_s``, from an offset ``at`` and its fit, or X to start
     at; no fit if there are too few. A clearly smaller offset than ``least_s`` is not refined,
     others no better than that asks for; nor is a fit whose start leaves more than ``most``.
     """
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
-    offset_s, most_pairs, settled_s = correlation.offset_s, MAX_PAIRS, max(_SETTLED_S, least_s / 20)
-    rate = ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
+    offset_s, start, settled_s = at.seconds, at.fit or start, max(_SETTLED_S, least_s / 20)
+    rate = at.rate or ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
     for _ in range(_MAX_ROUNDS):
+        most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
         shifted = child.shifted(offset_s, rate.used, rate.at_ns)
         pose_pairs = synchronise(parent, shifted, max_gap_s)
         pairs = pairs_over(pose_pairs, lag_s, most_pairs)
         if len(pairs) < MIN_PAIRS:
-            return TimeOffset(offset_s, np.inf, correlation)
+            return TimeOffset(offset_s, np.inf, at.correlation)
         # Velocities of the child in its own frame, over less at the ends of the trajectory.
-        at, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
-        stamps_ns, span_ns = pose_pairs.stamps_ns[at], round(span_s * 1e9)
+        ends, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
+        stamps_ns, span_ns = pose_pairs.stamps_ns[ends], round(span_s * 1e9)
         ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*shifted.stamps_ns[[0, -1]])
         before, after = np.split(shifted.at(ends_ns.ravel()), 2)
         steps, spans_s = se3.log(se3.inverse(before) @ after), np.diff(ends_ns, axis=0)[0] * 1e-9
@@ -374,9 +372,8 @@ def offset_over(
             is_settled = abs(rate.used - earlier.used) * child.duration_s < settled_s
             if is_settled and (most_pairs > MAX_PAIRS or not rate.is_used):
                 break
-            most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
     known = rate if np.isfinite(rate.sigma_ppm) else None
-    return TimeOffset(offset_s, fit.offset_sigma_s, correlation, fit, rate=known)
+    return TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit, rate=known)
 
 
 def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:

@@ -335,8 +335,9 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
     """How many times more noise both streams have in common than two sensors; 0 if it is motion
     that makes them rough, or a pose is missing.
     """
-    slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
-    slow = slow[len(slow) // 2 :][: _NEAREST[1]]
+    first_ns, last_ns = fast.stamps_ns[[0, -1]]
+    rows = np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
+    slow = slow[rows[len(rows) // 2 :][: _NEAREST[1]]]
     intervals_ns = np.diff(slow.stamps_ns)
     if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
         return 0.0
@@ -364,11 +365,12 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
 
 def _nearest(slow: Trajectory, fast: Trajectory) -> MotionPairs:
     """Motions between stamps of one stream at which the other, interpolated, is nearest."""
-    slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
-    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns), 1, len(fast) - 1)
-    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns).min(axis=0)
-    nearest = np.sort(around)[: max(_NEAREST[0], len(slow) // 100)]
-    slow = slow[around <= nearest.max(initial=0)]
-    slow = slow[:: max(-(-len(slow) // _NEAREST[1]), 1)]
+    first_ns, last_ns = fast.stamps_ns[[0, -1]]
+    rows = np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
+    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
+    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[rows]).min(axis=0)
+    nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
+    rows = rows[around <= nearest.max(initial=0)]
+    slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
     between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
     return pairs_between(between, slow.poses, start, start + 1)

@@ -18,6 +18,7 @@ import numpy as np
 
 from hand_eye_calib.alignment import similarity, time_offset
 from hand_eye_calib.alignment.similarity import SimilarityFit
+from hand_eye_calib.alignment.time_offset import Correlation, TimeOffset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
 from hand_eye_calib.checks import agreement, hypotheses
@@ -68,7 +69,7 @@ class CheckResult:
 
     findings: tuple[Finding, ...]
     fit: SimilarityFit | None = None
-    offset: time_offset.TimeOffset | None = None
+    offset: TimeOffset | None = None
 
 
 def check_streams(
@@ -77,7 +78,7 @@ def check_streams(
     time_offset_s: float = 0.0,
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
-    correlate: Callable[[], time_offset.Correlation] | None = None,
+    correlate: Callable[[], Correlation] | None = None,
     known: Known | None = None,
 ) -> CheckResult:
     """Check two streams.
@@ -99,10 +100,10 @@ def check_streams(
     if any(each.makes_unusable for each in findings):
         return CheckResult(gravest_first(findings))
     given = StreamPair(parent, child.scaled(scale), max_gap_s)
-    streams, correlation = given.shifted(time_offset_s), time_offset.Correlation()
-    explanation = offset = None
+    streams = given.shifted(time_offset_s)
+    explanation, at = None, TimeOffset()
     if known and not streams.is_slow:
-        explanation, offset = _as_they_are(streams, known[0])
+        explanation, at = _as_they_are(streams, known[0])
     if not explanation:
         correlation = (correlate or given.correlate)()
         times = correlation.ratio
@@ -112,22 +113,25 @@ def check_streams(
         from_known = replace(correlation, offset_s=correlation.offset_s - time_offset_s)
         if streams.is_slow:
             streams, from_known = _of_slow(given, streams, time_offset_s, correlation)
-        correlation = from_known
-    aligned = streams.shifted(correlation.offset_s if correlation.is_clear else 0.0)
+        if not correlation.is_clear:
+            # Short recordings may not show the offset, and yet the streams agree at the given one.
+            from_known = replace(from_known, offset_s=0.0)
+        at = TimeOffset(from_known.offset_s, correlation=from_known)
+    aligned = streams.shifted(at.seconds)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
         return CheckResult(gravest_first([*findings, *flat]))
     if not explanation:
         start = known[0] if known else None
-        explanation, found = _explained(aligned, correlation, start, is_frozen=bool(frozen))
+        explanation, found = _explained(aligned, at.correlation, start, is_frozen=bool(frozen))
         findings += found
     if not explanation:
         return CheckResult(gravest_first(findings))
     is_sound = not any(each.makes_unusable for each in findings)
     lengths = check_lengths(parent) if is_sound else []
     right = explanation.hypothesis.undo(streams)
-    offset = offset or _fine_offset(right, correlation, explanation.fit)
+    offset = _fine_offset(right, at, explanation.fit)
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
@@ -136,40 +140,38 @@ def check_streams(
     return CheckResult(gravest_first(findings), explanation.fit, offset)
 
 
-def _as_they_are(
-    streams: StreamPair, X: FloatArray
-) -> tuple[Explanation, time_offset.TimeOffset] | tuple[None, None]:
+def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None, TimeOffset]:
     """The fit from a known extrinsic X, and the clock offset with it, of streams that clearly agree
-    as they are, on one clock and in one unit; none of others.
+    as they are, in one unit and on about one clock; no explanation of others.
     """
-    least_s, lag_s = LIMITS["time_offset"][1], hypotheses.LAGS_S[1]
-    given = streams.parent, streams.child, time_offset.Correlation(), streams.max_gap_s, X
+    (_, least_s, _, grave_s), lag_s = LIMITS["time_offset"], hypotheses.LAGS_S[1]
     # In one step if it is below half of what is told.
-    offset = time_offset.offset_over(lag_s, *given, 2.0 * least_s, hypotheses.HOLDS)
+    given = streams.parent, streams.child, TimeOffset(), streams.max_gap_s, 2.0 * least_s
+    offset = time_offset.offset_over(lag_s, *given, X, hypotheses.HOLDS)
     fit, left_s = offset.fit, offset.largest_s(streams.child.duration_s)
     explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
-    if fit and explains and left_s < least_s:
-        found = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), streams, lag_s)
-        return (None, None) if found.findings else (found, offset)
-    return None, None
+    if fit and explains and left_s < grave_s:
+        shifted = streams.shifted(offset.seconds)
+        found = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
+        if not found.findings:
+            return found, offset
+    return None, TimeOffset()
 
 
-def _fine_offset(
-    right: StreamPair, correlation: time_offset.Correlation, fit: SimilarityFit
-) -> time_offset.TimeOffset:
+def _fine_offset(right: StreamPair, at: TimeOffset, fit: SimilarityFit) -> TimeOffset:
     """What is left of the clock offset in streams that agree by a fit."""
-    if not correlation.is_clear:
-        # Short recordings may not show the offset, and yet the streams agree at the given one.
-        correlation = replace(correlation, offset_s=0.0)
+    least_s = LIMITS["time_offset"][1]
+    if at.fit and at.largest_s(right.child.duration_s) < least_s:
+        return at
     if right.is_slow:
-        return time_offset.TimeOffset(correlation.offset_s, right.interval_s, correlation)
-    both = right.parent, right.child, correlation, right.max_gap_s, fit
-    return time_offset.refine_time_offset(*both, least_s=LIMITS["time_offset"][1])
+        return TimeOffset(at.seconds, right.interval_s, at.correlation)
+    at = replace(at, fit=at.fit or fit)
+    return time_offset.refine_time_offset(right.parent, right.child, at, right.max_gap_s, least_s)
 
 
 def _of_slow(
-    streams: StreamPair, moved: StreamPair, known_s: float, correlation: time_offset.Correlation
-) -> tuple[StreamPair, time_offset.Correlation]:
+    streams: StreamPair, moved: StreamPair, known_s: float, correlation: Correlation
+) -> tuple[StreamPair, Correlation]:
     """Streams whose poses are too far apart to interpolate, and the correlation from there: as they
     are or ``moved`` by the known offset, where they have stamps in common, unless the coarse offset
     is off by more than its accuracy.
@@ -184,7 +186,7 @@ def _of_slow(
 
 def _explained(
     streams: StreamPair,
-    correlation: time_offset.Correlation,
+    correlation: Correlation,
     start: FloatArray | None,
     is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
@@ -272,7 +274,7 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
     )
 
 
-def check_offset(found: time_offset.TimeOffset, known_s: float) -> list[Finding]:
+def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
     """A finding if the clocks differ by more than ``known_s``, which the child's stamps have."""
     values = offset_values(found.seconds, known_s) | {"sigma_s": found.sigma_s}
     values["beyond"] = f" beyond the {known_s:.4f} s that were added" if known_s else ""

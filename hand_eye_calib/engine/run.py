@@ -107,12 +107,12 @@ def _on_another_clock(snapshot: Snapshot, checks: bool | None) -> Run | None:
     is_known = "time_offset" in config.given or len(snapshot.kept) > 0 or checks is False
     if is_known or not is_free or config.measured != "poses" or not snapshot.correlation.is_clear:
         return None
-    streams = *snapshot.streams, snapshot.correlation, snapshot.max_gap_s
+    coarse = TimeOffset(snapshot.correlation.offset_s, correlation=snapshot.correlation)
     # Of motions over one time, in one step.
-    look = refine_time_offset(*streams, least_s=UNASKED_S)
+    look = refine_time_offset(*snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S)
     if look.fit is None or abs(look.seconds) - 3.0 * look.sigma_s < MOST_MOVED_S:
         return None
-    offset = refine_time_offset(*streams, start=look.fit)
+    offset = refine_time_offset(*snapshot.streams, look, snapshot.max_gap_s)
     other = replace(snapshot, config=replace(config, **_ESTIMATED), time_offset=offset)
     return _solved_with(other, {})
 

@@ -279,17 +279,18 @@ class Trajectory(Columns):
         return changed
 
     @cached_property
-    def _bends(self) -> tuple[FloatArray, FloatArray]:
-        """Change (N, 6) of the twist per second at each of the poses, zero at the ends; and the
-        share (N - 1, 6) of motion in those at both ends of each interval.
+    def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Twists (N - 1, 6) from each pose to the next; their change (N, 6) per second, squared, at
+        each of the poses, zero at the ends; and the share (N - 1, 6) of motion in those at both
+        ends of each interval.
         """
         if self._alike is not None:
-            return self._alike._bends
+            return self._alike._steps
         spans_s = np.diff(self.stamps_ns)[:, None] * 1e-9
-        twists = se3.log(se3.inverse(self.poses[:-1]) @ self.poses[1:]) / spans_s
+        steps = se3.log(se3.inverse(self.poses[:-1]) @ self.poses[1:])
         changes = np.zeros((len(self), 6))
-        changes[1:-1] = np.diff(twists, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
-        return changes, _shares_of_motion(changes)
+        changes[1:-1] = np.diff(steps / spans_s, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
+        return steps, changes, _shares_of_motion(changes)
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
@@ -328,13 +329,12 @@ class Trajectory(Columns):
         poses = self.poses[np.where(fraction == 1.0, after, before)]
         between = (fraction != 0.0) & (fraction != 1.0)
         if between.any():
-            poses[between] = se3.interpolate(
-                self.poses[before[between]], self.poses[after[between]], fraction[between]
-            )
-        bent = between & ~outside
-        if bent.any() and not straight:
-            twists = corners(self.stamps_ns, *self._bends, before[bent], fraction[bent])
-            poses[bent] = poses[bent] @ se3.exp(twists)
+            steps, changes, motion = self._steps
+            shares, bent = fraction[between, None], between & ~outside
+            poses[between] = poses[between] @ se3.exp(shares * steps[before[between]])
+            if bent.any() and not straight:
+                bends = self.stamps_ns, changes, motion, before[bent], fraction[bent]
+                poses[bent] = poses[bent] @ se3.exp(corners(*bends))
         return poses
 
 
