@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -15,8 +14,7 @@ from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results import document
 from hand_eye_calib.results.records import AXES, DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.verdict import Reason, Verdict, headline, reasons, verdict_of
+from hand_eye_calib.results.verdict import Judged, Verdict
 from hand_eye_calib.text import AXIS_UNITS
 from hand_eye_calib.upstairs import upstairs
 
@@ -35,7 +33,7 @@ def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Calibration(Result):
+class Calibration(Judged):
     """An extrinsic with its quality: the values of
     :class:`~hand_eye_calib.results.result.Result`, and what follows from them.
 
@@ -184,25 +182,7 @@ class Calibration(Result):
         """
         from hand_eye_calib.results.exports import export_text
 
-        is_usable = self.verdict is not Verdict.DO_NOT_USE
-        return export_text(self, format, self.headline, is_usable)
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the result may be used: ``Verdict.USE``, ``USE_WITH_CARE`` or ``DO_NOT_USE``."""
-        return verdict_of(self.reasons)
-
-    @cached_property
-    def reasons(self) -> tuple[Reason, ...]:
-        """Why the result may not be used as it is, the gravest first; empty if it may. The rules
-        are :data:`hand_eye_calib.results.verdict.RULES`.
-        """
-        return reasons(self)
-
-    @property
-    def headline(self) -> str:
-        """The verdict with its gravest reason, or with what is known, in one line."""
-        return headline(self, self.reasons)
+        return export_text(self, format)
 
     def to_dict(self) -> Document:
         """Everything but the residuals as plain numbers, strings, lists and mappings, ready for

@@ -17,7 +17,7 @@ from hand_eye_calib.geometry.trajectory import check_poses
 from hand_eye_calib.plain import Document, from_plain, plain
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.results.verdict import Verdict, headline, reasons, verdict_of
+from hand_eye_calib.results.verdict import Judged, Verdict
 from hand_eye_calib.text import fixed, given_or_estimated, listing, with_sigma
 
 # Format and version of a document. A change that an older reader cannot understand raises the
@@ -58,13 +58,13 @@ class Notation:
     matrix: FloatArray
 
 
-def document_of(result: Result) -> Document:
+def document_of(result: Judged) -> Document:
     """The document of a result; see ``Calibration.to_dict``."""
-    parent, child, found = result.parent_frame, result.child_frame, reasons(result)
+    parent, child = result.parent_frame, result.child_frame
     document: Document = {
-        "verdict": verdict_of(found),
-        "headline": headline(result, found),
-        "reasons": found,
+        "verdict": result.verdict,
+        "headline": result.headline,
+        "reasons": result.reasons,
         **_FORMAT,
         "parent_frame": parent,
         "child_frame": child,
@@ -191,7 +191,7 @@ def printed_numbers(
 # ------------------------------------------------------------------------ for robots
 
 
-def usable_numbers(result: Result) -> dict[str, float | str]:
+def usable_numbers(result: Judged) -> dict[str, float | str]:
     """The numbers of a result's ``mounting`` for commands and files that others read.
 
     Returns
@@ -201,7 +201,7 @@ def usable_numbers(result: Result) -> dict[str, float | str]:
         of the quaternion. An axis that cannot be determined is a text that no parser takes, such as
         MEASURE_Z_BY_HAND. Empty under DO NOT USE.
     """
-    if verdict_of(reasons(result)) is Verdict.DO_NOT_USE:
+    if result.verdict is Verdict.DO_NOT_USE:
         return {}
     T, unknown = result.mounting[1], {*result.unobservable()}
     hidden = np.array([axis in unknown for axis in TRANSLATIONS])
@@ -217,7 +217,7 @@ def usable_numbers(result: Result) -> dict[str, float | str]:
     return numbers | dict(zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True))
 
 
-def transform_arguments(result: Result, decimals: int) -> list[str]:
+def transform_arguments(result: Judged, decimals: int) -> list[str]:
     """The arguments of static_transform_publisher for a result's ``mounting``, with so many
     decimals; empty under DO NOT USE.
     """

@@ -19,7 +19,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.records import AXES
-from hand_eye_calib.results.result import Result
+from hand_eye_calib.results.verdict import Judged, Verdict
 from hand_eye_calib.text import axes_in_words
 from hand_eye_calib.version import package_version
 
@@ -107,14 +107,14 @@ def arranged(
     return max(found, key=lambda each: each[:4])[4]
 
 
-def export_text(result: Result, name: str, headline: str, is_usable: bool) -> str:
-    """A calibration in the format of another program, unless it is not usable; ``headline`` is its
-    verdict. See :meth:`~hand_eye_calib.results.calibration.Calibration.export`.
+def export_text(result: Judged, name: str) -> str:
+    """A calibration in the format of another program, unless it is not usable. See
+    :meth:`~hand_eye_calib.results.calibration.Calibration.export`.
     """
     if name not in formats():
         raise ConfigError(f"unknown format {name!r}; known are {', '.join(formats())}")
-    if not is_usable:
-        raise InputError(f"nothing is written: {headline}")
+    if result.verdict is Verdict.DO_NOT_USE:
+        raise InputError(f"nothing is written: {result.headline}")
     frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
     layout, is_inverted, is_certain = arranged(formats()[name], *frames)
     if layout.is_inverted is False and not layout.target:  # the vehicle or robot, if it is known
@@ -136,7 +136,7 @@ def export_text(result: Result, name: str, headline: str, is_usable: bool) -> st
     if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
     lines = [
-        f"{name}, by hand_eye_calib {package_version()}. {headline}.",
+        f"{name}, by hand_eye_calib {package_version()}. {result.headline}.",
         f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
         f"Clocks: t({result.parent_frame}) = t({result.child_frame}) "
         f"{'-' if result.time_offset_s < 0 else '+'} {_number(abs(result.time_offset_s))} s, "

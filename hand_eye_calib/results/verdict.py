@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.config import METHODS
@@ -98,7 +98,7 @@ CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
 FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
 
 # Rules that state a limit of the recording; the others are signs that something is wrong.
-_PHYSICS = frozenset({"nothing_known", "unobservable", "target", "floor"})
+_KINDS = dict.fromkeys(("nothing_known", "unobservable", "target", "floor"), "physics")
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
 # Other answers, and what to do if they disagree.
@@ -114,43 +114,47 @@ _OTHERS = {
 }
 
 
-def reasons(result: Result) -> tuple[Reason, ...]:
-    """Why a result may not be used as it is, the gravest first; empty if nothing speaks against
-    it.
-    """
-    return tuple(
-        Reason(rule.name, rule.verdict, *found, "physics" if rule.name in _PHYSICS else "suspicion")
-        for rule in RULES
-        for found in rule.find(result)
-    )
+class Judged(Result):
+    """A result that knows its verdict."""
 
+    @cached_property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Why the result may not be used as it is, the gravest first; empty if it may. The rules
+        are :data:`hand_eye_calib.results.verdict.RULES`.
+        """
+        return tuple(
+            Reason(rule.name, rule.verdict, *found, _KINDS.get(rule.name, "suspicion"))
+            for rule in RULES
+            for found in rule.find(self)
+        )
 
-def verdict_of(found: Sequence[Reason]) -> Verdict:
-    """The verdict that reasons lead to: the gravest comes first."""
-    return found[0].verdict if found else Verdict.USE
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used: ``Verdict.USE``, ``USE_WITH_CARE`` or ``DO_NOT_USE``."""
+        return self.reasons[0].verdict if self.reasons else Verdict.USE
+
+    @property
+    def headline(self) -> str:
+        """The verdict with its gravest reason, or with what is known, in one line."""
+        decided, gravest = self.verdict.value, shown(self.reasons)
+        if not gravest:
+            return f"{decided}: {what_is_known(self)}"
+        if gravest[0].rule == "unobservable":
+            hidden = listing(gravest[0].axes)
+            it = hidden if len(gravest[0].axes) == 1 else "them"
+            also = "".join(f"; {each.sentence}" for each in gravest[1:2])
+            return f"{decided}: all but {hidden}; measure {it} by hand{also}"
+        note = "" if any(reason.kind == "suspicion" for reason in self.reasons) else _NO_FAULT
+        more = len(gravest) - 1
+        rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
+        return f"{decided}: {gravest[0].sentence}{rest}{note}"
 
 
 def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
     """The reasons that a person has to read: under DO NOT USE those that lead to it, because the
     others may be its consequences; otherwise all.
     """
-    return tuple(each for each in found if each.verdict is verdict_of(found))
-
-
-def headline(result: Result, found: Sequence[Reason]) -> str:
-    """The verdict with its gravest reason, or with what is known, in one line."""
-    decided, gravest = verdict_of(found), shown(found)
-    if not found:
-        return f"{decided.value}: {what_is_known(result)}"
-    if gravest[0].rule == "unobservable":
-        hidden = listing(gravest[0].axes)
-        it = hidden if len(gravest[0].axes) == 1 else "them"
-        also = "".join(f"; {each.sentence}" for each in gravest[1:2])
-        return f"{decided.value}: all but {hidden}; measure {it} by hand{also}"
-    note = "" if any(reason.kind == "suspicion" for reason in found) else _NO_FAULT
-    more = len(gravest) - 1
-    rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
-    return f"{decided.value}: {gravest[0].sentence}{rest}{note}"
+    return tuple(each for each in found if each.verdict is found[0].verdict)
 
 
 def what_is_known(result: Result) -> str:
