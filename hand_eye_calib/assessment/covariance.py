@@ -36,7 +36,7 @@ from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
 from hand_eye_calib.gls.normal import answers_without, multiplied
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.stats import CHI2, median
@@ -103,24 +103,6 @@ class Assessment:
     cov_parent_child_in_child: FloatArray
     observability: tuple[DofObservability, ...]
     contradictions: Mapping[str, float] = field(default_factory=dict)
-
-    def status(self, converged: bool, within: slice = slice(6)) -> SolveStatus:
-        """How a solve ended, if it can determine the axes ``within``."""
-        if not converged:
-            return SolveStatus.NOT_CONVERGED
-        if self.contradictions:
-            return SolveStatus.CONTRADICTED
-        verdicts = [dof.verdict for dof in self.observability[within]]
-        is_open = DofVerdict.UNOBSERVABLE in verdicts
-        return SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the reasons of the verdict do not say."""
-        names = [dof.name for dof in self.observability if dof.verdict is DofVerdict.PRIOR]
-        if not names:
-            return []
-        return [f"{', '.join(names)} of the child sensor: mostly from the prior, not the motion"]
 
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:

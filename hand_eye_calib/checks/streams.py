@@ -64,7 +64,20 @@ def check_stream(
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(finding.code != "gaps" for finding in findings):
         return findings
-    share = float(_jumps(trajectory).mean())
+    interval_s, poses = np.diff(trajectory.stamps_ns) * 1e-9, trajectory.poses
+    translations = np.einsum("kji,kj->ki", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
+    rotations = se3.rotation_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    are_jumps = np.zeros(len(interval_s), dtype=bool)
+    for steps in (translations, rotations):
+        velocities = steps / interval_s[:, None]
+        padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
+        shifted = [padded[shift : shift + len(velocities)] for shift in range(5)]
+        around = np.partition(shifted, 2, axis=0)[2]
+        excess = np.linalg.norm(velocities - around, axis=1)
+        speed = np.linalg.norm(velocities, axis=1)
+        of_motion = _JUMP_STEPS * quantile(speed, USUAL)
+        are_jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), of_motion)
+    share = float(are_jumps.mean())
     jumps = graded("jumps", stream, share, options={"method": "dnlo"}, share=share)
     return [*findings, jumps] if jumps else findings
 
@@ -150,25 +163,6 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         if tilt_rad > _MOVES:
             return [finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))]
     return []
-
-
-def _jumps(trajectory: Trajectory) -> BoolArray:
-    """Mask (N - 1,) of steps that are far from those around them."""
-    interval_s = np.diff(trajectory.stamps_ns) * 1e-9
-    poses = trajectory.poses
-    translations = np.einsum("kji,kj->ki", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
-    rotations = se3.rotation_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
-    jumps = np.zeros(len(interval_s), dtype=bool)
-    for steps in (translations, rotations):
-        velocities = steps / interval_s[:, None]
-        padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
-        shifted = [padded[shift : shift + len(velocities)] for shift in range(5)]
-        around = np.partition(shifted, 2, axis=0)[2]
-        excess = np.linalg.norm(velocities - around, axis=1)
-        speed = np.linalg.norm(velocities, axis=1)
-        of_motion = _JUMP_STEPS * quantile(speed, USUAL)
-        jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), of_motion)
-    return jumps
 
 
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:

@@ -29,7 +29,7 @@ from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
-from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.results.records import AXES, AxisScatter, CrossCheck, Residuals
 from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.solvers.registry import Method
@@ -39,6 +39,9 @@ from hand_eye_calib.text import parse_targets
 # Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both
 # trajectories it is a fifth.
 _MAX_JUMPS = 0.25
+
+# The axes that streams determine together, of those that are no poses.
+_IN_REACH = {"rotations": slice(3, 6), "positions": slice(3)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,13 +89,12 @@ class Solved:
         offset_s, offset_sigma_s = float(config.time_offset), 0.0
         if offset := self.time_offset:
             offset_s, offset_sigma_s = offset.seconds, offset.sigma_s
-        scale, scale_sigma, warnings = self.scale, 0.0, [*fused.warnings]
+        scale, scale_sigma, warnings = self.scale, 0.0, self.warnings
         if self.scale_fit:
             scale_sigma = self.scale_fit.scale_sigma
             times = f"{scale:.4f} +/- {scale_sigma:.4f}, as estimated from the motion"
-            warnings += [f"the child's lengths are multiplied by {times}"] * (
-                config.scale == "auto"
-            )
+            if config.scale == "auto":
+                warnings = (f"the child's lengths are multiplied by {times}", *warnings)
         found, noise = self.solution, None
         if isinstance(found, AdaptiveSolution):
             noise = found.describe(self.stamps_ns)
@@ -100,13 +102,15 @@ class Solved:
             offset_sigma_s = found.time_offset_sigma_s or offset_sigma_s
             scale_sigma = scale * found.scale_sigma or scale_sigma
             scale *= found.scale
+        left = self.pairs.residuals(fused.T_parent_child)
+        start_ns, end_ns = self.stamps_ns[self.pairs.i], self.stamps_ns[self.pairs.j]
         return calibration_of(
             found,
             fused,
-            residuals_of(self.pairs, fused.T_parent_child, self.weights, self.stamps_ns),
+            Residuals(*left, self.weights, start_ns, end_ns),
             self.stamps_ns,
             config,
-            status=fused.status(found.converged, slice(3 * (self.measured == "rotations"), 6)),
+            warnings,
             measured=self.measured,
             T_method=found.T_parent_child,
             floor=self.floor,
@@ -122,7 +126,6 @@ class Solved:
             clock_rate=offset.rate if offset else None,
             scale=scale,
             scale_sigma=scale_sigma,
-            warnings=(*warnings, *self.warnings),
         )
 
 
@@ -132,19 +135,33 @@ def calibration_of(
     residuals: Residuals,
     stamps_ns: IntArray,
     config: CalibratorConfig,
+    warnings: tuple[str, ...] = (),
     **fields: Any,
 ) -> Calibration:
     """A result from a solution with ``converged`` and ``objective``, what was fused with the prior,
-    the residuals, the stamps of the poses, and further fields.
+    the residuals, the stamps of the poses, and further fields. Axes that are mostly from the prior
+    are named before the other warnings.
     """
+    dofs = fused.observability
+    in_reach = dofs[_IN_REACH.get(fields.get("measured", "poses"), slice(6))]
+    status = SolveStatus.OK
+    if not solution.converged:
+        status = SolveStatus.NOT_CONVERGED
+    elif fused.contradictions:
+        status = SolveStatus.CONTRADICTED
+    elif any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in in_reach):
+        status = SolveStatus.UNOBSERVABLE
+    if names := ", ".join(dof.name for dof in dofs if dof.verdict is DofVerdict.PRIOR):
+        told = f"{names} of the child sensor: mostly from the prior, not the motion"
+        warnings = (told, *warnings)
     fields.setdefault("method", "adaptive")
     fields.setdefault("backend", "fast")
     fields.setdefault("stamp_ns", int(stamps_ns[-1]))
-    fields.setdefault("status", fused.status(solution.converged))
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance=fused.cov_parent_child_in_child,
-        observability=fused.observability,
+        observability=dofs,
+        status=status,
         objective=solution.objective,
         n_poses=len(stamps_ns),
         n_pairs=len(residuals),
@@ -154,21 +171,8 @@ def calibration_of(
         target_rotation=config.target_rotation,
         target_axes=parse_targets("target.axes", config.target_axes),
         motion_residuals=residuals,
+        warnings=warnings,
         **fields,
-    )
-
-
-def residuals_of(
-    pairs: MotionPairs, T_parent_child: FloatArray, weights: FloatArray, stamps_ns: IntArray
-) -> Residuals:
-    """Residuals of motion pairs between poses of these stamps (N,), with their weights (K,)."""
-    translation, rotation = pairs.residuals(T_parent_child)
-    return Residuals(
-        translation=translation,
-        rotation=rotation,
-        weights=weights,
-        start_ns=stamps_ns[pairs.i],
-        end_ns=stamps_ns[pairs.j],
     )
 
 

@@ -83,7 +83,6 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         _steps(solution, stamps_ns, poses, positions),
         stamps_ns,
         config,
-        status=fused.status(solution.converged, slice(0, 3)),
         reference="increments",
         measured="positions",
         noise=solution.describe(stamps_ns),

@@ -133,5 +133,4 @@ def _assessed(
         cov_world_world=fit.covariance[6:, 6:],
         parent_world_frame=parent_world,
         child_world_frame=child_world,
-        warnings=tuple(fused.warnings),
     )

@@ -6,6 +6,7 @@ from os import PathLike
 from typing import Any, ClassVar, Protocol, Self, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from hand_eye_calib.arrays import FloatArray, IntArray
@@ -282,7 +283,8 @@ class Trajectory(Columns):
     def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Twists (N - 1, 6) from each pose to the next; their change (N, 6) per second, squared, at
         each of the poses, zero at the ends; and the share (N - 1, 6) of motion in those at both
-        ends of each interval.
+        ends of each interval, translation and rotation each on its own, as the weight that makes
+        their mean most precise.
         """
         if self._alike is not None:
             return self._alike._steps
@@ -290,7 +292,18 @@ class Trajectory(Columns):
         steps = se3.log(se3.inverse(self.poses[:-1]) @ self.poses[1:])
         changes = np.zeros((len(self), 6))
         changes[1:-1] = np.diff(steps / spans_s, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
-        return steps, changes, _shares_of_motion(changes)
+        shares = np.empty((len(changes) - 1, 6))
+        for part in (slice(0, 3), slice(3, 6)):
+            of_part = changes[:, part]
+            power = (of_part**2).sum(axis=1)
+            both = (of_part[1:] * of_part[:-1]).sum(axis=1), 0.5 * (power[1:] + power[:-1])
+            padded = (np.pad(values, _NEARBY) for values in both)
+            nearby = (sliding_window_view(values, 2 * _NEARBY + 1) for values in padded)
+            products, powers = (values.sum(axis=1) for values in nearby)
+            alike = products / np.maximum(powers, 1e-300)
+            motion = np.clip((alike - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
+            shares[:, part] = (motion / (motion + (1.0 - motion) * _LEFT_IN_THE_MEAN))[:, None]
+        return steps, changes, shares
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
@@ -407,22 +420,3 @@ def corners(
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
     missing = 0.5 * fraction * (1.0 - fraction) * (np.diff(stamps_ns)[start] * 1e-9) ** 2
     return -missing[:, None] * shares[start] * bend
-
-
-def _shares_of_motion(changes: FloatArray) -> FloatArray:
-    """Share (N - 1, 6) of motion in the changes at both ends of each interval, translation and
-    rotation each on its own, as the weight that makes their mean most precise.
-    """
-    shares, window = np.empty((len(changes) - 1, 6)), 2 * _NEARBY + 1
-    for part in (slice(0, 3), slice(3, 6)):
-        of_part = changes[:, part]
-        power = (of_part**2).sum(axis=1)
-        both = (of_part[1:] * of_part[:-1]).sum(axis=1), 0.5 * (power[1:] + power[:-1])
-        products, powers = (
-            np.lib.stride_tricks.sliding_window_view(np.pad(values, _NEARBY), window).sum(axis=1)
-            for values in both
-        )
-        alike = products / np.maximum(powers, 1e-300)
-        motion = np.clip((alike - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
-        shares[:, part] = (motion / (motion + (1.0 - motion) * _LEFT_IN_THE_MEAN))[:, None]
-    return shares

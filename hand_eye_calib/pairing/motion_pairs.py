@@ -160,40 +160,6 @@ def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
     return what, f"repair the stamps, or remove {few} of its poses"
 
 
-def reference_indices(reference: str, n_poses: int) -> tuple[IntArray, IntArray]:
-    """Index pairs of a reference.
-
-    Parameters
-    ----------
-    reference : str
-        ``"A"``: every pose with the first. ``"B<n>"``: with the n-th before it. ``"C<n>"``: with
-        the keyframe that starts its segment of n poses; a last segment whose keyframe is N - n or
-        later is left out, as in the published results.
-    n_poses : int
-        Number of poses N.
-
-    Returns
-    -------
-    i, j : (K,) int arrays
-        Motion k runs from pose ``i[k]`` to pose ``j[k]``; K is 0 if there are too few poses.
-
-    Raises
-    ------
-    ConfigError
-        If the reference has another form: n is at least 1, of C at least 2.
-    """
-    kind, step = parse_reference("reference", reference)
-    if kind == "A":
-        j = np.arange(1, n_poses)
-        return np.zeros_like(j), j
-    if kind == "B":
-        j = np.arange(step, n_poses)
-        return j - step, j
-    keyframes = np.arange(0, max(n_poses - step, 0), step)
-    j = (keyframes[:, None] + np.arange(1, step)).ravel()
-    return np.repeat(keyframes, step - 1), j
-
-
 @dataclass(frozen=True, eq=False)
 class MotionPairs(Columns):
     """K relative motions of both sensors between the same instants i and j.
@@ -238,10 +204,29 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of parent and child sensor in their own worlds at the same N instants.
     reference : str
-        A, B<n> or C<n>; see :func:`~hand_eye_calib.pairing.motion_pairs.reference_indices`, also
-        for its errors.
+        ``"A"``: every pose with the first. ``"B<n>"``: with the n-th before it. ``"C<n>"``: with
+        the keyframe that starts its segment of n poses; a last segment whose keyframe is N - n or
+        later is left out, as in the published results.
+
+    Returns
+    -------
+    MotionPairs
+        None if there are too few poses.
+
+    Raises
+    ------
+    ConfigError
+        If the reference has another form: n is at least 1, of C at least 2.
     """
-    return pairs_between(Ts_pw_p, Ts_cw_c, *reference_indices(reference, len(Ts_pw_p)))
+    kind, step = parse_reference("reference", reference)
+    n_poses = len(Ts_pw_p)
+    if kind == "C":
+        keyframes = np.arange(0, max(n_poses - step, 0), step)
+        i, j = np.repeat(keyframes, step - 1), keyframes[:, None] + np.arange(1, step)
+    else:
+        j = np.arange(step, n_poses)
+        i = np.zeros_like(j) if kind == "A" else j - step
+    return pairs_between(Ts_pw_p, Ts_cw_c, i, j.ravel())
 
 
 def pairs_between(

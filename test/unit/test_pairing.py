@@ -7,7 +7,6 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import (
     PosePairs,
     motion_pairs,
-    reference_indices,
     select_keyframes,
     slower_stream,
     synchronise,
@@ -31,8 +30,9 @@ from hand_eye_calib.pairing.motion_pairs import (
     ],
 )
 def test_references_are_those_of_the_paper(reference, n_poses, expected):
-    pairs = (indices.tolist() for indices in reference_indices(reference, n_poses))
-    assert list(zip(*pairs, strict=True)) == expected
+    poses = wandering_poses(10)[:n_poses]
+    pairs = motion_pairs(poses, poses, reference)
+    assert list(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) == expected
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_references_are_those_of_the_paper(reference, n_poses, expected):
 )
 def test_anything_else_is_not_a_reference(reference):
     with pytest.raises(ConfigError, match="must be auto, A, B<n>"):
-        reference_indices(reference, 10)
+        motion_pairs(*[wandering_poses(10)] * 2, reference)
 
 
 def test_every_motion_pair_fulfils_ax_xb():
