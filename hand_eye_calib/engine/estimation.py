@@ -223,22 +223,18 @@ def solve_poses(
         scale=scale,
         scale_fit=scale_fit,
         time_offset=time_offset,
-        floor=np.zeros((6, 6)) if is_beside else _floor(solved, pose_pairs, config),
+        floor=np.zeros((6, 6)) if is_beside else floor_of(solved, pose_pairs, config),
     )
 
 
-def odometry_share(config: CalibratorConfig) -> float:
-    """Share of the common-mode floor, that of two odometries, which these sensors have."""
-    return [config.parent_kind, config.child_kind].count("odometry") / 2
-
-
-def _floor(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
+def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
     """Common-mode floor (6, 6) of the errors of the sensors that are odometries."""
-    found, share = solved.solution, odometry_share(config)
+    # The floor is that of two odometries.
+    share = [config.parent_kind, config.child_kind].count("odometry") / 2
     speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
-    if isinstance(found, AdaptiveSolution):
+    if isinstance(solved.solution, AdaptiveSolution):
         return share * covariance.common_mode_floor(speed_m_s)
-    T = found.T_parent_child
+    T = solved.solution.T_parent_child
     return share * covariance.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
 
 

@@ -167,7 +167,6 @@ def estimate_rotation(
     if findings and has_rates:
         findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
     rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
-    floor = estimation.odometry_share(config) * covariance.common_mode_floor()
     solved = estimation.Solved(
         solution=solution,
         assessment=covariance.assess_rotation(Ts_pw_p, solution),
@@ -178,8 +177,9 @@ def estimate_rotation(
         weights=(~solution.jumps).astype(float),
         stamps_ns=stamps_ns,
         config=config,
-        floor=floor * np.repeat([0.0, 1.0], 3),
     )
+    floor = estimation.floor_of(solved, rotations, config) * np.repeat([0.0, 1.0], 3)
+    solved = replace(solved, floor=floor)
     checked = estimation.cross_checked(solved, config, rotations) if cross_check else None
     rate_bias = _rate_bias(solution, config) if has_rates else None
     return replace(checked or solved.calibration(), rate_bias=rate_bias, findings=findings)
