@@ -30,7 +30,13 @@ from hand_eye_calib.gls.estimator import AdaptiveSolution
 from hand_eye_calib.gls.increments import SYSTEMATIC
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.results.records import AXES, AxisScatter, CrossCheck, Residuals
+from hand_eye_calib.results.records import (
+    AXES,
+    OUT_OF_REACH,
+    AxisScatter,
+    CrossCheck,
+    Residuals,
+)
 from hand_eye_calib.solvers.all_pairs import Solution
 from hand_eye_calib.solvers.registry import Method
 from hand_eye_calib.stats import MEDIAN_NORMAL, median
@@ -39,9 +45,6 @@ from hand_eye_calib.text import parse_targets
 # Largest share of the increments that may be jumps: with jumps at a tenth of the poses of both
 # trajectories it is a fifth.
 _MAX_JUMPS = 0.25
-
-# The axes that streams determine together, of those that are no poses.
-_IN_REACH = {"rotations": slice(3, 6), "positions": slice(3)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,15 +145,13 @@ def calibration_of(
     the residuals, the stamps of the poses, and further fields. Axes that are mostly from the prior
     are named before the other warnings.
     """
-    dofs = fused.observability
-    in_reach = dofs[_IN_REACH.get(fields.get("measured", "poses"), slice(6))]
-    status = SolveStatus.OK
+    dofs, silent = fused.observability, OUT_OF_REACH[fields.get("measured", "poses")]
+    open_axes = {dof.name for dof in dofs if dof.verdict is DofVerdict.UNOBSERVABLE}
+    status = SolveStatus.UNOBSERVABLE if open_axes.difference(silent) else SolveStatus.OK
     if not solution.converged:
         status = SolveStatus.NOT_CONVERGED
     elif fused.contradictions:
         status = SolveStatus.CONTRADICTED
-    elif any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in in_reach):
-        status = SolveStatus.UNOBSERVABLE
     if names := ", ".join(dof.name for dof in dofs if dof.verdict is DofVerdict.PRIOR):
         told = f"{names} of the child sensor: mostly from the prior, not the motion"
         warnings = (told, *warnings)

@@ -21,6 +21,9 @@ INLIER_WEIGHT = 0.5
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
 AXES = (*TRANSLATIONS, *ROTATIONS)
 
+# Axes that streams say nothing about, by what they measure together.
+OUT_OF_REACH = {"poses": (), "rotations": TRANSLATIONS, "positions": ROTATIONS}
+
 
 class SolveStatus(str, Enum):
     """How a solve ended. Only an OK result may be used as it is.

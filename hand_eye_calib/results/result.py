@@ -277,8 +277,5 @@ class Result:
     @property
     def out_of_reach(self) -> tuple[str, ...]:
         """Axes that streams of this kind say nothing about, and no prior either."""
-        silent = {"rotations": records.AXES[:3], "positions": records.AXES[3:]}.get(
-            self.measured, ()
-        )
-        unknown = self.unobservable()
+        silent, unknown = records.OUT_OF_REACH.get(self.measured, ()), self.unobservable()
         return tuple(axis for axis in silent if axis in unknown)
