@@ -134,13 +134,13 @@ class Table:
 
     def __post_init__(self) -> None:
         found, units = named_columns(self.names)
-        listed = shortened(", ".join(self.names), LONGEST_NAME)
-        self.expected = self.expected or f"{len(self.names)} columns: {listed}"
+        self.expected = self.expected or f"{len(self.names)} columns: {self._listed()}"
         self.measures, measured = _measured(found, self.names, self.measures)
         # The stamp of the message's header rather than the time of its arrival.
         ways = (("secs", "nsecs"), ("header",), ("t",), ())
         stamp = next(way for way in ways if {*way} <= found.keys())
         if missing := [name for name in measured if name not in found]:
+            listed = self._listed()
             no_pose = " (accelerations show no pose)" * bool(re.search(r", a(cc\w*)?_?x", listed))
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among {listed}{no_pose}; name "
@@ -150,15 +150,20 @@ class Table:
             )
         for name in (*stamp, *measured):
             if len(found[name]) > 1:
-                several = shortened(", ".join(self.names[k] for k in found[name]), LONGEST_NAME)
                 raise InputError(
-                    f"{self.path}: columns {several} could all be {name}; name them with `columns`"
+                    f"{self.path}: columns {self._listed(found[name])} could all be {name}; name "
+                    "them with `columns`"
                 )
         self.at = {name: found[name][0] for name in measured}
         self.stamp_at = [found[name][0] for name in stamp]
         self._image_at = found.get("image", ())
         self.units = {name: units[at] for name, at in self.at.items() if units[at]}
         self.units["t"] = "ns" if len(stamp) > 1 else units[self.stamp_at[0]] if stamp else ""
+
+    def _listed(self, places: Iterable[int] | None = None) -> str:
+        """The names of some columns, or of all, for a message."""
+        names = self.names if places is None else [self.names[k] for k in places]
+        return shortened(", ".join(names), LONGEST_NAME)
 
     def values(self, names: Iterable[str] = ()) -> FloatArray:
         """(N, k) array: the values of some quantities, or of all."""
