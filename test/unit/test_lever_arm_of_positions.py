@@ -161,6 +161,7 @@ class TestLeverArm:
         assert np.abs(distances(found)[:2]).max() < 4.0
         known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)})
         assert known.status is hec.SolveStatus.OK
+        assert "z of the child sensor: mostly from the prior, not the motion" in known.warnings
 
     def test_positions_of_another_body_are_not_to_be_used(self, streams):
         found = hec.calibrate(streams[0], recorded(seed=8)[1])
