@@ -308,7 +308,16 @@ def check_independent(given: StreamPair, aligned: StreamPair) -> list[Finding]:
     # Programs interpolate at the stamps of the new stream.
     pairs = [(each.child, each.parent) for each in (given, aligned)]
     pairs += [both[::-1] for both in pairs]
-    left_rad = min(map(_left, starmap(_nearest, pairs)))
+    left_rad = np.inf
+    for slow, fast in pairs:  # motions between stamps at which the other one is nearest
+        slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
+        after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns), 1, len(fast) - 1)
+        around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns).min(axis=0)
+        nearest = np.sort(around)[: max(_NEAREST[0], len(slow) // 100)]
+        slow = slow[around <= nearest.max(initial=0)]
+        slow = slow[:: max(-(-len(slow) // _NEAREST[1]), 1)]
+        between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
+        left_rad = min(left_rad, _left(pairs_between(between, slow.poses, start, start + 1)))
     if left_rad < 0.01 * _ALIKE[0]:
         return [finding("not_independent", are="are not independent", residual_rad=left_rad)]
     # Circumstantial: sensors may be precise, or shake together.
@@ -361,16 +370,3 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
     follows = half[0, 2, 1] > _FLAT**2 * half[1, 2, 1]
     found = common**0.5 / _SHARED * [is_white, is_white or follows]
     return float(is_noise * found.max())
-
-
-def _nearest(slow: Trajectory, fast: Trajectory) -> MotionPairs:
-    """Motions between stamps of one stream at which the other, interpolated, is nearest."""
-    first_ns, last_ns = fast.stamps_ns[[0, -1]]
-    rows = np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
-    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
-    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[rows]).min(axis=0)
-    nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
-    rows = rows[around <= nearest.max(initial=0)]
-    slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
-    between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
-    return pairs_between(between, slow.poses, start, start + 1)

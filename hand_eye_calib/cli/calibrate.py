@@ -63,7 +63,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--order", choices=("time", "none"), default="time", help=order)
     options.add_config_arguments(parser)
-    options.add_output_arguments(parser)
+    group = parser.add_argument_group("output")
+    out = (
+        "save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
+        "static_transform.launch.py and report.html"
+    )
+    group.add_argument("--out", metavar="DIR", type=Path, help=out)
+    group.add_argument(
+        "--label",
+        metavar="NAME=VALUE",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=_label,
+        help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
+    )
+    options.add_json_argument(group, or_verbose=True)
+    _add_rare(parser)
+
+
+@options.argument_type
+def _label(text: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not (name and sign and value):
+        raise ConfigError(f"expected NAME=VALUE, such as vehicle=7; got {text!r}")
+    return name, value
+
+
+def _add_rare(parser: argparse.ArgumentParser) -> None:
+    """Declare what is about images of a target, many recordings, and what is installed."""
     add = parser.add_argument_group("images of a target").add_argument
     target = (
         "what the images of --child-topic show, or those of a folder, the second PATH, one for "
@@ -74,21 +102,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--target", metavar="TARGET", help=target)
     camera = "intrinsics: YAML of camera_info, Kalibr or OpenCV; a bag may have its own camera_info"
     add("--camera", metavar="FILE", type=Path, help=camera)
-    _add_many(parser)
-    add = parser.add_argument_group("what is installed").add_argument
-    installed = (
-        "compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
-        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
-    )
-    add("--installed", metavar="SOURCE", help=installed)
-    base_frame = (
-        "state the child's pose in this frame too, as the URDF of --installed or the bag's "
-        "/tf_static has it"
-    )
-    add("--base-frame", metavar="FRAME", help=base_frame)
-
-
-def _add_many(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("many recordings").add_argument
     batch = "bags, or patterns of bags in quotes, such as 'fleet/**'"
     add("--batch", metavar="BAG", nargs="+", help=batch)
@@ -103,6 +116,17 @@ def _add_many(parser: argparse.ArgumentParser) -> None:
     add("--jobs", metavar="N", type=options.at_least(1), help=jobs)
     dask = "use a Dask cluster instead: address of its scheduler, tcp://..."
     add("--dask", metavar="ADDRESS", help=dask)
+    add = parser.add_argument_group("what is installed").add_argument
+    installed = (
+        "compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
+        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
+    )
+    add("--installed", metavar="SOURCE", help=installed)
+    base_frame = (
+        "state the child's pose in this frame too, as the URDF of --installed or the bag's "
+        "/tf_static has it"
+    )
+    add("--base-frame", metavar="FRAME", help=base_frame)
 
 
 def run(arguments: argparse.Namespace) -> int:

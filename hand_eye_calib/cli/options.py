@@ -365,34 +365,6 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
     return {stream: source for stream, source in found.items() if source}
 
 
-@argument_type
-def _label(text: str) -> tuple[str, str]:
-    name, sign, value = text.partition("=")
-    if not (name and sign and value):
-        raise ConfigError(f"expected NAME=VALUE, such as vehicle=7; got {text!r}")
-    return name, value
-
-
-def add_output_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--out``, ``--label``, ``--json`` and ``--verbose``."""
-    group = parser.add_argument_group("output")
-    out = (
-        "save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
-        "static_transform.launch.py and report.html"
-    )
-    group.add_argument("--out", metavar="DIR", type=Path, help=out)
-    group.add_argument(
-        "--label",
-        metavar="NAME=VALUE",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=_label,
-        help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
-    )
-    add_json_argument(group, or_verbose=True)
-
-
 def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:
     """Add ``--json``, and ``--verbose`` if there are details to print."""
     text = "print one JSON document on stdout instead of text"

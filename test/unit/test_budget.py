@@ -16,15 +16,15 @@ ROOT = SOURCE.parent
 # What may not be exceeded: the sizes of today, which may only be lowered. Goal still ahead: 450
 # functions entered by ``calibrate a b``.
 LIMITS = {
-    "lines": 29_430,
-    "lines of code": 18_965,
+    "lines": 29_420,
+    "lines of code": 18_960,
     "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
     "rooms": 28,
     "floors": 17,
     "arrows between rooms": 166,
-    "functions entered by calibrate": 502,
+    "functions entered by calibrate": 500,
     "files entered by calibrate": 49,
     "lines of reproduction": 6_960,
     "lines of tests": 19_000,
