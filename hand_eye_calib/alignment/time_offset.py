@@ -308,11 +308,11 @@ def refine_time_offset(
     best, held = TimeOffset(coarse_s, reach_s / 5, at.correlation), list[float]()
     for lag_s in _LAGS_S:
         found = offset_over(lag_s, parent, child, at, max_gap_s, least_s)
+        at = replace(at, fit=found.fit)
         holds = found.fit and found.fit.explains_translation
         if not holds or abs(found.seconds - coarse_s) > reach_s:
             continue
         held.append(found.seconds)
-        at = found
         if found.sigma_s < best.sigma_s:
             best = found
         if found.largest_s(child.duration_s) < least_s:
