@@ -68,7 +68,7 @@ class TestLeverArm:
         assert result.status is hec.SolveStatus.OK
 
     def test_positions_of_the_parent_give_the_opposite(self, streams, result):
-        inverse = hec.calibrate(*streams[::-1])
+        inverse = hec.calibrate(*streams[::-1], checks=False)
         assert inverse.T_parent_child[:3, 3] == pytest.approx(-result.T_parent_child[:3, 3])
         assert inverse.time_offset_s == pytest.approx(-result.time_offset_s)
 
@@ -76,7 +76,7 @@ class TestLeverArm:
         parent, child = streams
         turned = child.poses @ se3.exp(np.r_[0, 0, 0, 0.5, 1.0, -0.3])
         whole = Trajectory(child.stamps_ns, turned, "antenna")
-        found = hec.calibrate(parent, whole, child_measures="positions")
+        found = hec.calibrate(parent, whole, child_measures="positions", checks=False)
         assert found.T_parent_child[:3, 3] == pytest.approx(result.T_parent_child[:3, 3], abs=1e-9)
 
     def test_another_clock_is_found_from_the_speeds(self):
@@ -103,6 +103,7 @@ class TestLeverArm:
         found = hec.calibrate(
             Trajectory(stamps_ns, truth @ se3.exp(noise), "lidar"),
             Trajectory.from_positions(stamps_ns, positions, "antenna"),
+            checks=False,
         )
         assert abs(found.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
         assert np.abs(distances(found)).max() < 3.0
@@ -118,7 +119,7 @@ class TestLeverArm:
 
     def test_a_drift_with_the_path_is_within_sigma(self):
         parent, child, lever_arm = simulated_positions("car", seed=3)
-        found = hec.calibrate(parent, child)
+        found = hec.calibrate(parent, child, checks=False)
         assert np.abs((found.T_parent_child[:3, 3] - lever_arm) / found.sigmas[:3]).max() < 4.0
 
     def test_positions_that_are_worse_for_a_time_are_as_if_they_were_missing(self, streams):
@@ -126,11 +127,10 @@ class TestLeverArm:
         positions = child.poses[:, :3, 3].copy()
         positions[120:180] += np.cumsum(np.random.default_rng(3).normal(0.0, 0.2, (60, 3)), axis=0)
         mixed = Trajectory.from_positions(child.stamps_ns, positions, "antenna")
-        found = hec.calibrate(parent, mixed)
+        found = hec.calibrate(parent, mixed, checks=False)
         good = np.r_[0:115, 185:300]
-        apart = hec.calibrate(
-            parent, Trajectory.from_positions(child.stamps_ns[good], positions[good], "antenna")
-        )
+        apart = Trajectory.from_positions(child.stamps_ns[good], positions[good], "antenna")
+        apart = hec.calibrate(parent, apart, checks=False)
         left_out = next(each for each in found.noise.in_words if "far less precise" in each)
         assert 20 < int(left_out.partition("%")[0]) < 30
         difference = found.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
@@ -159,7 +159,7 @@ class TestLeverArm:
         assert found.status is hec.SolveStatus.UNOBSERVABLE
         assert "z cannot be determined from this motion" in found.reasons[0].sentence
         assert np.abs(distances(found)[:2]).max() < 4.0
-        known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)})
+        known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)}, checks=False)
         assert known.status is hec.SolveStatus.OK
         assert "z of the child sensor: mostly from the prior, not the motion" in known.warnings
 

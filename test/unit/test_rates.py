@@ -90,14 +90,14 @@ class TestRates:
 
     def test_a_prior_gives_the_translation(self, streams):
         prior = {axis: (value, 0.01) for axis, value in zip("xyz", (0.4, -0.2, 0.7), strict=True)}
-        known = hec.calibrate(*streams, prior=prior)
+        known = hec.calibrate(*streams, prior=prior, checks=False)
         assert known.out_of_reach == ()
         assert known.T_parent_child[:3, 3] == pytest.approx([0.4, -0.2, 0.7], abs=1e-3)
 
     def test_rotations_alone_need_no_bias(self, streams):
         parent, _ = streams
         child = Trajectory(parent.stamps_ns, child_of(parent.poses), measures="rotations")
-        found = hec.calibrate(parent, child)
+        found = hec.calibrate(parent, child, checks=False)
         assert found.rate_bias is None
         assert angle_to(T_PARENT_CHILD[:3, :3], found) < np.radians(0.1)
 
@@ -197,10 +197,6 @@ class TestFiles:
         files = [str(tmp_path / name) for name in ("lidar.tum", "imu.csv")]
         assert main(["calibrate", *files]) == 0
         assert "x, y and z are not estimated" in capsys.readouterr().out
-        assert main(["calibrate", *files, "--json"]) == 0
-        document = json.loads(capsys.readouterr().out)
-        assert document["rate_bias"]["rad_per_s"] == pytest.approx(BIAS, abs=3e-3)
-        assert document["observability"][0]["sigma"] is None
         assert main(["check", *files]) == 0
         out = capsys.readouterr().out
         assert out.startswith("USE: nothing speaks against")
@@ -286,6 +282,8 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     assert main(["replay", *parts, *topics, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["measured"], document["child_frame"]) == ("rotations", "imu_link")
+    assert document["rate_bias"]["rad_per_s"] == pytest.approx(BIAS, abs=3e-3)
+    assert document["observability"][0]["sigma"] is None
     assert document["inputs"]["options"]["child_measures"] == "rates"
     assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
     assert "/imu has messages of type" in capsys.readouterr().err
