@@ -100,7 +100,7 @@ def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(start_
 
 
 def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, peer):
-    node = start_node(*QUIET, fresh=True)
+    node = start_node(*QUIET, before="pass")
     peer.solve(peer.publishers(), *drive())
     heard, statuses = peer.listen(TransformStamped, "extrinsic"), peer.diagnostics()
     peer.spin_until(lambda: heard, "the result of before")
