@@ -22,9 +22,9 @@ __all__ = [*_HOMES]
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from hand_eye_calib.version import package_version
+        from hand_eye_calib.version import version_of
 
-        return package_version()
+        return version_of()
     if name not in _HOMES:
         raise AttributeError(f"module 'hand_eye_calib' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

@@ -3,14 +3,9 @@
 from functools import cache
 
 
-def package_version() -> str:
-    """Version of the installed package, as in package.xml; "unknown" without an installation."""
-    return version_of("hand_eye_calib")
-
-
 @cache
-def version_of(package: str) -> str:
-    """Version of an installed package, read once; "unknown" if it is not installed."""
+def version_of(package: str = "hand_eye_calib") -> str:
+    """Version of an installed package, read once; "unknown" without an installation."""
     # Costs some ten milliseconds to import.
     from importlib.metadata import PackageNotFoundError, version
 

@@ -146,9 +146,9 @@ def _run(argv: Sequence[str]) -> int:
         of = added.get(command or "", parser)
         of.error(f"unknown {word!r}{did_you_mean(word, of._option_string_actions)}")
     if arguments.version:
-        from hand_eye_calib.version import package_version
+        from hand_eye_calib.version import version_of
 
-        print(f"hand_eye_calib {package_version()}")
+        print(f"hand_eye_calib {version_of()}")
     elif command is None:
         parser.print_help()
     else:

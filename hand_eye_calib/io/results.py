@@ -17,7 +17,7 @@ from hand_eye_calib.io.yaml_files import read_yaml, yaml_text
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import transform_arguments, usable_angles, usable_numbers
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
-from hand_eye_calib.version import package_version, version_of
+from hand_eye_calib.version import version_of
 
 FILE_NAME = "extrinsic.yaml"
 RIG_NAME = "rig.yaml"
@@ -116,7 +116,7 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
     inputs = {**(inputs or {})}
     provenance = {
         "package": "hand_eye_calib",
-        "package_version": package_version(),
+        "package_version": version_of(),
         "versions": {"python": platform.python_version()}
         | {name: version_of(name) for name in ("numpy", "scipy")},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -209,7 +209,7 @@ def _remarks(calibration: Calibration) -> list[str]:
         calibration.headline,
         *(f"{reason.sentence}: {reason.what_to_do}" for reason in calibration.reasons),
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
-        f"Made by hand_eye_calib {package_version()}; {FILE_NAME} beside this file has the "
+        f"Made by hand_eye_calib {version_of()}; {FILE_NAME} beside this file has the "
         "covariance and where it came from.",
     ]
     return [printable(" ".join(remark.split())) for remark in remarks]

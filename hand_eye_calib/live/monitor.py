@@ -15,6 +15,7 @@ what the monitor can see.
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
+from typing import TypeAlias
 
 import numpy as np
 
@@ -93,6 +94,10 @@ _KNOCKS = np.array(
     [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
 )
 
+# A second, its motions (K), their residuals (K, 6) at the installed extrinsic and the negative
+# derivatives (K, 6, 7) of these by a shift and by the logarithm of the child's scale.
+_Second: TypeAlias = tuple[int, MotionPairs, FloatArray, FloatArray]
+
 # Of the session that is watched, poses are paired soon, and few are kept.
 LIMITS = BufferLimits(
     capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
@@ -140,7 +145,7 @@ class MountMonitor:
         self._covariance = TUNING.caution * np.asarray(covariance, dtype=float)
         self._wander = np.zeros((6, 6))
         self._noise = np.zeros((6, 6))
-        self._learning: list[tuple[int, MotionPairs]] = []
+        self._learning: list[_Second] = []
         self.is_learning = True
         self._tail = PosePairs.empty()
         # Of the newest seconds of motion, the newest first, and the sums of those before them.
@@ -163,14 +168,15 @@ class MountMonitor:
             A new one, if it was raised by these poses.
         """
         before, raised = self.alarm, None
-        for stamp_ns, motions in self._by_second(pose_pairs):
+        for second in self._by_second(pose_pairs):
+            stamp_ns, motions, *terms = second
             if not _is_motion(motions, self._noise):
                 continue
             self.seconds += 1
             if self.is_learning:
-                self._learn(stamp_ns, motions)
+                self._learn(second)
             else:
-                self._take(stamp_ns, motions)
+                self._take(stamp_ns, *terms)
             if not self.is_learning:
                 self._judge()
             raised = raised or (None if before else self.alarm)
@@ -182,7 +188,7 @@ class MountMonitor:
 
     # ------------------------------------------------------------- the motions
 
-    def _by_second(self, pose_pairs: PosePairs) -> list[tuple[int, MotionPairs]]:
+    def _by_second(self, pose_pairs: PosePairs) -> list[_Second]:
         """Motions over a second that end in these poses, by the second in which they begin."""
         if len(self._tail) and len(pose_pairs):
             late_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
@@ -200,21 +206,24 @@ class MountMonitor:
         i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.most_late * _SECOND_NS]
         self._last_s = max(self._last_s, under_way - 1)
         pairs, of_pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i]), seconds[i]
-        return [
-            (each * _SECOND_NS, pairs[of_pairs == each]) for each in np.unique(of_pairs).tolist()
-        ]
+        residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)  # all at once
+        by_scale = -se3.inverse(pairs.Ts_childi_childj)[:, :3, 3:]
+        jacobians = np.append(jacobians, np.pad(by_scale, ((0, 0), (0, 3), (0, 0))), axis=2)
+        parts = [(each * _SECOND_NS, of_pairs == each) for each in np.unique(of_pairs).tolist()]
+        return [(ns, pairs[part], residuals[part], jacobians[part]) for ns, part in parts]
 
-    def _learn(self, stamp_ns: int, motions: MotionPairs) -> None:
+    def _learn(self, second: _Second) -> None:
         """Collect motions; once there are enough, learn the noise about their own answer."""
-        self._learning.append((stamp_ns, motions))
+        self._learning.append(second)
         if len(self._learning) < TUNING.learning_s:
             return
         learned, self._learning = self._learning, []
-        parent = np.concatenate([each.Ts_parenti_parentj for _, each in learned])
-        child = np.concatenate([each.Ts_childi_childj for _, each in learned])
+        parent = np.concatenate([each.Ts_parenti_parentj for _, each, *_ in learned])
+        child = np.concatenate([each.Ts_childi_childj for _, each, *_ in learned])
         index = np.arange(len(parent))
         pairs = MotionPairs(parent, child, index, index + 1)
-        residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)
+        residuals = np.concatenate([each for *_, each, _ in learned])
+        jacobians = np.concatenate([each[:, :, :6] for *_, each in learned])
         self.is_learning = False
         self._noise, _ = moved.noise_covariance(residuals)
         for _ in range(2):
@@ -226,15 +235,11 @@ class MountMonitor:
         floor += moved.shift_covariance(1e-3, 1e-4)  # never singular
         self._covariance = self._covariance + floor
         self._wander = TUNING.wander**2 * floor
-        for second_ns, each in learned:
-            self._take(second_ns, each)
+        for second_ns, _, *terms in learned:
+            self._take(second_ns, *terms)
 
-    def _take(self, stamp_ns: int, motions: MotionPairs) -> None:
+    def _take(self, stamp_ns: int, residuals: FloatArray, jacobians: FloatArray) -> None:
         """Add the information of a second whatever the scale in it, and follow the noise."""
-        residuals, jacobians = moved.residuals_and_jacobians(motions, self._installed)
-        by_scale = np.zeros((len(motions), 6, 1))  # of its logarithm
-        by_scale[:, :3, 0] = -se3.inverse(motions.Ts_childi_childj)[:, :3, 3]
-        jacobians = np.concatenate([jacobians, by_scale], axis=2)
         if self.seconds % TUNING.long_run_every_s == 0 and len(self._S) >= TUNING.learning_s:
             self._centre = moved.most_likely(self._H.sum(axis=0), self._S.sum(axis=0), TUNING.ridge)
         shift = np.append(self._centre, 0.0)
@@ -249,7 +254,7 @@ class MountMonitor:
         self._S = np.concatenate([S[None], self._S])[: TUNING.memory_s]
         share = 1.0 / TUNING.noise_memory_s
         self._noise = (1.0 - share) * self._noise + share * scatter
-        self._motions_per_s += (len(motions) - self._motions_per_s) / min(len(self._S), 100)
+        self._motions_per_s += (len(residuals) - self._motions_per_s) / min(len(self._S), 100)
 
     # ------------------------------------------------------------- the judgement
 

@@ -27,7 +27,7 @@ from hand_eye_calib.results.document import printed_numbers, summary, transforms
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.session.rig import RigCalibration
-from hand_eye_calib.version import package_version
+from hand_eye_calib.version import version_of
 
 MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
 TONES = {
@@ -228,7 +228,7 @@ def _data(
         "labels": inputs.get("labels", {}),
         "summary": rows
         | {"Poses": f"{calibration.n_poses:,} {kind}", "Options": ", ".join(given) or "defaults"}
-        | {"Written": f"{now}, hand_eye_calib {package_version()}; extrinsic.yaml has the rest"},
+        | {"Written": f"{now}, hand_eye_calib {version_of()}; extrinsic.yaml has the rest"},
         "streams": [_stream(name, inputs, streams.get(name)) for name in names],
     }
 

@@ -21,7 +21,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.results.records import AXES
 from hand_eye_calib.results.verdict import Judged, Verdict
 from hand_eye_calib.text import axes_in_words
-from hand_eye_calib.version import package_version
+from hand_eye_calib.version import version_of
 
 # Beginnings of the words in a frame's name that say what the sensor is; nearest to the body first,
 # as the parent is taken for nearer than the child if the names say nothing.
@@ -136,7 +136,7 @@ def export_text(result: Judged, name: str) -> str:
     if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
         texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
     lines = [
-        f"{name}, by hand_eye_calib {package_version()}. {result.headline}.",
+        f"{name}, by hand_eye_calib {version_of()}. {result.headline}.",
         f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
         f"Clocks: t({result.parent_frame}) = t({result.child_frame}) "
         f"{'-' if result.time_offset_s < 0 else '+'} {_number(abs(result.time_offset_s))} s, "
