@@ -178,6 +178,10 @@ def publish_alone(rate_hz, n_poses):
     """Publish everything once the node listens; the process of its own."""
     from ros_harness import Peer
 
+    # A sensor is on time whatever else this machine does: messages that were held up would come all
+    # at once, and the last of them wait.
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
     peer = Peer(int(os.environ["ROS_DOMAIN_ID"]))
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
@@ -204,6 +208,17 @@ def children(pid):
     return found
 
 
+# Time used is charged at the kernel's tick, often 4 ms apart, and when another program wakes up on
+# that core: without these, a program that has used up its share of 5 ms ran 4 and stood still 16.
+WAKES_UP = """
+import os, sys, time
+os.sched_setaffinity(0, [int(sys.argv[1])])
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+while True:
+    time.sleep(0.001)
+"""
+
+
 def slow_processor(node, share):
     """Give the node, and its solving process, a share of a core each; undoes that."""
     groups = []
@@ -221,8 +236,11 @@ def slow_processor(node, share):
         (group / "cpu.cfs_quota_us").write_text(str(round(5000 * share)))
         (group / "cgroup.procs").write_text(str(pid))
         groups.append(group)
+    cores = os.sched_getaffinity(0)
+    waking = [subprocess.Popen([sys.executable, "-c", WAKES_UP, str(core)]) for core in cores]
 
     def undo():
+        end(waking)
         for group in groups:
             for pid in (group / "cgroup.procs").read_text(encoding="ascii").split():
                 (group.parent / "cgroup.procs").write_text(pid)
@@ -234,7 +252,14 @@ def slow_processor(node, share):
 def others(count):
     """Programs that load all cores, at the usual priority; ends them."""
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    return lambda: [(each.kill(), each.wait()) for each in busy]
+    return lambda: end(busy)
+
+
+def end(programs):
+    """End programs that never end by themselves."""
+    for each in programs:
+        each.kill()
+        each.wait()
 
 
 def loaded_node(folder, name, seconds, disturb=None, **environment):
