@@ -171,7 +171,7 @@ def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
         "t,x,y,z,qx,qy,qz,qw\n" + "1" * 200_000 + ",0,0,0,0,0,0,1\n",
         't,x,y,z,qx,qy,qz,qw\n"' + "\n1" * 200_000,
         "c," * 1_000_000 + "\n",
-        ",".join(["x"] * 5_000) + "\n",
+        ",".join(["x"] * 30_000) + "\n",
         "t,x,y,z,qx,qy,qz," + "w" * 60_000 + "\n",
     ):
         path.write_text(text)
