@@ -308,14 +308,17 @@ def check_independent(given: StreamPair, aligned: StreamPair) -> list[Finding]:
     # Programs interpolate at the stamps of the new stream.
     pairs = [(each.child, each.parent) for each in (given, aligned)]
     pairs += [both[::-1] for both in pairs]
-    left_rad = np.inf
-    for slow, fast in pairs:  # motions between stamps at which the other one is nearest
-        slow = slow[(slow.stamps_ns >= fast.stamps_ns[0]) & (slow.stamps_ns <= fast.stamps_ns[-1])]
-        after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns), 1, len(fast) - 1)
-        around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns).min(axis=0)
-        nearest = np.sort(around)[: max(_NEAREST[0], len(slow) // 100)]
-        slow = slow[around <= nearest.max(initial=0)]
-        slow = slow[:: max(-(-len(slow) // _NEAREST[1]), 1)]
+    left_rad, halves = np.inf, list[tuple[Trajectory, Trajectory]]()
+    for slow, fast in pairs:
+        first_ns, last_ns = fast.stamps_ns[[0, -1]]
+        rows = np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
+        halves.append((slow[rows[len(rows) // 2 :][: _NEAREST[1]]], fast))
+        # Motions between stamps at which the other one is nearest.
+        after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
+        around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[rows]).min(axis=0)
+        nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
+        rows = rows[around <= nearest.max(initial=0)]
+        slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
         between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
         left_rad = min(left_rad, _left(pairs_between(between, slow.poses, start, start + 1)))
     if left_rad < 0.01 * _ALIKE[0]:
@@ -323,7 +326,7 @@ def check_independent(given: StreamPair, aligned: StreamPair) -> list[Finding]:
     # Circumstantial: sensors may be precise, or shake together.
     motions = [pairs_over(aligned.synchronised, s, _MOST_SHORT) for s in (0.0, _SHORT_S)]
     left_rad = min(left_rad, *map(_left, motions))
-    more = max(_ALIKE[0] / left_rad, *starmap(_shared_noise, pairs))
+    more = max(_ALIKE[0] / left_rad, *starmap(_shared_noise, halves))
     more_than_usual = f"have {more:.1f} times as much in common as two sensors may have"
     doubt = finding("not_independent", "both", Severity.WARNING, are=more_than_usual, more=more)
     return [doubt] if more > 1.0 else []
@@ -341,12 +344,9 @@ def _left(motions: MotionPairs) -> float:
 
 
 def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
-    """How many times more noise both streams have in common than two sensors; 0 if it is motion
-    that makes them rough, or a pose is missing.
+    """How many times more noise a part of one stream has in common with the other than two sensors
+    have; 0 if it is motion that makes them rough, or a pose is missing.
     """
-    first_ns, last_ns = fast.stamps_ns[[0, -1]]
-    rows = np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
-    slow = slow[rows[len(rows) // 2 :][: _NEAREST[1]]]
     intervals_ns = np.diff(slow.stamps_ns)
     if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
         return 0.0

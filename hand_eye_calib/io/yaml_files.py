@@ -6,6 +6,7 @@ twice, aliases, and documents that are too large or too deep; all in one line.
 """
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 # libyaml is several times as fast, and part of most builds.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+_dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
 
 
 class _Loader(_Base):
@@ -65,8 +66,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
 
 def yaml_text(document: Any) -> str:
     """Values of any kind as a YAML file for programs and people."""
-    style: dict[str, Any] = {"default_flow_style": None, "width": 120, "allow_unicode": True}
-    return str(yaml.dump(plain(document), Dumper=_Dumper, sort_keys=False, **style))
+    return str(_dump(plain(document), default_flow_style=None, width=120, allow_unicode=True))
 
 
 def _check_events(text: str) -> None:

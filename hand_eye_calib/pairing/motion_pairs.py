@@ -211,7 +211,7 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
     Returns
     -------
     MotionPairs
-        None if there are too few poses.
+        Of length 0 if there are too few poses.
 
     Raises
     ------

@@ -338,7 +338,7 @@ def _shares(kernels: FloatArray, rows: FloatArray) -> FloatArray:
 def _widened(
     stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray, views: FloatArray
 ) -> FloatArray:
-    """Covariance of a fit, if errors last or come back, and targets may have another size."""
+    """Covariance of a fit for time-correlated or recurring errors, and targets of another size."""
     errors, jacobian = _linearise(stops, fit.Ts_parent_child, fit.Ts_world_world, in_world)
     T = stops.Ts_world_child if in_world else se3.inverse(stops.Ts_world_child)
     longer = np.concatenate([T[:, :3, 3], np.zeros((len(T), 3))], axis=1)

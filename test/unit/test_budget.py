@@ -17,7 +17,7 @@ ROOT = SOURCE.parent
 # functions entered by ``calibrate a b``.
 LIMITS = {
     "lines": 29_420,
-    "lines of code": 18_960,
+    "lines of code": 18_959,
     "numeric constants": 395,
     "files above 500 lines": 0,
     "functions above 50 lines": 4,
