@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from hand_eye_calib.cli.options import note, print_result, waiting_for
 from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.python_path import trusted_environment
 from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.text import angle, length
 
@@ -100,7 +101,9 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 
     with (
         log_path.open("wb") as log,
-        subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT) as process,
+        subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, env=trusted_environment()
+        ) as process,
     ):
         try:
             yield check

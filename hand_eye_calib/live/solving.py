@@ -29,6 +29,7 @@ from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.live.state import GRACE_S
 from hand_eye_calib.option import Options
 from hand_eye_calib.pairing.motion_pairs import PosePairs
+from hand_eye_calib.python_path import trusted_environment
 from hand_eye_calib.results.calibration import Calibration
 
 # Not `-m`: its classes would belong to the module __main__, which the node does not have.
@@ -160,12 +161,11 @@ def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Po
     """Run Python code with the same modules as here, in a group of its own, which Ctrl-C in the
     terminal leaves alone.
     """
-    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
         stdin=stdin,
         stdout=stdout,
-        env=os.environ | {"PYTHONPATH": path},
+        env=trusted_environment(),
         process_group=0,
     )
 

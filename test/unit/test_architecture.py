@@ -14,12 +14,14 @@ from hand_eye_calib.simulation.options import NoiseConfig
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
 GROUND = {"errors", "text", "config", "arrays", "stats", "plain", "version", "upstairs", "option"}
+GROUND |= {"python_path"}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
     "stats": {"arrays"},
     "plain": {"errors"},
     "version": set(),
+    "python_path": set(),
     "upstairs": set(),
     "text": {"errors"},
     "option": {"errors", "text"},
@@ -44,7 +46,7 @@ ALLOWED = ENGINE | {
     "watch": {"errors", "stats", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "live", "watch", "ros", *ENGINE},
-    "__main__": {"cli"},
+    "__main__": {"cli", "python_path"},
 }
 
 # Where a library that is heavy, optional or bound to ROS may be imported.

@@ -29,6 +29,7 @@ from hand_eye_calib.io import remote
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.option import Options
 from hand_eye_calib.plain import Document
+from hand_eye_calib.python_path import trusted_environment
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import told_apart
@@ -262,6 +263,8 @@ def outcomes(
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
     """Worker processes, spawned: forking a program with threads is not safe."""
+    # A worker is `python -c`, which would import modules from the current folder.
+    os.environ.update(trusted_environment())
     executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
     try:
         yield executor
