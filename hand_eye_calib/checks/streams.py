@@ -1,8 +1,11 @@
 """Checks of a single stream, and of one beside another."""
 
+import itertools
+
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.assessment.covariance import usual_speed
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
@@ -17,10 +20,27 @@ _GAP_INTERVALS = 5.0
 # and by this many times a fast step.
 _JUMP_SIGMAS, _JUMP_STEPS = 12.0, 3.0
 
-# Poses, heights and verticals (m, rad) this close are the same, to rounding. A stream moves, or
-# tilts, by more than the second; it is frozen if its pose stays the same for so long (s) while the
-# other one moves.
-_SAME, _MOVES, _FROZEN_S = 1e-6, 0.02, 1.0
+# Poses, heights and verticals (m, rad) this close are the same, to rounding.
+_SAME = 1e-6
+
+# Smallest tilt of a stream that is not flat (rad).
+_TILTS = 0.02
+
+# Shortest time (s) for which a frozen stream repeats its pose, and the longest part of that time
+# that is asked for motion at once: a car may stand for a minute and then drive.
+_FROZEN_S = 1.0
+_PART_S = 10.0
+
+# Smallest net motion of a sensor that does not stand: in m and rad, and as a share of the usual
+# speed times the duration. Odometry drifts by up to 6 cm and 0.05 rad while a car waits 42 s at
+# traffic lights.
+_MOVES_M = 0.02
+_MOVES_RAD = 0.1
+_MOVES_SHARE = 0.1
+
+# Motion must also exceed the noise of positions and angles by this factor. Noise is the median
+# second difference; of white noise the largest distance was 2.2 times that in 6,000 draws.
+_MOVES_NOISES = 2.5
 
 # Two sensors take turns if a stream is this many times rougher from pose to pose than over some
 # longer lag (in poses), by at least so many metres. Repeated poses are another matter.
@@ -160,7 +180,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         # rotation.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
-        if tilt_rad > _MOVES:
+        if tilt_rad > _TILTS:
             return [finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))]
     return []
 
@@ -168,27 +188,57 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Findings about streams that repeat their pose while the other moves, on one clock."""
     shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
-    found = (graded("frozen", name, share, share=share) for name, share in shares.items())
-    return [*filter(None, found)]
+    findings = (graded("frozen", name, share, share=share) for name, share in shares.items())
+    return [*filter(None, findings)]
 
 
 def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
-    """Share of the time in which a stream repeats its pose to the last digits while another one, on
-    the same clock, moves.
+    """Return the share of the time in which a stream repeats its pose while the other sensor moves.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        The stream that may be frozen. Repeated poses are equal to the last digit.
+    other : Trajectory
+        The stream of the other sensor, on the same clock.
     """
+    usual_m_s = usual_speed(other.stamps_ns, other.poses[:, :3, 3])
+    frozen_ns = 0
+    for from_ns, until_ns in _repetitions(trajectory):
+        n_parts = max(1, round((until_ns - from_ns) * 1e-9 / _PART_S))
+        edges_ns = np.linspace(from_ns, until_ns, n_parts + 1).astype(np.int64)
+        for first_ns, last_ns in itertools.pairwise(edges_ns.tolist()):
+            is_part = (other.stamps_ns >= first_ns) & (other.stamps_ns <= last_ns)
+            if _moves(other[is_part], usual_m_s):
+                frozen_ns += last_ns - first_ns
+    return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
+
+
+def _repetitions(trajectory: Trajectory) -> list[tuple[int, int]]:
+    """Return first and last stamp (ns) of the times in which a stream repeats its pose."""
     same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME
     edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int)))
-    frozen_ns = 0
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        from_ns, until_ns = (int(trajectory.stamps_ns[index]) for index in (start, end))
-        during = other.poses[(other.stamps_ns >= from_ns) & (other.stamps_ns <= until_ns)]
-        if until_ns - from_ns < _FROZEN_S * 1e9 or len(during) < 2:
-            continue
-        distance = np.linalg.norm(during[:, :3, 3] - during[0, :3, 3], axis=1).max()
-        angle = se3.rotation_angle(during[0, :3, :3].T @ during[:, :3, :3]).max()
-        if max(distance, angle) > _MOVES:
-            frozen_ns += until_ns - from_ns
-    return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
+    times_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
+    is_long = times_ns[:, 1] - times_ns[:, 0] >= _FROZEN_S * 1e9
+    return [(from_ns, until_ns) for from_ns, until_ns in times_ns[is_long].tolist()]
+
+
+def _moves(part: Trajectory, usual_m_s: float) -> bool:
+    """Return whether a sensor moves in a part of its stream: drift and noise are no motion."""
+    if len(part) < 2:
+        return False
+    positions = part.poses[:, :3, 3]
+    angles = se3.rotation_log(part.poses[0, :3, :3].T @ part.poses[:, :3, :3])
+    least_m = max(_MOVES_M, _MOVES_SHARE * usual_m_s * part.duration_s)
+    return _exceeds(positions - positions[0], least_m) or _exceeds(angles, _MOVES_RAD)
+
+
+def _exceeds(away: FloatArray, least: float) -> bool:
+    """Return whether vectors (N, 3) from the start become longer than ``least`` and their noise."""
+    rough = np.linalg.norm(np.diff(away, 2, axis=0), axis=1)
+    noise = median(rough) if len(rough) else 0.0
+    largest = float(np.linalg.norm(away, axis=1).max())
+    return largest > max(least, _MOVES_NOISES * noise)
 
 
 def check_lengths(parent: Trajectory) -> list[Finding]:

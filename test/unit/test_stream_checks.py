@@ -15,7 +15,7 @@ from hand_eye_calib.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.checks import hypotheses
 from hand_eye_calib.checks.check import check_streams
 from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.checks.streams import check_stream, frozen_share
+from hand_eye_calib.checks.streams import check_frozen, check_stream, frozen_share
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.engine.evidence import summarise
 from hand_eye_calib.errors import InputError
@@ -29,6 +29,28 @@ def drive(seed=0, noise=0.001, wander=motions.wandering_poses, n_poses=500):
     """A walk far from the origin, so that it matters whose pose is in which frame."""
     start = se3.from_rotation_translation(np.eye(3), [30.0, -20.0, 2.0])
     return motions.noisy_pair(start @ wander(n_poses, seed), seed + 1, noise, noise)
+
+
+def driving_car(n_poses=600):
+    """Two sensors of a car that takes curves at 8 m/s, ten poses a second."""
+    steps = np.zeros((n_poses - 1, 6))
+    steps[:, 0] = 0.8
+    steps[:, 5] = 0.03 * np.sin(np.arange(n_poses - 1) / 25.0)
+    return motions.noisy_pair(motions.walked(se3.exp(steps)), 1, 0.003, 0.0005)
+
+
+# Pose at which a car stops.
+_STOP_AT = 300
+
+
+def with_stop(stream, duration_s, drift):
+    """A stop of so many seconds, during which the pose drifts by (rho, phi) ``drift`` (6,)."""
+    n_poses = round(10 * duration_s)
+    shares = np.arange(1, n_poses + 1)[:, None] / n_poses
+    standing = stream.poses[_STOP_AT] @ se3.exp(shares * drift)
+    onward = standing[-1] @ se3.inverse(stream.poses[_STOP_AT]) @ stream.poses[_STOP_AT + 1 :]
+    poses = np.concatenate([stream.poses[: _STOP_AT + 1], standing, onward])
+    return motions.as_trajectory(poses)
 
 
 def grave(agreement):
@@ -207,6 +229,58 @@ class TestOneStream:
         assert frozen_share(frozen(child, 0.75), parent) == pytest.approx(0.25, abs=0.01)
         assert frozen_share(child, parent) == 0.0
         assert frozen_share(frozen(child, 0.75), frozen(parent, 0.75)) == 0.0
+
+    @pytest.mark.parametrize("repeating", ["parent", "child"])
+    @pytest.mark.parametrize("duration_s", [4.0, 42.0, 120.0])
+    def test_drift_of_one_odometry_at_traffic_lights_is_no_motion(self, repeating, duration_s):
+        streams = dict(zip(("parent", "child"), driving_car(), strict=True))
+        drift = np.r_[0.05, -0.03, 0.01, 0.01, 0.0, 0.04]
+        for name, stream in streams.items():
+            streams[name] = with_stop(
+                stream, duration_s, np.zeros(6) if name == repeating else drift
+            )
+        assert check_frozen(**streams) == []
+        codes = {found.code for found in check_streams(**streams).findings}
+        assert "frozen" not in codes
+
+    @pytest.mark.parametrize("repeating", ["parent", "child"])
+    def test_noise_of_a_camera_beside_wheels_that_stand_is_no_motion(self, repeating):
+        streams = dict(zip(("parent", "child"), drive(n_poses=500), strict=True))
+        for seed, (name, stream) in enumerate(streams.items()):
+            stopped = with_stop(stream, 20.0, np.zeros(6))
+            if name != repeating:
+                poses = motions.disturbed(stopped.poses, seed, 0.02, 0.03)
+                stopped = dataclasses.replace(stopped, poses=poses)
+            streams[name] = stopped
+        assert check_frozen(**streams) == []
+
+    @pytest.mark.parametrize("frozen_stream", ["parent", "child"])
+    @pytest.mark.parametrize("duration_s", [2.0, 3.5, 6.0])
+    @pytest.mark.parametrize("of", ["car", "hand"])
+    def test_a_freeze_of_seconds_during_motion_is_found(self, frozen_stream, duration_s, of):
+        pair = driving_car() if of == "car" else drive(n_poses=600)
+        streams = dict(zip(("parent", "child"), pair, strict=True))
+        stream = streams[frozen_stream]
+        poses = stream.poses.copy()
+        poses[200 : 201 + int(10 * duration_s)] = poses[200]
+        streams[frozen_stream] = dataclasses.replace(stream, poses=poses)
+        (found,) = check_frozen(**streams)
+        assert (found.code, found.stream, found.severity) == (
+            "frozen",
+            frozen_stream,
+            Severity.ERROR,
+        )
+        share = duration_s / stream.duration_s
+        assert found.evidence["share"] == pytest.approx(share, abs=0.004)
+
+    def test_only_the_part_of_a_freeze_in_which_the_car_drives_counts(self):
+        parent, child = driving_car()
+        parent = with_stop(parent, 40.0, np.zeros(6))
+        child = with_stop(child, 40.0, np.zeros(6))
+        poses = child.poses.copy()
+        poses[_STOP_AT + 400 : _STOP_AT + 500] = poses[_STOP_AT]
+        stuck = dataclasses.replace(child, poses=poses)
+        assert 6.0 < frozen_share(stuck, parent) * parent.duration_s < 14.0
 
     @pytest.mark.parametrize(("at", "few"), [(3, "the first 3"), (497, "the last 3")])
     def test_a_stamp_years_away_is_one_line_and_takes_no_memory(self, at, few):
