@@ -18,6 +18,8 @@ AsGiven = Callable[[Any], Any]
 
 # Files of a bag, as their names end.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
+# Files beside a .db3 that hold its newest messages if its recorder was killed.
+_BESIDE = (".db3-wal", ".db3-journal")
 
 
 def is_url(path: object) -> bool:
@@ -77,8 +79,9 @@ def _copied(url: str, folder: Path) -> Path:
     folder.mkdir()
     with _reached(url) as (system, path):
         is_file = _name(path).endswith(_SUFFIXES)
-        found = [system.info(path) | {"name": path}] if is_file else system.ls(path, detail=True)
-        files = [about for about in found if _name(about["name"]).endswith(_SUFFIXES)]
+        found = _file_and_beside(system, path) if is_file else system.ls(path, detail=True)
+        names = (*_SUFFIXES, *_BESIDE)
+        files = [about for about in found if _name(about["name"]).endswith(names)]
         if not files:
             raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
         # Half of the free space is left to the copies of other processes.
@@ -92,6 +95,15 @@ def _copied(url: str, folder: Path) -> Path:
             # The name's last part only: a store does not choose where things go.
             system.get_file(about["name"], str(folder / _name(about["name"])))
         return folder / _name(path) if is_file else folder
+
+
+def _file_and_beside(system: Any, path: str) -> list[dict[str, Any]]:
+    """Return what a store says of a file, and of those beside it that belong to it."""
+    paths = [path]
+    if path.endswith(".db3"):
+        beside = [path.removesuffix(".db3") + suffix for suffix in _BESIDE]
+        paths += [name for name in beside if system.exists(name)]
+    return [system.info(name) | {"name": name} for name in paths]
 
 
 def _name(path: str) -> str:

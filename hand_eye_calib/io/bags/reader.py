@@ -20,7 +20,7 @@ from hand_eye_calib.io.bags import messages, sources
 from hand_eye_calib.io.bags.messages import PoseTable, Run
 from hand_eye_calib.io.bags.scans import ScanReading
 from hand_eye_calib.io.bags.sources import Reading, Source
-from hand_eye_calib.io.bags.storage import open_bags
+from hand_eye_calib.io.bags.storage import losses_of, open_bags
 from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.target_images import Target, camera_of, read_camera
 from hand_eye_calib.io.transforms import TfSource, TfStream
@@ -61,7 +61,7 @@ class PoseBag:
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
-        self.files = [storage.path for storage in self._storages]
+        self.files = [file for storage in self._storages for file in storage.files]
         types, counts = defaultdict[str, set[str]](set), Counter[str]()
         for kind, count in chain(*(storage.counts.items() for storage in self._storages)):
             types[kind.topic].add(kind.type)
@@ -70,6 +70,10 @@ class PoseBag:
             name: TopicInfo(name, "" if len(types[name]) > 1 else types[name].pop(), counts[name])
             for name in sorted(types)
         }
+        for path in self.paths:
+            inside = [storage for storage in self._storages if path in storage.path.parents]
+            n_present = sum(sum(storage.counts.values()) for storage in inside)
+            self._notes += losses_of(path, n_present)
         spans = [each.span_ns for each in self._storages if each.span_ns]
         self.start_ns = min((first for first, _ in spans), default=None)
         self.end_ns = max((last for _, last in spans), default=None)

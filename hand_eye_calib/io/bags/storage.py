@@ -2,13 +2,15 @@
 rosbag1) and mcap.
 """
 
+import shutil
+import sqlite3
 import struct
 import sys
 import tempfile
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -22,10 +24,17 @@ import numpy as np
 
 from hand_eye_calib.errors import InputError, MissingDependencyError, printable, required
 from hand_eye_calib.io import files
+from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.text import listing, share
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 _REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+# Files of SQLite beside a .db3 whose recorder was killed: they hold its newest messages.
+_UNFINISHED = ("-wal", "-journal")
+_METADATA = "metadata.yaml"
+# Missing files that a message names.
+_MOST_NAMED = 5
 
 
 class MessageKind(NamedTuple):
@@ -59,7 +68,8 @@ def _kind(topic: str, name: str, encoding: str, language: str, content: bytes) -
 
 class Storage(ABC):
     """A storage file opened for reading, until ``opened`` is closed: ``path`` is its name for a
-    person, ``file`` where it is, unpacked. An InputError if nothing in it can be read.
+    person, ``file`` where it is, unpacked, ``files`` are those that it was read from. An InputError
+    if nothing in it can be read.
 
     ``counts`` has the number of messages of each kind, ``span_ns`` the bag times of the first and
     the last, if there are any, and ``losses`` what could not be read, one line each.
@@ -69,6 +79,7 @@ class Storage(ABC):
 
     def __init__(self, path: Path, file: Path, opened: ExitStack) -> None:
         self.path, self._file = path, file
+        self.files = [path, *_unfinished(path)]
         self.counts = Counter[MessageKind]()
         self.span_ns: tuple[int, ...] = ()
         self.losses: list[str] = []
@@ -340,19 +351,62 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
     """The storage files of bags in the order of their start; those compressed as a whole are
     unpacked first. An InputError if there is no bag or it cannot be read.
     """
-    found = list[Storage]()
+    storages = list[Storage]()
     for file in [file for path in paths for file in _files_of(path)]:
-        readable, lost = file, ""
-        if file.suffix == ".zstd":
-            folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
-            readable = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
-            lost = _unpack(file, readable)
+        readable, loss = _readable(file, opened)
         is_mcap = _suffix(file) == ".mcap" and find_spec("mcap")
         kind = McapFile if is_mcap else RosbagsFile
         storage: Storage = kind(file, readable, opened)
-        storage.losses[:0] = [lost] * bool(lost)
-        found.append(storage)
-    return sorted(found, key=attrgetter("span_ns"))
+        if loss:
+            storage.losses.insert(0, loss)
+        storages.append(storage)
+    return sorted(storages, key=attrgetter("span_ns"))
+
+
+def _readable(file: Path, opened: ExitStack) -> tuple[Path, str]:
+    """Return a file that can be read as it is, and what could not be unpacked.
+
+    This is the file itself, or a temporary copy until ``opened`` is closed: unpacked if the file is
+    compressed as a whole, complete if its recorder was killed.
+    """
+    unfinished = _unfinished(file)
+    if file.suffix != ".zstd" and not unfinished:
+        return file, ""
+    folder = tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
+    copy = Path(opened.enter_context(folder), f"unpacked{_suffix(file)}")
+    if file.suffix == ".zstd":
+        return copy, _unpack(file, copy)
+    _complete(file, unfinished, copy)
+    return copy, ""
+
+
+def _unfinished(file: Path) -> list[Path]:
+    """Return the files of SQLite beside a .db3 without which messages would be missing."""
+    if file.suffix != ".db3":
+        return []
+    beside = [file.with_name(f"{file.name}{suffix}") for suffix in _UNFINISHED]
+    return [path for path in beside if path.is_file() and path.stat().st_size]
+
+
+def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
+    """Copy a database with the files beside it, and let SQLite finish the copy.
+
+    SQLite writes beside a database even if it only reads, and the user's folder must stay as it is.
+    """
+    try:
+        shutil.copyfile(file, copy)
+        for path in unfinished:
+            shutil.copyfile(path, f"{copy}{path.name.removeprefix(file.name)}")
+        with closing(sqlite3.connect(copy)) as database:
+            database.execute("PRAGMA journal_mode=DELETE").fetchall()
+            database.execute("SELECT count(*) FROM sqlite_master").fetchall()
+    except (OSError, sqlite3.Error) as error:
+        raise InputError(
+            f"cannot read bag {file}: its recorder was stopped, and its newest messages are in "
+            f"{', '.join(path.name for path in unfinished)}, which cannot be added to a copy in "
+            f"{copy.parent.parent} ({_reason_of(error)}); set TMPDIR to a folder with more space, "
+            f"or repair the bag with {_REPAIRS['.db3']}"
+        ) from error
 
 
 def _unpack(file: Path, target: Path) -> str:
@@ -381,6 +435,12 @@ def _files_of(path: Path) -> list[Path]:
     found = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
     found -= {file for file in found if file.suffix == ".zstd" and file.with_suffix("") in found}
     if not found:
+        missing, _ = missing_files(path)
+        if missing:
+            raise InputError(
+                f"no messages in {path}: its {_METADATA} lists {_listing(missing)}, missing there; "
+                "copy the whole bag"
+            )
         near = sorted(file.parent for depth in ("*/*", "*/*/*") for file in path.glob(depth))
         below = next((folder for folder in near if any(map(_suffix, folder.iterdir()))), "")
         raise InputError(
@@ -388,6 +448,66 @@ def _files_of(path: Path) -> list[Path]:
             + (f"give {below} (--batch takes all below a folder)" if below else "check the path")
         )
     return sorted(found)
+
+
+class Listed(NamedTuple):
+    """A storage file that the metadata of a rosbag2 lists; messages are None if not counted."""
+
+    name: str
+    messages: int | None
+
+
+def missing_files(path: Path) -> tuple[list[Listed], int | None]:
+    """Return the files that ``metadata.yaml`` lists and the directory of a bag lacks.
+
+    The second value is the number of messages of the whole bag; None if it is not stated.
+    """
+    listed: list[Listed] = []
+    total = None
+    with suppress(InputError, AttributeError, TypeError, KeyError):  # damaged, or not there
+        about = read_yaml(path / _METADATA)["rosbag2_bagfile_information"]
+        counts = {file["path"]: file["message_count"] for file in about.get("files") or ()}
+        paths = [str(name) for name in about["relative_file_paths"]]
+        listed = [Listed(_name_of(name), counts.get(name)) for name in paths]
+        total = about.get("message_count")
+    present = {file.name.removesuffix(".zstd") for file in path.iterdir()}
+    missing = [file for file in listed if file.name.removesuffix(".zstd") not in present]
+    return missing, total if isinstance(total, int) else None
+
+
+def _name_of(path: str) -> str:
+    return printable(PurePath(path).name[: files.LONGEST_NAME])
+
+
+def _listing(missing: Collection[Listed]) -> str:
+    names = [file.name for file in missing]
+    if len(names) > _MOST_NAMED:
+        names[_MOST_NAMED:] = [f"{len(names) - _MOST_NAMED} more"]
+    return listing(names)
+
+
+def losses_of(path: Path, n_present: int) -> list[str]:
+    """Return a line that names the listed files which a directory lacks, and what share that is.
+
+    ``n_present`` is the number of messages in the files that are there.
+    """
+    if not path.is_dir():
+        return []
+    missing, total = missing_files(path)
+    if not missing:
+        return []
+    counts = [file.messages for file in missing if isinstance(file.messages, int)]
+    n_missing = sum(counts)
+    if len(counts) < len(missing):
+        n_missing = max((total or 0) - n_present, 0)
+    are = "is" if len(missing) == 1 else "are"
+    line = f"{path}: {_METADATA} lists {_listing(missing)}, which {are} missing"
+    if n_missing:
+        lost = n_missing / (n_missing + n_present)
+        line += (
+            f": {n_missing:,} of {n_missing + n_present:,} messages ({share(lost)}) are not read"
+        )
+    return [f"{line}; copy the whole bag"]
 
 
 def _suffix(file: Path) -> str:
