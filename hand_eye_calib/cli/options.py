@@ -67,7 +67,7 @@ _OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for
 # Names in backticks; and names that are no words of the language, such as max_gap and prior.z, or
 # stand before a value, wherever they stand, but not in a path, after dashes or in quotes.
 _NAMES = re.compile(
-    r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._][a-z_]+)+|scale(?= (?:none|auto|estimate\b|\d)))"
+    r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._]+[a-z]+)+|scale(?= (?:none|auto|estimate\b|\d)))"
     r"(?![\w/=-]|\.\w)( VALUE)?"
 )
 

@@ -54,7 +54,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     """
     text = read_text(path, expected, LARGEST_YAML)
     # Comments of JSON, header and tag of OpenCV.
-    text = re.sub(r"^%YAML.*|^\s*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^%YAML.*|^[ \t]*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
     try:
         _check_events(text)
         return yaml.load(text, Loader=_Loader)

@@ -1,0 +1,124 @@
+"""Every regular expression of the package is linear in texts that are made against it."""
+
+import ast
+import re
+import re._parser as sre
+import signal
+from contextlib import contextmanager
+
+import pytest
+from source_code import SOURCE
+
+_FLAGS = ("MULTILINE", "DOTALL", "IGNORECASE")
+_FUNCTIONS = {"compile", "search", "match", "fullmatch", "sub", "split", "findall", "finditer"}
+# Characters of a hostile text; a line of a trajectory file may have more.
+_LENGTH = 30_000
+# Processor time (s) for a pattern and a text. A linear pattern needs milliseconds, a quadratic one
+# several seconds, an exponential one years.
+_MOST_S = 2.0
+# Patterns that meet only what the package has drawn itself.
+_OF_OWN_TEXT = {"report/figures.py"}
+# Most characters of a pattern from which hostile texts are made.
+_ALPHABET = 6
+
+
+def patterns():
+    """Every pattern that stands in the source as text: place to pattern, flags and function."""
+    collected = {}
+    for path in sorted(SOURCE.rglob("*.py")):
+        file = str(path.relative_to(SOURCE))
+        calls = [node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if is_of_re(node)]
+        for call in calls:
+            if file not in _OF_OWN_TEXT:
+                flags = sum(getattr(re, name) for name in _FLAGS if name in ast.unparse(call))
+                place = f"{file}:{call.lineno} {call.func.attr}"
+                collected[place] = (call.args[0].value, flags, call.func.attr)
+    return collected
+
+
+def is_of_re(node):
+    """Whether a node of the syntax tree calls a function of re with a literal pattern."""
+    if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute) or not node.args:
+        return False
+    module = node.func.value
+    has_module = isinstance(module, ast.Name) and module.id == "re"
+    return has_module and node.func.attr in _FUNCTIONS and isinstance(node.args[0], ast.Constant)
+
+
+def alphabet(pattern):
+    """Characters that the pattern names or has in a class: signs first, then letters."""
+    of_class = {
+        sre.CATEGORY_DIGIT: "1",
+        sre.CATEGORY_SPACE: " \n",
+        sre.CATEGORY_WORD: "a_",
+        sre.CATEGORY_NOT_SPACE: "a.",
+    }
+    characters = {"a", "1", " "}
+
+    def visit(item):
+        match item:
+            case (sre.LITERAL | sre.NOT_LITERAL, code):
+                characters.add(chr(code))
+            case (sre.RANGE, (first, _)):
+                characters.add(chr(first))
+            case (sre.CATEGORY, category):
+                characters.update(of_class.get(category, ""))
+            case tuple() | list() | sre.SubPattern():
+                for part in item:
+                    visit(part)
+
+    visit(sre.parse(pattern))
+    return sorted(characters, key=lambda character: (character.isalpha(), character))[:_ALPHABET]
+
+
+def hostile_texts(pattern):
+    """Long repetitions of one or two characters that the pattern names, after some of them."""
+    characters = alphabet(pattern)
+    pairs = [first + second for first in characters for second in characters if first != second]
+    for unit in (*characters, *pairs):
+        for start in ("", *characters[:3]):
+            yield start + unit * (_LENGTH // len(unit)) + "\0"
+
+
+def applied(pattern, flags, function, text):
+    """The function on a text, with everything that it yields."""
+    if isinstance(pattern, bytes):
+        text = text.encode()
+    compiled = re.compile(pattern, flags)
+    if function in ("compile", "fullmatch"):
+        compiled.fullmatch(text)
+    if function != "fullmatch":
+        for _ in compiled.finditer(text):
+            pass
+
+
+@contextmanager
+def processor_time(seconds, what):
+    """Fail if the block takes more processor time."""
+
+    def stop(*_):
+        raise AssertionError(f"{what}: more than {seconds:g} s for {_LENGTH} characters")
+
+    before = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
+
+
+@pytest.mark.parametrize("place", patterns())
+def test_a_pattern_is_linear_in_hostile_texts(place):
+    pattern, flags, function = patterns()[place]
+    for text in hostile_texts(pattern.decode() if isinstance(pattern, bytes) else pattern):
+        with processor_time(_MOST_S, f"{pattern!r} on {text[:12]!r} ..."):
+            applied(pattern, flags, function, text)
+
+
+@pytest.mark.parametrize("pattern", [r"(a+)+b", r"\d+\.?\d*x", r"\s+:"])
+def test_a_pattern_that_is_not_linear_is_noticed(pattern):
+    with pytest.raises(AssertionError, match="more than"):
+        for text in hostile_texts(pattern):
+            with processor_time(_MOST_S, pattern):
+                applied(pattern, 0, "compile", text)
