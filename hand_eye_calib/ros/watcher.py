@@ -1,6 +1,5 @@
 """Listens to the nodes for ``watch``, and passes the presses of its buttons on."""
 
-import json
 import os
 import time
 from functools import partial
@@ -18,12 +17,11 @@ from std_srvs.srv import Trigger
 
 from hand_eye_calib.config import POSE_TYPES
 from hand_eye_calib.errors import printable
-from hand_eye_calib.live.state import ANSWER_WITHIN_S, REPORT_PERIOD_S, NodeState
-from hand_eye_calib.plain import from_plain
+from hand_eye_calib.live.state import ANSWER_WITHIN_S, REPORT_PERIOD_S
 from hand_eye_calib.ros.conversions import LATCHED
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.text import counted
-from hand_eye_calib.watch.board import Board
+from hand_eye_calib.watch.board import Board, state_of
 
 # So many nodes are listened to, and so many topics with poses are told of, at most.
 _MOST = 20
@@ -131,21 +129,3 @@ class Watcher:
     def _end(self, request: str, good: bool, text: str) -> None:
         self._node.destroy_client(self._asked.pop(request)[0])
         self._board.answer(request, good, printable(text) or "done", time.monotonic())
-
-
-def state_of(text: str) -> NodeState | None:
-    """The state of a node from its JSON, without control characters; None if it is something else,
-    such as that of another version.
-    """
-    try:
-        return from_plain(NodeState, _printable(json.loads(text)))
-    except (TypeError, ValueError, KeyError, RecursionError):
-        return None
-
-
-def _printable(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {printable(key): _printable(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_printable(each) for each in value]
-    return printable(value) if isinstance(value, str) else value

@@ -3,12 +3,15 @@
 Nothing here knows ROS, a terminal or a browser: states go in, a :class:`View` comes out.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
+from typing import Any
 
+from hand_eye_calib.errors import printable
 from hand_eye_calib.live.state import (
     REPORT_PERIOD_S,
     Broadcast,
@@ -19,6 +22,7 @@ from hand_eye_calib.live.state import (
     ResultState,
     SavedState,
 )
+from hand_eye_calib.plain import from_plain
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.stats import LARGEST_OF_SIX
@@ -390,3 +394,27 @@ def _result(state: NodeState) -> Iterator[Line]:
         yield Line(tone, "on /tf_static", text)
     if state.saved is not None:
         yield Line(Tone.GOOD, "saved", f"{_where(state.saved)}: {state.saved.text}")
+
+
+def state_of(text: str) -> NodeState | None:
+    """Return the state of a node from its JSON, without control characters.
+
+    Anybody may publish on that topic. None stands for a text that is no state, such as that of
+    another version, and for a state whose values cannot be shown.
+    """
+    try:
+        state = from_plain(NodeState, _printable(json.loads(text)))
+        trial = Board()
+        trial.take(state, 0.0)
+        trial.view(0.0)
+    except (TypeError, ValueError, KeyError, RecursionError, OverflowError, OSError):
+        return None
+    return state
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {printable(key): _printable(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_printable(item) for item in value]
+    return printable(value) if isinstance(value, str) else value

@@ -14,8 +14,8 @@ from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
 
 from hand_eye_calib.live.state import JournalState, Level, NodeState
 from hand_eye_calib.plain import json_text
-from hand_eye_calib.ros.watcher import Watcher, state_of
-from hand_eye_calib.watch.board import Board
+from hand_eye_calib.ros.watcher import Watcher
+from hand_eye_calib.watch.board import Board, state_of
 
 QUICK = ("-p solve_period:=0.2", *RELIABLE_INPUTS)
 

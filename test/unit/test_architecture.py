@@ -43,7 +43,7 @@ ALLOWED = ENGINE | {
     "simulation": GROUND | {"geometry", "io"},
     "root": GROUND | {"geometry", "results", "engine", "session", "io", "report", "simulation"},
     "live": {"io", *ENGINE},
-    "watch": {"errors", "stats", "text", "results", "live"},
+    "watch": {"errors", "plain", "stats", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "live", "watch", "ros", *ENGINE},
     "__main__": {"cli", "python_path"},

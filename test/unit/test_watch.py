@@ -1,7 +1,9 @@
 """The live node as a person sees it: words and bars, on a terminal and as a page."""
 
+import copy
 import http.client
 import io
+import json
 import queue
 import re
 import stat
@@ -32,7 +34,7 @@ from hand_eye_calib.plain import from_plain, plain
 from hand_eye_calib.results import context
 from hand_eye_calib.results.context import AxisProgress, Comparison, Difference, Progress
 from hand_eye_calib.watch import terminal
-from hand_eye_calib.watch.board import AXES, Board, Tone
+from hand_eye_calib.watch.board import AXES, Board, Tone, state_of
 from hand_eye_calib.watch.web import WebServer, fragment
 
 NODE = "/calibrator"
@@ -103,6 +105,68 @@ def test_a_state_survives_its_json_and_nothing_else_is_one():
     for wrong in ({}, {**plain(state()), "node": 7}, {**plain(state()), "inputs": [1]}, [], "x"):
         with pytest.raises((TypeError, ValueError, KeyError)):
             from_plain(NodeState, wrong)
+
+
+def places(document, path=()):
+    """The path to every value of a document, itself included."""
+    yield path
+    if isinstance(document, dict):
+        keys = list(document)
+    else:
+        keys = range(len(document)) if isinstance(document, list) else ()
+    for key in keys:
+        yield from places(document[key], (*path, key))
+
+
+def changed(document, path, value):
+    """A copy of a document with another value at one place."""
+    if not path:
+        return value
+    other = copy.deepcopy(document)
+    holder = other
+    for key in path[:-1]:
+        holder = holder[key]
+    holder[path[-1]] = value
+    return other
+
+
+HOSTILE = [
+    None,
+    True,
+    -1,
+    10**400,
+    1e300,
+    3e18,
+    -1e49,
+    "",
+    "\x1b[31m",
+    "\ud800",
+    [],
+    {},
+    [1],
+    {"x": None},
+]
+
+
+@pytest.mark.parametrize("hostile", HOSTILE, ids=lambda value: repr(value)[:12])
+@pytest.mark.parametrize("kind", ["calibrates", "watches", "cannot write", "saved"])
+def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
+    states = {
+        "calibrates": state(),
+        "watches": mount(),
+        "cannot write": state(journal=FULL),
+        "saved": state(saved=SAVED),
+    }
+    document = plain(states[kind])
+    shown = 0
+    for path in places(document):
+        taken = state_of(json.dumps(changed(document, path, hostile)))
+        if taken is not None:
+            view = view_of(taken)
+            fragment(view)
+            assert list(terminal.lines(view))
+            shown += 1
+    assert shown < len(list(places(document)))
 
 
 ERROR = {"level": Level.ERROR}
