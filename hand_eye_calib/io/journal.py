@@ -33,6 +33,8 @@ _FORMAT = "hand_eye_calib/journal"
 _VERSION = 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
+# Names for a journal that is kept aside, beside what is no journal.
+_MOST_ASIDE = 100
 _ADVICE = "move it away to start anew"
 # What a line may raise that is none of a journal.
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
@@ -45,6 +47,7 @@ class JournalWriter:
     """Writes one session into a directory, which is made if it does not exist. All methods raise
     OSError if it cannot be written.
 
+    A directory with a file of such a name that is no journal, or a link, is refused.
     ``about`` is what is known of each stream, ``resumed`` the session in the directory if that goes
     on: what cannot be read at the end of its files is cut off.
     """
@@ -53,6 +56,7 @@ class JournalWriter:
         self, directory: str | Path, about: About, resumed: "Journal | None" = None
     ) -> None:
         Path(directory).mkdir(parents=True, exist_ok=True)
+        _refuse_foreign(Path(directory))
         before = resumed or Journal({}, np.array([]), np.array([]), np.array([]), {})
         self._parent_poses = int((before.streams == "parent").sum())
         self._about: dict[str, Document] = {**before.about}
@@ -61,7 +65,7 @@ class JournalWriter:
         for stream in self._pending:
             # Unbuffered: what is flushed is with the operating system and survives this process.
             path = Path(directory, f"{stream}.tum")
-            self._files[stream] = open(path, "ab", buffering=0)  # noqa: SIM115
+            self._files[stream] = open(path, "ab", buffering=0, opener=_open_no_link)  # noqa: SIM115
             self._files[stream].truncate(before.whole_bytes.get(stream, 0))
         head = {"format": _FORMAT, "version": _VERSION}
         self.describe({stream: head | {"stream": stream} | {**about[stream]} for stream in about})
@@ -176,20 +180,59 @@ def _read(path: Path) -> tuple[Document, "array[int]", "array[float]", int]:
     return about, stamps_ns, values, whole_bytes
 
 
+def _refuse_foreign(directory: Path) -> None:
+    """Raise an OSError if a file of a stream's name is not a journal's: writing would empty it."""
+    for stream in _STREAMS:
+        path = directory / f"{stream}.tum"
+        if os.path.lexists(path) and not _is_own(path):
+            raise OSError(f"{path} is no session journal; move it away")
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a file is empty or begins as the file of a journal does; links are not."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    with open_regular(path) as file:
+        beginning = file.read(LONGEST_LINE)
+    return not beginning or (beginning.startswith(b"# {") and _FORMAT.encode() in beginning)
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
+def is_used(directory: str | Path) -> bool:
+    """Return whether a directory has a file of the name of a stream, whatever is in it."""
+    return any(os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS)
+
+
 def has_session(directory: str | Path) -> bool:
     """Whether a directory holds a journal."""
     return os.path.isfile(Path(directory) / "parent.tum")
 
 
 def keep_aside(directory: str | Path) -> Path:
-    """Rename a journal's directory so that a new session can use it; returns where it went. Only
-    the last one is kept: what was kept before is removed. Raises OSError.
+    """Rename a journal's directory so that a new session can use it, and return where it went.
+
+    Only the last journal is kept: the one before is removed. Where that is more than a journal, the
+    next free name is taken, such as ``journal.previous2``. Raises OSError.
     """
     directory = Path(directory)
-    aside = directory.with_name(f"{directory.name}.previous")
-    if aside.exists():
-        shutil.rmtree(aside)
-    return directory.replace(aside)
+    for number in ("", *range(2, _MOST_ASIDE)):
+        aside = directory.with_name(f"{directory.name}.previous{number}")
+        if _is_journal(aside):
+            shutil.rmtree(aside)
+        if not os.path.lexists(aside):
+            return directory.replace(aside)
+    raise OSError(f"{aside} and those before it are no session journals; move them away")
+
+
+def _is_journal(directory: Path) -> bool:
+    """Return whether a directory holds files of a journal and nothing else."""
+    if directory.is_symlink() or not directory.is_dir():
+        return False
+    names = {f"{stream}.tum" for stream in _STREAMS}
+    return all(path.name in names and _is_own(path) for path in directory.iterdir())
 
 
 def count_poses(directory: str | Path) -> int | None:

@@ -3,6 +3,7 @@ transforms alone as xacro and as launch file.
 """
 
 import hashlib
+import os
 import platform
 import re
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,8 @@ RIG_NAME = "rig.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 _NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
+# Every file that this program writes has its name in it; tables have a column of headlines.
+_MARKS = (b"hand_eye_calib", b'"headline"')
 
 
 def save_result(
@@ -105,6 +108,8 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     kept = {directory / name: text for name, text in texts.items() if text is not None}
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
+        for name in texts:
+            _keep_foreign(directory / name)
         write_atomically(kept)
         for path in {directory / name for name in texts} - kept.keys():
             path.unlink(missing_ok=True)
@@ -126,6 +131,28 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
     return yaml_text({**document, "provenance": provenance})
 
 
+def _keep_foreign(path: Path) -> None:
+    """Give a file that this program has not written a second name, before it is replaced.
+
+    The name is that of the file with ``.kept``, or ``.kept2`` and so on. A link needs none, because
+    the file that it leads to stays, nor does a file whose copy lies in ``previous``.
+    """
+    if path.is_symlink() or not path.is_file():
+        return
+    content = read_bytes(path)
+    copy = path.parent / "previous" / path.name
+    is_copied = copy.is_file() and read_bytes(copy) == content
+    is_own = any(mark in content for mark in _MARKS)
+    if content and not is_copied and not is_own:
+        os.link(path, _free_name(path))
+
+
+def _free_name(path: Path) -> Path:
+    """Return the first name that no file has: ``path.kept``, ``path.kept2`` and so on."""
+    names = (path.with_name(f"{path.name}.kept{number}") for number in ("", *range(2, 10_000)))
+    return next(name for name in names if not os.path.lexists(name))
+
+
 def keep_earlier_results(directory: str | Path) -> str:
     """Copy the result files and the report of a directory into its folder ``previous`` before they
     are replaced; returns words about it, empty if there are none. An InputError if that fails.
@@ -135,6 +162,8 @@ def keep_earlier_results(directory: str | Path) -> str:
     with writing(previous):
         if found:
             previous.mkdir(exist_ok=True)
+        for path in found:
+            _keep_foreign(previous / path.name)
         write_atomically({previous / path.name: read_bytes(path) for path in found})
     return f"; the files that were there are in {previous}" if found else ""
 

@@ -133,7 +133,7 @@ class SessionJournal:
                 self._give_up(getattr(error, "strerror", None) or what)
 
     def _open(self, about: journal.About, resumed: journal.Journal | None = None) -> None:
-        if resumed is None and journal.has_session(self.directory):
+        if resumed is None and journal.is_used(self.directory):
             poses = journal.count_poses(self.directory)
             if poses != 0:  # not the empty one of a node that was started in vain
                 what = "" if poses is None else f" ({poses} poses)"

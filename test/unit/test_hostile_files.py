@@ -227,6 +227,27 @@ def test_links_are_replaced_and_not_followed(calibrate, tmp_path, no_figures):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "previous"}
 
 
+def test_files_of_somebody_else_are_kept_however_often_results_are_written(calibrate, tmp_path):
+    names = ("extrinsic.yaml", "extrinsic.urdf.xacro", "static_transform.launch.py", "report.html")
+    for name in names:
+        (tmp_path / "out" / name).write_text(f"my own {name}")
+    for _ in range(3):
+        assert calibrate() == 0
+    contents = [path.read_text() for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    for name in names:
+        assert contents.count(f"my own {name}") == 1
+        assert "hand_eye_calib" in (tmp_path / "out" / name).read_text()
+    assert len(contents) == 3 * len(names)
+
+
+def test_a_result_that_is_saved_from_python_keeps_files_of_somebody_else(tmp_path):
+    (tmp_path / "static_transform.launch.py").write_text("my launch file")
+    for _ in range(2):
+        save_result(calibration(), tmp_path)
+    assert (tmp_path / "static_transform.launch.py.kept").read_text() == "my launch file"
+    assert not (tmp_path / "static_transform.launch.py.kept2").exists()
+
+
 @pytest.mark.parametrize(
     "frame", ["a--->b", "---", "-->", "a\x1b[2Jb", "a\nb", "a\x00b", "<&>\"'", "$(arg x)", "\u2028"]
 )

@@ -11,7 +11,13 @@ import hand_eye_calib as hec
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, Calibrators
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.journal import JournalWriter, count_poses, has_session, read_journal
+from hand_eye_calib.io.journal import (
+    JournalWriter,
+    count_poses,
+    has_session,
+    keep_aside,
+    read_journal,
+)
 from hand_eye_calib.live.journal import lock_directory
 from hand_eye_calib.live.session import give
 
@@ -188,3 +194,37 @@ def test_the_lock_is_on_the_directory(tmp_path):
     assert not list(tmp_path.iterdir())
     os.close(lock)
     os.close(lock_directory(tmp_path))
+
+
+MINE = "0.0 1.0 2.0 3.0 0.0 0.0 0.0 1.0\n"
+
+
+@pytest.mark.parametrize("stream", ["parent", "child"])
+def test_a_journal_empties_no_file_of_somebody_else(tmp_path, stream):
+    mine = tmp_path / f"{stream}.tum"
+    mine.write_text(MINE)
+    with pytest.raises(OSError, match=f"{stream}.tum is no session journal; move it away"):
+        JournalWriter(tmp_path, BOTH)
+    assert mine.read_text() == MINE
+
+
+def test_a_journal_is_not_written_through_a_link(tmp_path):
+    mine = tmp_path / "poses.tum"
+    mine.write_text(MINE)
+    directory = tmp_path / "journal"
+    directory.mkdir()
+    (directory / "child.tum").symlink_to(mine)
+    with pytest.raises(OSError, match="child.tum is no session journal"):
+        JournalWriter(directory, BOTH)
+    assert mine.read_text() == MINE
+
+
+def test_what_is_no_journal_is_kept_when_journals_are_moved_aside(tmp_path):
+    (tmp_path / "journal.previous").mkdir()
+    mine = tmp_path / "journal.previous" / "notes.txt"
+    mine.write_text("mine")
+    for _ in range(2):
+        JournalWriter(tmp_path / "journal", BOTH).close()
+        assert keep_aside(tmp_path / "journal") == tmp_path / "journal.previous2"
+    assert mine.read_text() == "mine"
+    assert count_poses(tmp_path / "journal.previous2") == 0
