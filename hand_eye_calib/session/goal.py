@@ -7,6 +7,7 @@ docs/session.md.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,12 +35,23 @@ _STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, 
 # own are larger by more than this factor.
 _AS_GOOD = 1.25
 
+_NO_RESULT = "No result yet: move the sensors, with rotations."
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A result of the session, the motion it comes from, and whether its streams were faulty."""
+
+    calibration: Calibration
+    seen: Excitation
+    faults: tuple[str, ...]
+
 
 class Goal:
     """Judges the results of a session, one after the other.
 
-    Once the goal is reached, it stays reached. Of the results that reach it, the newest is kept,
-    but not one that is clearly worse than the best.
+    Once the goal is reached, it stays reached, unless a result is refuted or the options change. Of
+    the results that reach it, the newest is kept, but not one that is clearly worse than the best.
 
     Parameters
     ----------
@@ -60,16 +72,48 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        self._motion_s, self._was_known = -1.0, False
+        # The newest result, and the newest of those from less motion.
+        self._newest: _Judged | None = None
+        self._before: _Judged | None = None
+        self._motion_s = -1.0
+        self._start_over(_NO_RESULT)
+
+    def _start_over(self, sentence: str) -> None:
+        """Forget that the goal was reached, but not the results."""
         self.best: Calibration | None = None
         self._best_information = 0.0
         self._steps = np.full(6, len(_STEPS_S) - 1)
-        self.progress = self._nothing_yet("No result yet: move the sensors, with rotations.")
+        self.progress = self._nothing_yet(sentence)
 
     def wait(self, sentence: str) -> None:
         """Take note that there is no result yet, and why."""
-        if self._motion_s < 0:
+        if self._newest is None:
             self.progress = self._nothing_yet(sentence)
+
+    def follow(self, targets: Sequence[float] | FloatArray) -> None:
+        """Start over with these targets, because options have changed.
+
+        Earlier results still confirm the next one: a robot may be parked by now.
+        """
+        self._targets = np.asarray(targets, dtype=float)
+        if self._newest is not None:
+            self._start_over("Solving with the new options.")
+        else:
+            self._start_over(_NO_RESULT)
+
+    def retarget(self, calibration: Calibration, targets: Sequence[float] | FloatArray) -> Progress:
+        """Judge the session's result again, because the targets, and nothing else, have changed.
+
+        Parameters
+        ----------
+        calibration : Calibration
+            The result with the new targets.
+        targets : (6,) array-like
+        """
+        self.follow(targets)
+        if self._newest is None:
+            return self.progress
+        return self.add(calibration, self._newest.seen, self._newest.faults)
 
     def add(
         self, calibration: Calibration, seen: Excitation, faults: Sequence[str] = ()
@@ -84,22 +128,25 @@ class Goal:
         faults : sequence of str
             What the stream checks found; the goal is not reached while there is something.
         """
-        ratios = self._ratios(calibration)
-        worst, motion_s = int(np.argmax(ratios)), seen.motion_s
         if not faults:  # errors that the result has of its own, as one of positions or rates
-            found = [each for each in calibration.reasons if each.is_finding]
-            faults = [one.sentence for one in found if one.verdict is Verdict.DO_NOT_USE]
+            findings = [reason for reason in calibration.reasons if reason.is_finding]
+            errors = [each for each in findings if each.verdict is Verdict.DO_NOT_USE]
+            faults = [error.sentence for error in errors]
+        # Every result of a robot that stands still is the same result.
+        if seen.motion_s > self._motion_s:
+            self._before = self._newest
+            self._motion_s = seen.motion_s
+        self._newest = _Judged(calibration, seen, tuple(faults))
+        if calibration.status is SolveStatus.CONTRADICTED:
+            self._start_over(f"No usable result: {calibration.status.failure}.")
+            return self.progress
+        ratios = self._ratios(calibration, calibration)
+        worst, motion_s = int(np.argmax(ratios)), seen.motion_s
         may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
-        # Below so many seconds of motion, a standard deviation is not believed.
-        lasting = calibration.noise.lasting if calibration.noise else ()
-        slowest_s = max((each.tau_s for each in lasting if each.kind != "path"), default=0.0)
-        least_s = max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
-        is_known, may_end = bool(is_within) and motion_s >= least_s, self.best is not None
-        # Every result of a robot that stands still is the same result.
-        if motion_s > self._motion_s:
-            may_end |= is_known and self._was_known
-            self._motion_s, self._was_known = motion_s, is_known
+        least_s = _least_motion_s(calibration)
+        is_known = is_within and motion_s >= least_s
+        may_end = self.best is not None or (is_known and self._is_confirmed(calibration))
         information = 1.0 / max(ratios[worst], 1e-12)
         if is_within and may_end and information * _AS_GOOD**2 >= self._best_information:
             self.best = calibration
@@ -122,15 +169,28 @@ class Goal:
         )
         return self.progress
 
-    def _ratios(self, calibration: Calibration) -> FloatArray:
+    def _is_confirmed(self, newest: Calibration) -> bool:
+        """Whether the result before, from less motion, reaches the goal as the newest one does.
+
+        Options may have changed in between: floor and priors are those of the newest result.
+        """
+        before = self._before
+        if before is None or before.faults:
+            return False
+        if before.calibration.status is SolveStatus.NOT_CONVERGED:
+            return False
+        is_long = before.seen.motion_s >= _least_motion_s(before.calibration)
+        return bool(is_long and self._ratios(before.calibration, newest).max() <= 1.0)
+
+    def _ratios(self, calibration: Calibration, newest: Calibration) -> FloatArray:
         """Variances (6,) over what the common-mode floor leaves of the targets: a floor above them
-        cannot be driven away.
+        cannot be driven away. Floor and priors are those of the newest result.
         """
         wanted = _SHARE * self._targets
-        room = np.maximum(wanted**2 - calibration.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
+        room = np.maximum(wanted**2 - newest.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
         # What somebody measured by hand, no motion would tell better; some streams never show all.
-        exempt = np.isin(AXES, calibration.out_of_reach)
-        exempt |= [dof.verdict is DofVerdict.PRIOR for dof in calibration.observability]
+        exempt = np.isin(AXES, newest.out_of_reach)
+        exempt |= [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
         return np.asarray(np.where(exempt, 0.0, calibration.sigmas**2 / room))
 
     def _told(self, left_s: FloatArray) -> FloatArray:
@@ -163,6 +223,13 @@ class Goal:
         if self.best is not None:
             return f"Done: {what_is_known(self.best)}. Stop and save."
         return ""
+
+
+def _least_motion_s(calibration: Calibration) -> float:
+    """Seconds of motion below which a standard deviation is not believed."""
+    lasting = calibration.noise.lasting if calibration.noise else ()
+    slowest_s = max((error.tau_s for error in lasting if error.kind != "path"), default=0.0)
+    return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
 
 
 def _way_on(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
