@@ -29,8 +29,19 @@ examples:
 _PORT = 8765
 _LISTEN_S = 0.1
 _SURE_WITHIN_S = 5.0
-_KEYS = {"s": "solve", "w": "save", "r": "reset", "c": "recalibrate", "a": "acknowledge"}
-_SURE = {"r": "forgets all poses", "c": "stops watching and calibrates anew"}
+_KEYS = {
+    "s": "solve",
+    "w": "save",
+    "r": "reset",
+    "c": "recalibrate",
+    "a": "acknowledge",
+    "f": "forget",
+}
+_SURE = {
+    "r": "forgets all poses",
+    "c": "stops watching and calibrates anew",
+    "f": "removes all priors",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
@@ -24,19 +25,25 @@ from hand_eye_calib.live.state import (
     Level,
     ProgressState,
     ResultState,
+    Standing,
     by_axis,
 )
 from hand_eye_calib.option import Options
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.context import Comparison
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.session.goal import Goal
+from hand_eye_calib.text import duration, parse_targets
 
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
 
 # The streams are checked at most this often (s), which costs a second or two each time.
 _CHECK_PERIOD_S = 30.0
+
+# Options that change how a result is judged, but not the result.
+_TARGETS = ("target_translation", "target_rotation", "target_axes")
 
 
 class StreamChecks:
@@ -123,8 +130,9 @@ class SolveCycle:
     ----------
     is_solving : bool
     result : Calibration or None
-        The session's result, which is told, published, saved and broadcast: the newest usable one;
-        once the goal is reached, the one kept, whose warnings say why the newest is not.
+        The session's result: the newest usable one; once the goal is reached, the one kept, whose
+        warnings say why the newest is not. A contradicted prior puts a result in its place that
+        says DO NOT USE.
     """
 
     def __init__(
@@ -155,17 +163,72 @@ class SolveCycle:
         self._solved_at_s = 0.0
         self._seen = NO_MOTION
         self._failure: Failure | None = None
+        # Why every solve since the result has failed, and since when (steady time, s).
+        self._failing: Failure | None = None
+        self._failing_since_s = 0.0
         self._certain: Options = {}
         self._told: tuple[str, ...] = ()
         self._is_unchecked, self._check_due_s = False, 0.0
         self.checks.restart()
         self.goal.restart()
 
-    def follow(self, targets: Sequence[float]) -> None:
-        """Options have changed: start over with a goal of these targets, and check at once."""
-        self.goal = Goal(targets)
+    def follow(self, config: CalibratorConfig, before: CalibratorConfig) -> None:
+        """Start over with other options than before, and check at once.
+
+        Targets alone do not change the result: it is judged again, also if nothing moves any more.
+        """
         self._certain, self._told = {}, ()
         self._is_unchecked, self._check_due_s = True, 0.0
+        targets = {name: getattr(config, name) for name in _TARGETS}
+        result = self.published
+        others = before.given.difference(_TARGETS), config.given.difference(_TARGETS)
+        is_other = replace(before, **targets) != config or others[0] != others[1]
+        if result is None or is_other:
+            self.goal.follow(config.targets)
+            return
+        targets["target_axes"] = parse_targets("target.axes", config.target_axes)
+        result = replace(result, **targets)
+        self.goal.retarget(result, config.targets)
+        self.result = result
+        self._told_result = _result_state(result)
+
+    @property
+    def published(self) -> Calibration | None:
+        """The result for the topics; None without one that holds."""
+        return None if self.result is None or is_refuted(self.result) else self.result
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the result holds."""
+        if self.result is None:
+            return Standing.NONE
+        if is_refuted(self.result):
+            return Standing.REFUTED
+        return Standing.CURRENT if self._failing is None else Standing.OUTDATED
+
+    @property
+    def problem(self) -> str:
+        """Why the result does not hold, in one line; empty if it does."""
+        result, failing = self.result, self._failing
+        if result is not None and is_refuted(result):
+            reason = result.reasons[0]
+            remedy = ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
+            return f"{reason.sentence}; {reason.what_to_do}{remedy}"
+        if result is None or failing is None:
+            return ""
+        now_s = time.monotonic()
+        failing_s = duration(now_s - self._failing_since_s)
+        age_s = duration(now_s - self._solved_at_s)
+        return (
+            f"every solve has failed for {failing_s}: {failing.what.rstrip('.')}; the result shown "
+            f"is {age_s} old, of {result.n_poses} poses"
+        )
+
+    def result_to_save(self) -> Calibration | None:
+        """The result, with a warning if every solve since has failed; None without one."""
+        if self.result is None or self.standing is not Standing.OUTDATED:
+            return self.result
+        return replace(self.result, warnings=(*self.result.warnings, self.problem))
 
     def snapshot(self) -> Snapshot | None:
         """The poses and options that gave the result; None without one."""
@@ -252,15 +315,42 @@ class SolveCycle:
             if answer.calibration is None:
                 missing = what_is_missing(self._seen) if self._seen.n_poses else ""
                 self.goal.wait(missing or answer.failure.what)
+                self._keep_result(answer.failure)
                 return False, text
         assert answer.calibration is not None
         told = tuple(dict.fromkeys((*self._told, *answer.calibration.warnings)))
         for warning in told:
             self._log.warning(warning)
         newest = self._with_findings(replace(answer.calibration, warnings=told))
+        if newest.status is SolveStatus.CONTRADICTED:
+            return self._refute(newest)
         if newest.status.failure:
+            self._failure = Failure(newest.status.failure)
+            self.goal.wait(f"No usable result: {newest.status.failure}.")
+            self._keep_result(self._failure)
             return False, self._say(newest)
         return self._take(self._complete(newest))
+
+    def _keep_result(self, failure: Failure) -> None:
+        """Keep the result although the newest solve has failed."""
+        if self._failing is None:
+            self._failing_since_s = time.monotonic()
+        self._failing = failure
+
+    def _refute(self, newest: Calibration) -> tuple[bool, str]:
+        """Take a calibration whose prior the motion contradicts: it replaces the result, so that
+        what was found before is neither published nor saved any more.
+        """
+        self.goal.add(newest, self._seen, self.checks.faults())
+        self._solved = self._submitted, self._certain
+        self._set_result(newest)
+        return False, self._say(newest)
+
+    def _set_result(self, result: Calibration) -> None:
+        self.result = result
+        self._told_result = _result_state(result)
+        self._solved_at_s = time.monotonic()
+        self._failing = None
 
     def _take(self, newest: Calibration) -> tuple[bool, str]:
         """Take a usable calibration: it becomes the session's result, unless a better one that has
@@ -276,13 +366,13 @@ class SolveCycle:
             kept = f"{kept}: {describe(newest)}"
             self._log.info(kept, ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, kept))
-        self.result, self._solved_at_s = self._with_findings(result), time.monotonic()
-        self._told_result = _result_state(self.result)
+        self._set_result(self._with_findings(result))
         if not progress.is_faulty and progress.sentence:
             write = self._log.warning if progress.will_not_get_there else self._log.info
             write(progress.sentence, GOES_ON_S, key=f"now {progress.done}")
         every_s = GOES_ON_S if progress.done == was_done else 0.0
-        return self.result.status is SolveStatus.OK, self._say(self.result, every_s)
+        is_good = result.status is SolveStatus.OK
+        return is_good, self._say(self._with_findings(result), every_s)
 
     def _say(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
         """A line about a calibration with its reasons and warnings. What is new of that is logged:
@@ -324,6 +414,7 @@ class SolveCycle:
         """
         seen, told = self._seen, self._told_result
         level, text = self._judged(accepts_poses, tf_static)
+        contradictions = self.result.contradictions if self.result is not None else {}
         return ExtrinsicState(
             level=level,
             text=text,
@@ -335,6 +426,10 @@ class SolveCycle:
             rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True)),
             tf_static=tf_static[0],
             tf_static_reason=tf_static[1],
+            standing=self.standing,
+            problem=self.problem,
+            priors=priors_of(self._session.calibrator.config),
+            contradicted=tuple(contradictions),
             result=told and replace(told, age_s=time.monotonic() - self._solved_at_s),
         )
 
@@ -343,6 +438,9 @@ class SolveCycle:
         result, failure = self.result, self._failure
         if failure is not None and failure.details:
             return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
+        if result is not None and self.problem:
+            joint = ": " if self.standing is Standing.REFUTED else ", but "
+            return Level.WARN, f"{result.verdict.value}{joint}{self.problem}"
         if not accepts_poses:
             return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
         if result is None:
@@ -356,20 +454,33 @@ class SolveCycle:
         return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
 
     def progress_state(self, why_not_compared: str) -> ProgressState:
-        """Each axis against its target, the seconds left, and what to do now; WARN before the first
-        result, and while the motion is of no use for an axis that lacks. ``why_not_compared`` with
-        what is installed: empty if that was not asked for.
+        """Each axis against its target, the seconds left, and what to do now; WARN while somebody
+        should do something else than go on. ``why_not_compared`` with what is installed: empty if
+        that was not asked for.
         """
         progress, result = self.goal.progress, self.result
+        is_well = self.standing is Standing.CURRENT and not progress.is_faulty
+        may_go_on = is_well and not progress.will_not_get_there
         comparison = result.comparison if result is not None else None
         if comparison is None and why_not_compared:
             comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
         return ProgressState(
-            level=Level.WARN if result is None or progress.will_not_get_there else Level.OK,
-            text=progress.sentence,
+            level=Level.OK if may_go_on else Level.WARN,
+            text=progress.sentence if progress.is_faulty else self.problem or progress.sentence,
             progress=progress,
             comparison=comparison,
         )
+
+
+def is_refuted(result: Calibration) -> bool:
+    """Whether the solve failed, or an error in the streams speaks against every axis."""
+    return bool(result.status.failure) or any(each.makes_unusable for each in result.findings)
+
+
+def priors_of(config: CalibratorConfig) -> dict[str, str]:
+    """The priors that are set, by axis, as they were typed."""
+    priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
+    return {axis: text for axis, text in priors.items() if text}
 
 
 def _result_state(result: Calibration) -> ResultState:

@@ -15,7 +15,7 @@ from hand_eye_calib.live.cycle import SolveCycle
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.solving import start
-from hand_eye_calib.live.state import SavedState
+from hand_eye_calib.live.state import SavedState, Standing
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import listing
@@ -61,7 +61,7 @@ class Saver:
 
     def _save(self, options: NodeConfig) -> str:
         directory = options.output_directory
-        result, snapshot = self._cycle.result, self._cycle.snapshot()
+        result, snapshot = self._cycle.result_to_save(), self._cycle.snapshot()
         if not directory:
             raise ConfigError("set the parameter output_directory to a directory")
         if result is None or snapshot is None:
@@ -79,8 +79,12 @@ class Saver:
             self._process.wait()
         save_result(result, path, inputs)
         where = str(path.resolve())
-        text = f"result saved to {where}: {result.headline}"
-        self.state = SavedState(directory=where, at_s=time.time(), text=result.headline)
+        said = result.headline
+        if self._cycle.standing is Standing.OUTDATED:
+            said = f"{said}; {self._cycle.problem}"
+        text = f"result saved to {where}: {said}"
+        verdict = result.verdict.value
+        self.state = SavedState(directory=where, at_s=time.time(), text=said, verdict=verdict)
         engines = self._session.engines
         others = {name: each.snapshot() for name, each in engines.items() if name != "child"}
         session = SessionResult(result, snapshot, inputs, options.report, others)

@@ -48,6 +48,19 @@ class Broadcast(Enum):
     REFUSED = "refused"
 
 
+class Standing(Enum):
+    """Whether the session's result still holds.
+
+    OUTDATED: every solve since has failed. REFUTED: the motion contradicts a prior, or the streams
+    are faulty; such a result is not published.
+    """
+
+    NONE = "none"
+    CURRENT = "current"
+    OUTDATED = "outdated"
+    REFUTED = "refuted"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Part:
     """One part of the node: what it says, and whether a person should act."""
@@ -80,7 +93,9 @@ class ResultState:
 class ExtrinsicState(Part):
     """The solver, what has been seen of the motion, and the result if there is one. The sensors
     moved for ``motion_s``; ``has_vehicle_axes`` if the parent sensor moves along its x and turns
-    about its z, as on a vehicle (REP 103).
+    about its z, as on a vehicle (REP 103). ``problem`` is why the result is outdated or refuted.
+    ``priors`` are the priors that are set, by axis; ``contradicted`` are the axes of those that the
+    motion contradicts.
     """
 
     is_solving: bool
@@ -91,6 +106,10 @@ class ExtrinsicState(Part):
     rotation_deg: Mapping[str, float]
     tf_static: Broadcast
     tf_static_reason: str
+    standing: Standing = Standing.CURRENT
+    problem: str = ""
+    priors: Mapping[str, str] = field(default_factory=dict)
+    contradicted: tuple[str, ...] = ()
     result: ResultState | None
 
 
@@ -152,11 +171,12 @@ class MountState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class SavedState:
-    """Where the result was saved, when (seconds since 1970), and what was said of it."""
+    """Where the result was saved, when (seconds since 1970), its headline and its verdict."""
 
     directory: str
     at_s: float
     text: str
+    verdict: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

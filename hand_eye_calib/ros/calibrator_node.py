@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 from hand_eye_calib.config import NodeConfig, other_names
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io.transforms import TfSource
-from hand_eye_calib.live.cycle import SolveCycle
+from hand_eye_calib.live.cycle import SolveCycle, priors_of
 from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.live.log import GOES_ON_S, NodeLog
@@ -68,6 +68,7 @@ class CalibratorNode(Node):
         for line in self._options.unknown:
             self._log.warning(line)
         options, config = self._options.node, self._options.calibrator
+        self._config = config
         # From now on, participants may choose a directory below this one.
         self._output_base = output_path(options.output_directory or ".").resolve()
         if options.monitor:
@@ -191,7 +192,7 @@ class CalibratorNode(Node):
 
     def _publish(self, has_ended: bool = False) -> None:
         """Publish all that is to be told now: so the topics agree at every time."""
-        self._results.publish(self._cycle.result)
+        self._results.publish(self._cycle.published)
         self._tf.look(self._cycle.result, self._why_not_broadcast())
         if self._mount is not None:
             self._mount.look()
@@ -205,6 +206,8 @@ class CalibratorNode(Node):
         result, progress = self._cycle.result, self._cycle.goal.progress
         if result is None:
             return "no result yet"
+        if self._cycle.published is None:
+            return self._cycle.problem
         if not progress.done:
             return "the streams are faulty" if progress.is_faulty else "the goal is not reached"
         wanted = self._options.node.base_frame
@@ -262,6 +265,10 @@ class CalibratorNode(Node):
     def _reset(self, request: Trigger.Request) -> tuple[bool, str]:
         self._begin_session()
         text = "all poses forgotten, new session"
+        priors = priors_of(self._options.calibrator)
+        if priors:
+            kept = listing([f"prior.{axis} {value}" for axis, value in priors.items()])
+            text = f"{text}; {kept} still set: set to '' to forget it"
         self._log.info(text)
         return True, text
 
@@ -287,9 +294,11 @@ class CalibratorNode(Node):
 
     def _follow_parameters(self) -> None:
         options, config = self._options.node, self._options.calibrator
-        if config != self._session.calibrator.config:
+        before = self._config
+        if (config, config.given) != (before, before.given):
+            self._config = config
             self._session.reconfigure(config)
-            self._cycle.follow(config.targets)
+            self._cycle.follow(config, before)
         for each in self._inputs:
             each.configure(config)
         if options.monitor != (self._mount is not None):

@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 from hand_eye_calib.config import POSE_TYPES
 from hand_eye_calib.errors import printable
 from hand_eye_calib.live.state import ANSWER_WITHIN_S, REPORT_PERIOD_S
+from hand_eye_calib.results.records import AXES
 from hand_eye_calib.ros.conversions import LATCHED
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.text import counted
@@ -71,16 +72,27 @@ class Watcher:
         if request == "acknowledge":
             self._board.acknowledge()
         elif self._board.node and request not in self._asked:
-            name, is_parameter, value = request.partition(":=")
-            kind, message = Trigger, Trigger.Request()
-            if is_parameter or request == "recalibrate":
-                off = Parameter("monitor", value=False)
-                parameter = Parameter(name, value=value) if is_parameter else off
-                message = SetParameters.Request(parameters=[parameter.to_parameter_msg()])
+            parameters = self._parameters(request)
+            kind, name, message = Trigger, request, Trigger.Request()
+            if parameters:
                 kind, name = SetParameters, "set_parameters"
+                messages = [parameter.to_parameter_msg() for parameter in parameters]
+                message = SetParameters.Request(parameters=messages)
             client = self._node.create_client(kind, f"{self._board.node}/{name}")
             self._asked[request] = client, message, None, time.monotonic()
             self._board.answer(request, None, "asked ...", time.monotonic())
+
+    def _parameters(self, request: str) -> list[Parameter]:
+        """The parameters that a request sets; none if it calls a service."""
+        name, is_parameter, value = request.partition(":=")
+        if is_parameter:
+            return [Parameter(name, value=value)]
+        if request == "recalibrate":
+            return [Parameter("monitor", value=False)]
+        if request == "forget":
+            axes = self._board.priors or AXES
+            return [Parameter(f"prior.{axis}", value="") for axis in axes]
+        return []
 
     def _look(self) -> None:
         """Listen to nodes that are new: anybody may have a topic of that name. And note the topics
@@ -119,8 +131,8 @@ class Watcher:
         elif future is not None and future.done():
             response: Any = future.result()
             if client.srv_type is SetParameters:
-                (result,) = response.results
-                self._end(request, result.successful, result.reason)
+                refused = [each.reason for each in response.results if not each.successful]
+                self._end(request, not refused, "; ".join(refused))
             else:
                 self._end(request, response.success, response.message)
         elif time.monotonic() - asked_s > _PATIENCE_S:

@@ -15,12 +15,14 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.live.state import (
     REPORT_PERIOD_S,
     Broadcast,
+    ExtrinsicState,
     InputState,
     Level,
     MountState,
     NodeState,
     ResultState,
     SavedState,
+    Standing,
 )
 from hand_eye_calib.plain import from_plain
 from hand_eye_calib.results.context import Comparison
@@ -32,6 +34,7 @@ from hand_eye_calib.text import amount, capital, change, duration, fixed, two_di
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 MOVED = "MOUNT MOVED"
+CHANGE_MOTION = "CHANGE THE MOTION"
 _ADVICE = "; check it, then recalibrate or acknowledge"
 
 # The answer to a button is shown for so long (s).
@@ -86,9 +89,10 @@ class View:
     """Everything a person is shown of one node.
 
     ``values`` is the pose as it is printed, by axis. ``buttons`` are the requests that make sense
-    now, that to be pressed first; ``by_hand`` is the axis that somebody may measure instead of
-    driving on; ``saved_in`` is the directory of the files. A node that only watches the mount has a
-    line for each axis (``watched``), and no bars, verdict and comparison.
+    now, that to be pressed first; ``by_hand`` are the axes that somebody may measure or correct,
+    that to be looked at first; ``priors`` are those that somebody has measured, as they were typed;
+    ``saved_in`` is the directory of the files. A node that only watches the mount has a line for
+    each axis (``watched``), and no bars, verdict and comparison.
     """
 
     node: str
@@ -105,7 +109,8 @@ class View:
     health: tuple[Line, ...] = ()
     topics: tuple[str, ...] = ()
     buttons: tuple[str, ...] = ()
-    by_hand: str = ""
+    by_hand: tuple[str, ...] = ()
+    priors: tuple[tuple[str, str], ...] = ()
     saved_in: str = ""
     answer: tuple[Line, ...] = ()
 
@@ -123,6 +128,14 @@ class Board:
         self._heard: tuple[NodeState, float] | None = None
         self._answer: tuple[Line, float] | None = None
         self._acknowledged: tuple[str, int | None] | None = None
+
+    @property
+    def priors(self) -> tuple[str, ...]:
+        """Axes whose prior is set on the node that is shown."""
+        if self._heard is None or self._heard[0].extrinsic is None:
+            return ()
+        priors = self._heard[0].extrinsic.priors
+        return tuple(axis for axis in AXES if axis in priors)
 
     @property
     def node(self) -> str:
@@ -184,18 +197,45 @@ def _view(state: NodeState, silent_s: float) -> View:
         watched = tuple(_watched(axis, state.mount) for axis in AXES)
         facts = _ago(state.mount) + "; a reset ends the alarm" * bool(asked)
         return replace(view, facts=facts, watched=watched, buttons=asked)
-    buttons: tuple[str, ...] = ("reset",)
     if result := _result_of(state):
-        is_wanted = view.word == "DONE" and not state.saved
-        buttons = ("save", "solve", "reset") if is_wanted else ("solve", "save", "reset")
-        title = f"pose of {result.child_frame} in {result.parent_frame}"
-        view = replace(view, title=title, values=tuple(_values(result)), reasons=result.reasons)
-    if at := state.progress:
-        asks = at.progress.will_not_get_there and view.word == "CHANGE THE MOTION"
-        bars, by_hand = tuple(_bar(axis, state) for axis in AXES), at.progress.limiting_axis * asks
-        view = replace(view, bars=bars, by_hand=by_hand)
-    shown = () if is_old else buttons
+        view = replace(view, reasons=result.reasons)
+        if _standing(state) is not Standing.REFUTED:
+            title = f"pose of {result.child_frame} in {result.parent_frame}"
+            view = replace(view, title=title, values=tuple(_values(result)))
+    if state.progress:
+        bars = tuple(_bar(axis, state) for axis in AXES)
+        view = replace(view, bars=bars, by_hand=_axes_by_hand(state, view.word))
+    if state.extrinsic and not is_old:
+        priors = state.extrinsic.priors
+        view = replace(view, priors=tuple(item for item in priors.items() if item[0] in AXES))
+    shown = () if is_old else _buttons(state, view.word)
     return replace(view, facts=_facts(state, is_old), result=tuple(_result(state)), buttons=shown)
+
+
+def _buttons(state: NodeState, word: str) -> tuple[str, ...]:
+    """The requests that make sense for a node that calibrates, that to be pressed first."""
+    buttons: tuple[str, ...] = ("reset",)
+    if _result_of(state):
+        is_wanted = word == "DONE" and not state.saved
+        buttons = ("save", "solve", "reset") if is_wanted else ("solve", "save", "reset")
+    has_priors = state.extrinsic is not None and bool(state.extrinsic.priors)
+    return (*buttons, "forget") if has_priors else buttons
+
+
+def _axes_by_hand(state: NodeState, word: str) -> tuple[str, ...]:
+    """Axes that somebody may measure, or whose prior may be corrected or removed."""
+    extrinsic, at = state.extrinsic, state.progress
+    if extrinsic is None or at is None:
+        return ()
+    axes = [*extrinsic.contradicted]
+    if at.progress.will_not_get_there and word == CHANGE_MOTION:
+        axes.append(at.progress.limiting_axis)
+    axes += extrinsic.priors
+    return tuple(axis for axis in dict.fromkeys(axes) if axis in AXES)
+
+
+def _standing(state: NodeState) -> Standing:
+    return state.extrinsic.standing if state.extrinsic else Standing.NONE
 
 
 def _result_of(state: NodeState) -> ResultState | None:
@@ -215,13 +255,17 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
     extrinsic, mount, at, checks = state.extrinsic, state.mount, state.progress, state.checks
     is_safe = at is not None and at.progress.done and state.saved  # whatever the journal lacks
     inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
+    is_contradicted = extrinsic is not None and bool(extrinsic.contradicted)
+    is_outdated = _standing(state) is Standing.OUTDATED
     told = [
         (Tone.BAD, "BROKEN", extrinsic, Level.ERROR),
         (Tone.BAD, MOVED, mount, Level.ERROR),
+        (Tone.BAD, "CHECK THE PRIOR", extrinsic if is_contradicted else None, Level.WARN),
         *((Tone.BAD, "BAD INPUT", each, Level.ERROR) for each in inputs),
         (Tone.BAD, "BROKEN", None if is_safe else state.journal, Level.ERROR),
         *((Tone.ACT, "CHECK INPUT", each, Level.WARN) for each in inputs),
         (Tone.ACT, "CHECK THE STREAMS", checks, Level.WARN),
+        (Tone.ACT, "OLD RESULT", extrinsic if is_outdated else None, Level.WARN),
         (Tone.ACT, "NOT WATCHING", mount, Level.WARN),
     ]
     for tone, word, part, level in told:
@@ -242,7 +286,7 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
     if _result_of(state) is None:
         return Tone.BUSY, "START", sentence
     if at.level >= Level.WARN:
-        return Tone.ACT, "CHANGE THE MOTION", sentence
+        return Tone.ACT, CHANGE_MOTION, sentence
     return Tone.BUSY, "GO ON", sentence
 
 
@@ -269,6 +313,8 @@ def _of_end(state: NodeState) -> tuple[Tone, str, str]:
         return Tone.ACT, "ENDED", "The node has ended: nobody watches the mount."
     if state.saved is not None:
         text = f"The node has ended. The result was saved {_where(state.saved)}."
+        if state.saved.verdict == "DO NOT USE":
+            return Tone.ACT, "ENDED", f"{text} {_sentence(state.saved.text)}"
         return Tone.GOOD, "ENDED", text
     lost = "The result is not saved: the log says why."
     text = lost if _result_of(state) else "There was no result yet."
@@ -287,8 +333,10 @@ def _facts(state: NodeState, is_old: bool) -> str:
     if seen is None or not seen.n_poses:
         return ""
     told = [f"{seen.path_m:,.0f} m", f"{duration(seen.motion_s)} of motion"]
-    if seen.result and not is_old:
+    if seen.result and not is_old and seen.standing is not Standing.REFUTED:
         told.append(f"result {duration(seen.result.age_s)} old")
+    if seen.standing is Standing.OUTDATED:
+        told.append("newer solves fail")
     return ", ".join(told)
 
 
@@ -312,7 +360,9 @@ def _bar(axis: str, state: NodeState) -> Bar:
     wanted = amount(axis, known.target)
     sigma = amount(axis, known.sigma).removesuffix(f" {wanted.rpartition(' ')[2]}")
     against = f"± {sigma} of {wanted}"
-    if not math.isfinite(known.sigma):
+    if state.extrinsic is not None and state.extrinsic.contradicted:
+        tone, word, against = Tone.UNKNOWN, "no usable result", f"wanted: {wanted}"
+    elif not math.isfinite(known.sigma):
         tone, word = Tone.UNKNOWN, "out of reach" if has_end else "not seen yet"
         against = "" if has_end else f"wanted: {wanted}"
     elif at.progress.is_faulty:
@@ -384,6 +434,8 @@ def _result(state: NodeState) -> Iterator[Line]:
     verdict, notes = (result.verdict, result.warnings) if result else ("no result yet", ())
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
     yield from (Line(Tone.ACT, "note", note.replace("+/-", "±")) for note in notes)
+    if state.extrinsic is not None:
+        yield from _priors(state.extrinsic)
     if state.progress and (found := state.progress.comparison):
         text, tone = found.sentence.replace("+/-", "±"), _TONES.get(found.verdict, Tone.UNKNOWN)
         yield Line(tone, "compared with what is installed", text)
@@ -393,7 +445,19 @@ def _result(state: NodeState) -> Iterator[Line]:
         tone, text = told or (_TONES[broadcast], text)
         yield Line(tone, "on /tf_static", text)
     if state.saved is not None:
-        yield Line(Tone.GOOD, "saved", f"{_where(state.saved)}: {state.saved.text}")
+        tone = Tone.BAD if state.saved.verdict == "DO NOT USE" else Tone.GOOD
+        yield Line(tone, "saved", f"{_where(state.saved)}: {state.saved.text}")
+
+
+def _priors(extrinsic: ExtrinsicState) -> Iterator[Line]:
+    """The priors that are set, and whether the motion contradicts them."""
+    for axis in (name for name in AXES if name in extrinsic.priors):
+        prior = extrinsic.priors[axis]
+        text = f"{axis} = {prior.replace('+/-', ' ± ')}"
+        if axis in extrinsic.contradicted:
+            yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
+        else:
+            yield Line(Tone.BUSY, "prior", text)
 
 
 def state_of(text: str) -> NodeState | None:

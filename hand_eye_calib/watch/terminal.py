@@ -22,6 +22,8 @@ _WIDE = 76
 
 # Of a request whose key is not its first letter.
 _KEYS = {"save": "w"}
+# Requests with another name beside their key.
+_LABELS = {"forget": "forget priors"}
 
 
 def screen(view: View, width: int, footer: str = "") -> RenderableType:
@@ -44,7 +46,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
         parts += [title, _lines(view.watched)]
     parts.append(_lines((*view.result, *view.health)))
     parts += [Text(f"    - {reason}", style="dim") for reason in view.reasons[:3]]
-    keys = [f"{_KEYS.get(name, name[0])} {name}   " for name in view.buttons]
+    keys = [f"{_KEYS.get(name, name[0])} {_LABELS.get(name, name)}   " for name in view.buttons]
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
     body = Panel(Group(*parts), title=title, title_align="left")
     return Group(Text(f" {''.join(keys)}q quit   {footer}".rstrip(), style="dim"), body)

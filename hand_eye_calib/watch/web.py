@@ -7,6 +7,7 @@ the key that is part of the address: a page of somebody else in the same browser
 
 import contextlib
 import hmac
+import json
 import os
 import re
 import secrets
@@ -27,8 +28,8 @@ from hand_eye_calib.live.state import REPORT_PERIOD_S
 from hand_eye_calib.text import AXIS_UNITS, capital
 from hand_eye_calib.watch.board import Bar, Board, Line, Tone, View
 
-# Requests of the page, beside that of an axis measured by hand.
-BUTTONS = ("solve", "save", "reset", "recalibrate", "acknowledge")
+# Requests of the page, beside those about an axis measured by hand.
+BUTTONS = ("solve", "save", "reset", "recalibrate", "acknowledge", "forget")
 
 # The view is looked at so often (s).
 _LOOK_S = 0.25
@@ -82,7 +83,7 @@ class WebServer(ThreadingHTTPServer):
     board : Board
     ask : callable
         Called in another thread with one of BUTTONS, or with a parameter and its value as in
-        ``prior.z:=1.85m+/-0.02m``.
+        ``prior.z:=1.85m+/-0.02m``, or ``prior.z:=`` to remove it.
     address : (str, int)
         Host and port; an empty host stands for all addresses of the computer, port 0 for any that
         is free.
@@ -163,6 +164,8 @@ class _Handler(BaseHTTPRequestHandler):
         status, text = HTTPStatus.OK, ""
         if not self._has_key():
             status, text = HTTPStatus.FORBIDDEN, "the key is missing"
+        elif request == "forget" and axis in AXIS_UNITS:
+            self.server.ask(f"prior.{axis}:=")
         elif request in BUTTONS:
             self.server.ask(request)
         elif request == "prior" and axis in AXIS_UNITS:  # the node refuses what is no number
@@ -252,10 +255,12 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     )
     said, _, advice = view.sentence.partition("; ")
     told = (("advice", capital(advice)), ("facts", view.facts))
+    priors = escape(json.dumps(dict(view.priors)))
     more = [f'<p class="{name}">{escape(text)}</p>' for name, text in told if text]
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
-        f'data-by-hand="{escape(view.by_hand)}" data-files="{" ".join(files)}">'
+        f'data-by-hand="{" ".join(view.by_hand)}" data-priors="{priors}" '
+        f'data-files="{" ".join(files)}">'
         f'<p class="node">{escape(view.node or "no node")}</p>'
         f'<section class="headline"><h1>{_sign(view.tone)} {escape(view.word)}</h1>'
         f"<p>{escape(said)}</p>{''.join(more)}</section>{''.join(sections)}</div>"

@@ -21,6 +21,7 @@ let now = 0, tick = null; const log = {posts: [], opened: [], shaken: 0, locks: 
 Date.now = () => now;
 const element = (more) => withClasses({
   dataset: {}, hidden: false, disabled: false, textContent: "", heard: {}, classes: new Set(),
+  value: "", innerHTML: "",
   setAttribute() {},
   addEventListener(name, run) { this.heard[name] = run; }, ...more});
 const withClasses = (one) => { one.classList = {toggle(name, on) {
@@ -32,9 +33,9 @@ const nodes = {connection: element(), footer: element(), view: element({
     const textContent = this.innerHTML.match(/<h1>(.*?)<.h1>/)[1].replace(/<[^>]*>/g, "");
     return {textContent, innerText: this.innerHTML};
   }})};
-for (const id of ["by-hand", "files", "sound", "asked", "unit", "icon", "said"])
+for (const id of ["by-hand", "files", "sound", "asked", "unit", "icon", "said", "forget"])
   nodes[id] = element();
-const shown = {buttons: "solve save reset", byHand: "", files: ""};
+const shown = {buttons: "solve save reset", byHand: "", priors: "{}", files: ""};
 nodes.state = {className: "busy", dataset: shown};
 const keys = ["solve", "save", "reset"].map((request) => element(
   {dataset: request === "reset" ? {request, sure: "Forget all poses?"} : {request}}));
@@ -42,14 +43,14 @@ globalThis.document = {title: "", getElementById: (id) => nodes[id], visibilityS
   addEventListener(name, run) { seen = run; }, querySelector: () => nodes.footer,
   querySelectorAll: (what) => what.startsWith("a") ? anchors : keys};
 globalThis.FormData = class {
-  *[Symbol.iterator]() { yield ["value", "1.85"]; yield ["sigma", "0.02"]; }
+  *[Symbol.iterator]() { yield ["axis", "?"]; yield ["value", "1.85"]; yield ["sigma", "0.02"]; }
 };
 globalThis.location = {search: "?key=word"};
 Object.defineProperty(globalThis, "navigator", {value: {
   vibrate() { log.shaken += 1; },
   wakeLock: {request(kind) { log.locks.push(kind); return Promise.resolve(); }}}});
-let seen = null, sure = false, answer = {ok: true, text: async () => ""};
-globalThis.confirm = () => sure;
+let seen = null, sure = false, asks = [], answer = {ok: true, text: async () => ""};
+globalThis.confirm = (text) => { asks.push(text); return sure; };
 globalThis.fetch = (address, {method}) => {
   log.posts.push(`${method} ${address}`); return Promise.resolve(answer); };
 globalThis.setInterval = (run) => { tick = run; };
@@ -63,7 +64,9 @@ const state = () => ({...log, posts: [...log.posts], locks: log.locks.length,
   opened: log.opened.length, last: log.opened.at(-1),
   title: document.title, said: nodes.connection.textContent,
   lost: nodes.connection.classes.has("lost"), footer: nodes.footer.hidden,
-  form: nodes["by-hand"].hidden, hidden: keys.map((key) => key.hidden),
+  form: nodes["by-hand"].hidden, axes: nodes.asked.innerHTML, chosen: nodes.asked.value,
+  unit: nodes.unit.textContent, forget: nodes.forget.hidden, asks: [...asks],
+  hidden: keys.map((key) => key.hidden),
   main: keys.map((key) => key.classes.has("main")), link: anchors[0].hidden || anchors[0].href,
   disabled: keys.every((button) => button.disabled)});
 """
@@ -93,7 +96,7 @@ def test_the_script_finds_what_it_looks_for():
     assert page.data["data-file"] == list(web.SAVED)
     assert sorted(page.data["data-request"]) == sorted(web.BUTTONS)
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
-    assert len(page.data["data-sure"]) == 2
+    assert len(page.data["data-sure"]) == 3
 
 
 def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen():
@@ -182,4 +185,31 @@ def test_what_is_to_be_pressed_first_stands_out_and_an_axis_can_be_given_by_hand
     assert [each["hidden"] for each in states[:2]] == [[False] * 3, [False, False, True]]
     assert [each["link"] for each in states[:2]] == [True, "a?key=word"]
     assert [each["form"] for each in states] == [True, True, False, False]
-    assert states[3]["posts"] == ["POST prior?key=word&value=1.85&sigma=0.02&axis=z"]
+    assert states[3]["posts"] == ["POST prior?key=word&axis=z&value=1.85&sigma=0.02"]
+
+
+def test_a_prior_can_be_corrected_and_removed_and_what_somebody_has_chosen_stays():
+    message = "events.onmessage({data: '<h1>CHECK THE PRIOR</h1>'});"
+    states = played(
+        [
+            f"""shown.byHand = 'z yaw'; shown.priors = '{{"z": "1.5m+/-0.02m"}}'; {message}""",
+            "nodes.asked.value = 'yaw'; nodes.asked.heard.change();",
+            f"shown.byHand = 'yaw z x'; {message}",
+            "nodes.asked.value = 'z'; nodes.asked.heard.change(); nodes.forget.heard.click();",
+            "sure = true; keys[2].heard.click();",
+            f"shown.priors = '{{}}'; {message} keys[2].heard.click();",
+        ]
+    )
+    assert [state["form"] for state in states] == [False] * 6
+    assert states[0]["axes"] == "<option>z</option><option>yaw</option>"
+    assert [state["chosen"] for state in states[:4]] == ["z", "yaw", "yaw", "z"]
+    assert [state["unit"] for state in states[:4]] == ["m", "deg", "deg", "m"]
+    assert [state["forget"] for state in states[:4]] == [False, True, True, False]
+    assert states[3]["posts"] == ["POST forget?key=word&axis=z"]
+    assert states[4]["asks"] == [
+        "Forget all poses?",
+        "Remove the prior, too? It is z = 1.5m+/-0.02m.",
+    ]
+    assert states[4]["posts"][1:] == ["POST forget?key=word", "POST reset?key=word"]
+    assert states[5]["asks"][2:] == ["Forget all poses?"]
+    assert states[5]["posts"][3:] == ["POST reset?key=word"]

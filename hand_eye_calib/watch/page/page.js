@@ -5,12 +5,14 @@ const address = new URLSearchParams(location.search);
 const part = (id) => document.getElementById(id);
 const view = part("view"), connection = part("connection"), form = part("by-hand");
 const sound = part("sound"), links = document.querySelectorAll("a[data-file]");
+const asked = part("asked");
 const footer = document.querySelector("footer");
 const buttons = document.querySelectorAll("button[data-request]");
 
 // The server sends something every second. A connection that is silent for longer is opened anew:
 // a phone that was asleep or out of reach does not notice by itself.
 const SILENT_MS = 4000, RETRY_MS = 1000;
+let priors = {};
 let source = null, heardAt = 0, lostAt = null, isOld = false, tones = null;
 
 const ICONS = {good: "#11703a", busy: "#0b5cad", act: "#c77700", bad: "#b3211c", unknown: "#6b4a8a"};
@@ -49,11 +51,7 @@ function put(html) {
   }
   footer.hidden = ["", "reset"].includes(shown[0]);
   part("files").hidden = state.dataset.files === "";
-  form.hidden = state.dataset.byHand === "";
-  if (!form.hidden) {
-    part("asked").textContent = state.dataset.byHand;
-    part("unit").textContent = "xyz".includes(state.dataset.byHand) ? "m" : "deg";
-  }
+  offer(state.dataset.byHand.split(" ").filter(Boolean), JSON.parse(state.dataset.priors));
   for (const link of links) {
     link.hidden = !state.dataset.files.split(" ").includes(link.dataset.file);
   }
@@ -66,6 +64,25 @@ function put(html) {
   const colour = encodeURIComponent(ICONS[state.className]);
   part("icon").href = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' "
     + `viewBox='0 0 9 9'><circle cx='4.5' cy='4.5' r='4' fill='${colour}'/></svg>`;
+}
+
+// The axes that can be measured by hand, and the priors that are set. What somebody has chosen and
+// typed stays.
+function offer(axes, set) {
+  priors = set;
+  form.hidden = axes.length === 0;
+  if (asked.dataset.axes !== axes.join(" ")) {
+    const chosen = asked.value;
+    asked.dataset.axes = axes.join(" ");
+    asked.innerHTML = axes.map((axis) => `<option>${axis}</option>`).join("");
+    asked.value = axes.includes(chosen) ? chosen : axes[0] || "";
+  }
+  choose();
+}
+
+function choose() {
+  part("unit").textContent = "xyz".includes(asked.value) ? "m" : "deg";
+  part("forget").hidden = !(asked.value in priors);
 }
 
 function connect() {
@@ -103,6 +120,9 @@ for (const link of links) link.href = link.dataset.file + "?" + address;
 for (const button of buttons) {
   button.addEventListener("click", () => {
     if (button.dataset.sure && !confirm(button.dataset.sure)) return;
+    const set = Object.entries(priors).map(([axis, prior]) => `${axis} = ${prior}`).join(", ");
+    const isReset = button.dataset.request === "reset";
+    if (isReset && set && confirm(`Remove the prior, too? It is ${set}.`)) post("forget");
     post(button.dataset.request);
   });
 }
@@ -110,9 +130,11 @@ for (const button of buttons) {
 form.addEventListener("submit", (event) => {
   event.preventDefault();
   const given = new URLSearchParams(new FormData(form));
-  given.set("axis", part("asked").textContent);
+  given.set("axis", asked.value);
   post("prior", "&" + given);
 });
+asked.addEventListener("change", choose);
+part("forget").addEventListener("click", () => post("forget", "&axis=" + asked.value));
 
 // Browsers allow sound only after a touch, and a screen that stays on only to pages that come over
 // https or from the same computer.
