@@ -47,6 +47,10 @@ class InputError(HandEyeCalibError, ValueError):
     """Data that cannot be used: not finite, wrong shape, unreadable, contradictory."""
 
 
+class NoPoseError(InputError):
+    """A message states that there is no pose: null quaternion, value that is not finite, no fix."""
+
+
 class NotEnoughDataError(InputError):
     """There is too little data to solve; what there is can be used."""
 

@@ -101,6 +101,24 @@ def tf_message(edges, message_type=TF):
     return make
 
 
+def pose_message(message_type, stamp_ns, values, world="map", sensor="sensor"):
+    """Makes a PoseStamped or an Odometry of x y z qx qy qz qw, whatever these are."""
+
+    def make(typestore):
+        def made(name, *parts):
+            return typestore.types[f"geometry_msgs/msg/{name}"](*parts)
+
+        row = [float(value) for value in values]
+        parts = (made("Pose", made("Point", *row[:3]), made("Quaternion", *row[3:])),)
+        if message_type == ODOMETRY:
+            zero = made("Vector3", 0.0, 0.0, 0.0)
+            twist = made("TwistWithCovariance", made("Twist", zero, zero), np.zeros(36))
+            parts = (sensor, made("PoseWithCovariance", *parts, np.zeros(36)), twist)
+        return typestore.types[message_type](header(typestore, stamp_ns, world), *parts)
+
+    return make
+
+
 def path_message(stamps_ns, poses, frame="map"):
     """Makes a nav_msgs/Path."""
 

@@ -46,7 +46,7 @@ def read_recording(
     if wanted:
         raise ConfigError(
             f"{journal} is the journal of a session, which has two streams; it cannot be combined "
-            "with topics or frames"
+            "with topics, frames or stamps"
         )
     return read_journal_of(journal, options)
 
@@ -55,7 +55,7 @@ def select(
     bag: PoseBag, wanted: Mapping[str, str], config: CalibratorConfig
 ) -> tuple[dict[str, Source], dict[str, str]]:
     """The sources of "parent" and "child" in a bag, and what each measures."""
-    given = {stream: source_of(text) for stream, text in wanted.items()}
+    given = {stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted}
     chosen = bag.select(given.get("parent"), given.get("child"))
     if len(given) < len(STREAMS):
         parent, child = chosen
@@ -70,16 +70,21 @@ def select(
     return dict(zip(STREAMS, chosen, strict=True)), measures
 
 
+def stamps_of(wanted: Mapping[str, str]) -> dict[str, str]:
+    """Where the stamps of "parent" and "child" come from."""
+    return {stream: wanted.get(f"{stream}_stamps", "header") for stream in STREAMS}
+
+
 def read_sources(
-    bag: PoseBag, measures: Iterable[tuple[Source, str]]
+    bag: PoseBag, measures: Iterable[tuple[Source, str, str]]
 ) -> tuple[list[Trajectory], list[str]]:
-    """The whole trajectories of sources of a bag, each with what it measures, and what was wrong
-    with their stamps.
+    """The whole trajectories of sources of a bag, each with what it measures and where its stamps
+    come from, and what was wrong with their stamps.
     """
     found = []
-    for source, kind in measures:
+    for source, kind, stamps in measures:
         with waiting_for(f"reading {source}"):
-            found.append(bag.trajectory(source, kind))
+            found.append(bag.trajectory(source, kind, stamps))
     note(*bag.warnings)
     return [poses for poses, _ in found], [text for _, notes in found for text in notes]
 
@@ -93,7 +98,9 @@ def _read_bags(
         of_streams: Options = {f"{stream}_measures": measures[stream] for stream in STREAMS}
         calibrator = Calibrator(dataclasses.replace(config, **of_streams))
         bag.shown = with_progress
-        poses = bag.poses(sources["parent"], sources["child"], config.max_gap, measures)
+        stamps = stamps_of(wanted)
+        both = sources["parent"], sources["child"]
+        poses = bag.poses(*both, config.max_gap, measures, stamps)
         _feed(calibrator, poses, sources)
         for stream, source in sources.items():
             if not calibrator.frame(stream):

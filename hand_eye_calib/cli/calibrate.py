@@ -175,6 +175,7 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     if are_samples or are_images or arguments.order == "none":
         from hand_eye_calib.cli import stops
 
+        options.refuse_stamps(arguments)
         return deliver(*stops.solved(arguments), arguments)
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
     if arguments.topics or (len(paths) > 2 and not are_bags):
@@ -183,6 +184,7 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         return calibrate_rig(arguments, as_given)
     given = options.options_from(arguments)
     if not are_bags:
+        options.refuse_stamps(arguments)
         recording = reading.read_pair(arguments, given)
     else:
         from hand_eye_calib.cli import bags

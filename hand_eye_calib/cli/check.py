@@ -70,6 +70,7 @@ def _opened(
     if len(paths) != (1 if is_bag else 2):
         raise ConfigError(f"expected one bag or two trajectory files; got {len(paths)}")
     if not is_bag:
+        options.refuse_stamps(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
         return names, *reading.read_files(arguments, paths, given)
     from hand_eye_calib.cli import bags
@@ -78,9 +79,12 @@ def _opened(
 
     config = CalibratorConfig.from_options(given)
     with PoseBag(paths[0]) as bag:
-        sources, measures = bags.select(bag, options.sources_from(arguments), config)
+        wanted = options.sources_from(arguments)
+        sources, measures = bags.select(bag, wanted, config)
+        stamps = bags.stamps_of(wanted)
         names = {stream: str(source) for stream, source in sources.items()}
-        return names, *bags.read_sources(bag, zip(sources.values(), measures.values(), strict=True))
+        readings = [(sources[stream], measures[stream], stamps[stream]) for stream in STREAMS]
+        return names, *bags.read_sources(bag, readings)
 
 
 def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:

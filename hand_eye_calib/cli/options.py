@@ -61,7 +61,10 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
-_OF_FILES = (*FILE_OPTIONS, "pair_by")
+# Where the stamps of a bag's poses come from.
+STAMPS = ("header", "receive")
+
+_OF_FILES = (*FILE_OPTIONS, "pair_by", "stamps")
 _OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for name in _OF_FILES)}
 
 # Names in backticks; and names that are no words of the language, such as max_gap and prior.z, or
@@ -337,6 +340,14 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
             "t=header.stamp,x=pose.position.x,..."
         )
         group.add_argument(f"--{stream}-fields", metavar="NAME=PATH,...", help=fields)
+    of_stamps = (
+        "stamps of the poses: of their headers, or the times at which the recorder received them, "
+        "for headers without. Default: header"
+    )
+    group.add_argument("--stamps", choices=STAMPS, help=of_stamps)
+    for stream in STREAMS:
+        same = f"the same for the {stream} only"
+        group.add_argument(f"--{stream}-stamps", choices=STAMPS, help=same)
     group = parser.add_argument_group(
         "trajectory files", "each also as --parent-... and --child-... for one of the two files"
     )
@@ -353,7 +364,9 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
-    """Topic or frames, WORLD:SENSOR, of "parent" and "child", if they are given."""
+    """Topic or frames, WORLD:SENSOR, of "parent" and "child", and where their stamps come from,
+    "parent_stamps" and "child_stamps", if they are given.
+    """
     found = {}
     for stream in STREAMS:
         topic, fields = (getattr(arguments, f"{stream}_{kind}") for kind in ("topic", "fields"))
@@ -362,7 +375,18 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
         if stream == "child" and topic and getattr(arguments, "target", None):
             fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
         found[stream] = f"{topic}?{fields}" if fields else topic
+        found[f"{stream}_stamps"] = getattr(arguments, f"{stream}_stamps") or arguments.stamps
     return {stream: source for stream, source in found.items() if source}
+
+
+def refuse_stamps(arguments: argparse.Namespace) -> None:
+    """Raise ConfigError for the times of receipt of what is no bag."""
+    names = ("stamps", *(f"{stream}_stamps" for stream in STREAMS))
+    given = [name for name in names if getattr(arguments, name, None)]
+    if given:
+        raise ConfigError(
+            f"--{flag(given[0])} is for bags; trajectory files have one kind of stamps"
+        )
 
 
 def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:

@@ -3,7 +3,14 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.options import fail, note, options_from, print_result, waiting_for
+from hand_eye_calib.cli.options import (
+    fail,
+    note,
+    options_from,
+    print_result,
+    refuse_stamps,
+    waiting_for,
+)
 from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.cli.reporting import write_rig_report
@@ -35,11 +42,14 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         names, sources = topics, [*map(source_of, topics)]
         refuse_recordings(arguments.paths, sources)
         with PoseBag(*arguments.paths) as bag:
-            trajectories, notes = read_sources(bag, [(each, "auto") for each in sources])
+            stamps = arguments.stamps or "header"
+            readings = [(source, "auto", stamps) for source in sources]
+            trajectories, notes = read_sources(bag, readings)
             inputs: Document = {"bag": str(bag), "topics": topics}
             if arguments.out:
                 inputs["files"] = [fingerprint(file) for file in bag.files]
     else:
+        refuse_stamps(arguments)
         names = [*map(str, arguments.paths)]
         trajectories, notes = read_files(arguments, arguments.paths, {})
         inputs = {"files": names}

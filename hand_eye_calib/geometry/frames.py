@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.errors import InputError, NoPoseError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 
@@ -22,13 +22,30 @@ _ROTATION_WITHIN = 1e-2
 _MOST_LISTED = 50
 
 
-def check_pose(*values: float) -> None:
-    """Raise InputError for x, y, z, qx, qy, qz, qw that are not finite, too far away, or have a
-    quaternion that is not of unit length.
+def are_null(poses: FloatArray) -> BoolArray:
+    """Mask (N,) of rows x y z qx qy qz qw (N, 7) by which a source states that it has no pose.
+
+    A value is not finite, or the quaternion is zero: trackers publish both when they are lost.
     """
-    length = math.hypot(*values[3:])
+    is_finite = np.isfinite(poses).all(axis=1)
+    has_quaternion = (poses[:, 3:] != 0.0).any(axis=1)
+    return np.asarray(~(is_finite & has_quaternion), dtype=bool)
+
+
+def check_not_null(*values: float) -> None:
+    """Raise NoPoseError for x, y, z, qx, qy, qz, qw that :func:`are_null`."""
     if not all(map(math.isfinite, values)):
-        raise InputError("the pose has a value that is not finite")
+        raise NoPoseError("the pose has a value that is not finite")
+    if not any(values[3:]):
+        raise NoPoseError("the pose has a quaternion of length 0, expected 1")
+
+
+def check_pose(*values: float) -> None:
+    """Raise InputError for x, y, z, qx, qy, qz, qw that are too far away, or have a quaternion that
+    is not of unit length; NoPoseError as :func:`check_not_null`.
+    """
+    check_not_null(*values)
+    length = math.hypot(*values[3:])
     if abs(length - 1.0) > QUATERNION_NORM_TOLERANCE:
         raise InputError(f"the pose has a quaternion of length {length:.4g}, expected 1")
     if max(map(abs, values[:3])) > FARTHEST_M:

@@ -16,15 +16,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import HandEyeCalibError
+from hand_eye_calib.config import STAMP_UNITS, CalibratorConfig
+from hand_eye_calib.engine.calibrator import StreamStatistics
+from hand_eye_calib.errors import HandEyeCalibError, NoPoseError
+from hand_eye_calib.geometry.frames import check_not_null
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import REPORT_PERIOD_S, InputState, Level
+from hand_eye_calib.text import MUCH_NULL, share
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
+# Share of repeated stamps from which on the stamps are of no use, and fewest messages to judge.
+_MUCH_REPEATED = 0.5
+_FEWEST_TO_JUDGE = 20
 # Reports, one a second, over which rates and shares are taken, and a bad message is reported.
 _REPORTS = 10
 
@@ -42,16 +48,19 @@ SILENT_AFTER_S = 2.0
 
 Stamped = tuple[int, Any]
 
+_STAMP_IS_0 = "its stamp is 0: have its publisher set header.stamp"
+
 
 class Judgement(NamedTuple):
     """What a message has brought about: stamps and messages to be used now, of which some have
     waited; corrupt stamps of messages that are not to be used; whether those to be used are the
-    first of a new session.
+    first of a new session; the stamp of a message that repeats the one before, which waits.
     """
 
     taken: Sequence[Stamped] = ()
     dropped: Sequence[int] = ()
     jumped_back: bool = False
+    repeated: Sequence[int] = ()
 
 
 class StampGuard:
@@ -76,6 +85,8 @@ class StampGuard:
                 return Judgement()
             return Judgement(self._take([(stamp_ns, message)]), self._drop_held())
         dropped = []
+        if self._held and stamp_ns == self._held[-1][0]:
+            return Judgement(repeated=[stamp_ns])
         if self._held and not 0 < abs(stamp_ns - self._held[-1][0]) <= _LONGEST_PAUSE_NS:
             dropped = self._drop_held()
         self._held.append((stamp_ns, message))
@@ -163,11 +174,11 @@ class PoseInput:
         self._guard, self._refused = StampGuard(), Counter[str]()
         self._session, self._log, self._on_jump_back = session, log, on_jump_back
         self._wanted = "auto"
-        self._arrived, self._lost = 0, 0
+        self._arrived, self._lost, self._null = 0, 0, 0
         self._next_number: int | None = None
         self._arrived_s: float | None = None
         self._bad, self._bad_at_s = "", -np.inf
-        self._counts = deque([(time.monotonic(), 0, 0)], maxlen=_REPORTS + 1)
+        self._counts = deque([(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._last_stamp_ns: int | None = None
         self._longest_gap_ns, self._is_new = 0, True
 
@@ -231,14 +242,24 @@ class PoseInput:
         self._log.warning(f"{self.topic}: a message is refused: {text}")
         self._log.debug(f"{self.topic}: message {which} refused: {text}")
 
+    def leave_out(self, which: str, reason: NoPoseError) -> None:
+        """Count a message that states that it has no pose, as of a tracker that is lost."""
+        self._refused["no pose"] += 1
+        self._null += 1
+        self._log.debug(f"{self.topic}: message {which} is left out: {reason}")
+
     def _use(self, judgement: Judgement) -> None:
         for stamp_ns in judgement.dropped:
             text = "its stamp does not fit those before and after it"
-            text = text if stamp_ns else "its stamp is 0: have its publisher set header.stamp"
+            text = text if stamp_ns else _STAMP_IS_0
+            self.refuse(with_stamp(stamp_ns), "corrupt stamp", text)
+        for stamp_ns in judgement.repeated:
+            text = repeated_stamps(stamp_ns) if stamp_ns else _STAMP_IS_0
             self.refuse(with_stamp(stamp_ns), "corrupt stamp", text)
         for stamp_ns, read in judgement.taken:
             try:
                 pose = read()
+                check_not_null(*pose.position, *pose.quat_xyzw)
                 # An empty name is the one before, too: parameters or a default name it.
                 if pose.sensor_frame not in (None, self._sensor_frame):
                     self._session.engines.set_frame(self.name, pose.sensor_frame)
@@ -249,6 +270,8 @@ class PoseInput:
                     self._log.debug(f"{self.topic}: message {which} is repeated or too late")
                 elif self._session.journal is not None:
                     self._session.journal.poses.append(fields)
+            except NoPoseError as error:
+                self.leave_out(with_stamp(stamp_ns), error)
             except HandEyeCalibError as error:
                 self.refuse(with_stamp(stamp_ns), "unusable", str(error))
         if judgement.taken and self._is_new:
@@ -265,13 +288,19 @@ class PoseInput:
         """What has come in; to be called once a second or oftener. ``may_rest`` if silence is
         nothing to look at: there is a result, and the other input is silent too.
         """
-        now = steady_s, self._arrived, self._lost
-        seconds, arrived, lost = np.subtract(now, self._counts[0]).tolist()
+        now = steady_s, self._arrived, self._lost, self._null
+        seconds, arrived, lost, null = np.subtract(now, self._counts[0]).tolist()
         if steady_s - self._counts[-1][0] > REPORT_PERIOD_S / 2:
             self._counts.append(now)
         rate_hz = arrived / seconds if seconds > 0 else 0.0
-        level, text = self._judge(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
+        lost_share = lost / max(arrived + lost, 1)
+        null_share = null / max(arrived, 1)
+        level, text = self._judge(steady_s, rate_hz, lost_share, may_rest)
         taken = self._session.engines.statistics(self.name)
+        if level is Level.OK and (advice := self._advice(null_share, taken)):
+            self._log.warning(f"{self.topic}: {advice}")
+            level = Level.WARN
+            text = f"{text}; {advice}"
         refused = {"repeated stamp": taken.refused_duplicate, "too late": taken.refused_late}
         return InputState(
             level=level,
@@ -284,6 +313,21 @@ class PoseInput:
             lost=None if self._next_number is None else self._lost,
             longest_gap_s=self._longest_gap_ns * 1e-9,
         )
+
+    def _advice(self, null_share: float, taken: StreamStatistics) -> str:
+        """Return what to do about messages without a pose or a stamp of their own; or nothing."""
+        if null_share > MUCH_NULL:
+            return (
+                f"{share(null_share)} of the messages have no pose (null, not finite or without a "
+                "fix): see whether the source loses track"
+            )
+        n_taken = taken.received
+        n_repeated = taken.refused_duplicate
+        if n_repeated + n_taken < _FEWEST_TO_JUDGE:
+            return ""
+        if n_repeated <= _MUCH_REPEATED * (n_repeated + n_taken):
+            return ""
+        return repeated_stamps(taken.last_stamp_ns or 0)
 
     def _judge(
         self, steady_s: float, rate_hz: float, lost_share: float, may_rest: bool
@@ -304,6 +348,12 @@ class PoseInput:
         text = f"{lost_share:.1%} of the messages are lost: {advice}"
         self._log.warning(f"{self.topic}: {text}")
         return Level.WARN, f"{rate_hz:.1f} Hz; {text}"
+
+
+def repeated_stamps(stamp_ns: int) -> str:
+    """What is wrong with a stream whose stamps repeat, of which this is one; and what to do."""
+    kind = "repeat" if stamp_ns % STAMP_UNITS["s"] else "have whole seconds only"
+    return f"the stamps {kind}: have the publisher set header.stamp for every message"
 
 
 def with_stamp(stamp_ns: int) -> str:

@@ -13,7 +13,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hand_eye_calib.config import POSE_TYPES, CalibratorConfig
-from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.errors import ConfigError, InputError, NoPoseError
 from hand_eye_calib.io.bags import messages
 from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.live.input import PoseInput, with_stamp
@@ -162,5 +162,7 @@ class TfInput(RosInput):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):
                     self.accept(pose.stamp_ns, partial(PoseFields, *pose))
+            except NoPoseError as error:
+                self.leave_out(with_stamp(transform.stamp_ns), error)
             except InputError as error:
                 self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))

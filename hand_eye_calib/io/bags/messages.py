@@ -20,8 +20,16 @@ from numpy.typing import NDArray
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, printable, required
+from hand_eye_calib.errors import (
+    ConfigError,
+    HandEyeCalibError,
+    InputError,
+    NoPoseError,
+    printable,
+    required,
+)
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import are_null
 from hand_eye_calib.geometry.rates import RateIntegrator
 from hand_eye_calib.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.io.bags.storage import MessageKind
@@ -33,7 +41,7 @@ from hand_eye_calib.io.transforms import PoseFields
 # What unpacking bytes that are not a message of its type may raise.
 MALFORMED = (struct.error, ValueError)
 
-_NS_PER_S = STAMP_UNITS["s"]
+NS_PER_S = STAMP_UNITS["s"]
 _POSE_SIZE = struct.calcsize("=7d")
 
 
@@ -63,9 +71,9 @@ class Cursor:
     def stamp_ns(self) -> int:
         """Read a stamp."""
         seconds, nanoseconds = self.read("II" if self._is_ros1 else "iI")
-        if nanoseconds >= _NS_PER_S:
+        if nanoseconds >= NS_PER_S:
             raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
-        return int(seconds * _NS_PER_S + nanoseconds)
+        return int(seconds * NS_PER_S + nanoseconds)
 
     def name(self) -> str:
         """Read a string; in CDR it ends in a zero byte. Control characters are escaped."""
@@ -299,7 +307,7 @@ def ns_of(stamp: Any) -> int | None:
     """A stamp of a message, as ROS, Foxglove's JSON or protobuf has it, in ns; None for others."""
     for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos")):
         if hasattr(stamp, nanoseconds):
-            return int(getattr(stamp, seconds) * _NS_PER_S + getattr(stamp, nanoseconds))
+            return int(getattr(stamp, seconds) * NS_PER_S + getattr(stamp, nanoseconds))
     return None
 
 
@@ -395,10 +403,10 @@ def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatAr
     """
     frames, stamps = rows[:, 8:-_POSE_SIZE], np.ascontiguousarray(rows[:, :8])
     seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(np.int64)
-    if (frames != frames[0]).any() or not (nanoseconds // _NS_PER_S == 0).all():
+    if (frames != frames[0]).any() or not (nanoseconds // NS_PER_S == 0).all():
         return None
     poses = np.ascontiguousarray(rows[:, -_POSE_SIZE:]).view("<f8")
-    return seconds * _NS_PER_S + nanoseconds, poses
+    return seconds * NS_PER_S + nanoseconds, poses
 
 
 # ---- what the messages of a topic measure
@@ -409,7 +417,8 @@ class MessageReader:
     orientations, and rotations alone positions at the origin: these mean nothing.
 
     ``measures`` is as of :func:`measured_as`, ``origin`` that of latitudes and longitudes, the
-    first one read by default. ``n_left_out`` counts messages without a fix or an orientation.
+    first one read by default. ``n_left_out`` counts messages without what is measured: null poses,
+    no fix, no orientation.
     """
 
     def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
@@ -428,9 +437,13 @@ class MessageReader:
         """
         columns = unpack_poses(messages, self._row.name, is_ros1)
         if self._are_poses:
-            return columns, np.ones(len(messages), dtype=bool)
+            is_null = are_null(columns.poses)
+            self.n_left_out += int(is_null.sum())
+            return columns, ~is_null
         values = columns.poses[:, _PARTS[self._measures]]
         is_usable = np.asarray(np.isfinite(values).all(axis=1), dtype=bool)
+        if self._measures == "rotations":
+            is_usable &= (values != 0.0).any(axis=1)
         self.n_left_out += int((~is_usable).sum())
         poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))
         if is_usable.any():
@@ -476,7 +489,7 @@ class MessageReader:
         except MALFORMED as error:
             raise InputError(f"not a message of type {self._row.name}: {error}") from error
         if not is_usable.all():
-            raise InputError(f"the message has no {self._measures}")
+            raise NoPoseError(f"the message has no {self._measures}")
         values = columns.poses[0].tolist()
         world, sensor = columns.world_frames[0], columns.sensor_frames[0]
         return PoseFields(int(columns.stamps_ns[0]), world, sensor, values[:3], values[3:])

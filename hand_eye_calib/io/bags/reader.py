@@ -201,11 +201,13 @@ class PoseBag:
         child: Source | None = None,
         max_gap_s: float = CalibratorConfig.max_gap,
         measures: Mapping[str, str] | None = None,
+        stamps: Mapping[str, str] | None = None,
     ) -> PoseTable:
         """The poses of one or two streams in the order of the bag's time; an InputError if the bag
         is damaged, or the transforms do not lead from one frame to the other. Up to ``max_gap_s``
         is interpolated between two transforms of a chain; ``measures`` are what the topics of
-        "parent" and "child" are read as, see :meth:`measured`.
+        "parent" and "child" are read as, see :meth:`measured`; ``stamps`` are where their stamps
+        come from, "header" or "receive".
         """
         measures = measures or {}
         wanted = {"parent": parent} | ({"child": child} if child else {})
@@ -213,6 +215,8 @@ class PoseBag:
             self._reading(stream, source, measures.get(stream, "auto"), max_gap_s)
             for stream, source in wanted.items()
         ]
+        for reading in readings:
+            reading.use_stamps((stamps or {}).get(reading.stream, "header"))
         topics = {topic for reading in readings for topic in reading.topics}
         count, runs = sum(self.topics[topic].count for topic in topics), self._runs(topics)
         for run in self.shown(runs, count, f"reading {self}", lambda run: len(run.messages)):
@@ -266,13 +270,15 @@ class PoseBag:
         camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
         return sources.ImageReading(stream, topic, target, camera)
 
-    def trajectory(self, source: Source, measures: str = "auto") -> tuple[Trajectory, list[str]]:
+    def trajectory(
+        self, source: Source, measures: str = "auto", stamps: str = "header"
+    ) -> tuple[Trajectory, list[str]]:
         """The trajectory of one source in the order of stamps, of those with equal stamps the
-        first, and what a person should know; ``measures`` as of :meth:`measured`. An InputError if
-        the bag or a pose cannot be read.
+        first, and what a person should know; ``measures`` as of :meth:`measured`, ``stamps`` as of
+        :meth:`poses`. An InputError if the bag or a pose cannot be read.
         """
         self.check(source)
-        poses = self.poses(source, measures={"parent": measures})
+        poses = self.poses(source, measures={"parent": measures}, stamps={"parent": stamps})
         if not len(poses):
             raise InputError(f"no poses on {source} of {self}")
         kind: Any = self.measured(source, measures)

@@ -9,6 +9,7 @@ camera's intrinsics.
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
+from dataclasses import replace
 from decimal import Decimal
 from itertools import compress
 from typing import Any
@@ -16,13 +17,15 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError, InputError, located, printable
+from hand_eye_calib.errors import ConfigError, InputError, NoPoseError, located, printable
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import are_null
 from hand_eye_calib.io.bags import messages
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import TWIST, Table
 from hand_eye_calib.io.transforms import TfSource, TfStream
+from hand_eye_calib.text import without_poses
 
 Source = str | TfSource
 # A delay against the bag's time (s) is of a wrong stamp if it is so much farther from both
@@ -30,6 +33,10 @@ Source = str | TfSource
 _JUMP_S = 0.5
 _NOTHING = messages.PoseTable.of([], np.empty((0, 7)))
 _NOT_FINITE = {"nan", "inf", "-inf"}
+_QUAT = {"qx", "qy", "qz", "qw"}
+_ZEROS = {"0", "0.0", "-0.0"}
+# Share of stamps that are 0, or repeated, from which on they are of no use.
+_MOSTLY = 0.5
 
 
 def source_of(text: str) -> Source:
@@ -46,6 +53,17 @@ class Reading(ABC):
     def __init__(self, stream: str, *topics: str) -> None:
         self.stream, self.topics = stream, topics
         self.notes: list[str] = []
+        self.stamps = "header"
+
+    def use_stamps(self, stamps: str) -> None:
+        """Take the stamps of the poses from "header", or the times of the recorder, "receive".
+
+        Raises
+        ------
+        ConfigError
+            If the messages were not received one by one.
+        """
+        self.stamps = stamps
 
     @abstractmethod
     def take(self, run: messages.Run) -> None:
@@ -55,12 +73,54 @@ class Reading(ABC):
     def table(self) -> messages.PoseTable:
         """The poses of all messages; an InputError if there can be none."""
 
+    def _stamped(self, table: messages.PoseTable) -> messages.PoseTable:
+        """Return the table with the stamps that are wanted, without poses whose stamp is 0."""
+        name = "+".join(self.topics)
+        if self.stamps == "receive":
+            self.notes.append(
+                f"{name}: the stamps are the times at which the recorder received the messages; "
+                "the delay on the way counts as offset of the clocks"
+            )
+            return replace(table, stamps_ns=table.bag_ns)
+        is_zero = table.stamps_ns == 0
+        n_zero = int(is_zero.sum())
+        self._refuse_zeros(n_zero, len(table))
+        if n_zero > 1:  # a simulation may begin at 0
+            self.notes.append(f"{name}: {n_zero:,} poses were left out: their header stamps are 0")
+            table = table[~is_zero]
+        n_stamps = len(np.unique(table.stamps_ns))
+        has_whole_seconds = len(table) > 0 and not (table.stamps_ns % messages.NS_PER_S).any()
+        if has_whole_seconds and n_stamps <= _MOSTLY * len(table):
+            raise InputError(
+                f"{name}: the header stamps have whole seconds only: {len(table):,} poses have "
+                f"{n_stamps:,} stamps; have the publisher set header.stamp.nanosec; "
+                f"{self._advice()}"
+            )
+        return table
+
+    def _refuse_zeros(self, n_zero: int, n_all: int) -> None:
+        """Raise InputError if most header stamps are 0."""
+        if n_zero > max(1, _MOSTLY * n_all):
+            raise InputError(
+                f"{'+'.join(self.topics)}: {n_zero:,} of {n_all:,} header stamps are 0: have the "
+                f"publisher set header.stamp; {self._advice()}"
+            )
+
+    def _advice(self) -> str:
+        return f"or take the times of the recorder: `{self.stream}_stamps` receive"
+
+    def _note_null(self, n_null: int, n_all: int) -> None:
+        """Note how many poses were left out because they are null."""
+        if n_null:
+            self.notes.append(f"{'+'.join(self.topics)}: {without_poses(n_null, n_all)}")
+
 
 class TopicReading(Reading):
     """A topic with a pose, or what is measured of one, in each message."""
 
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
+        self._measures = measures
         self._reader = messages.MessageReader(message_type, measures)
         self._tables = [_NOTHING]
 
@@ -74,19 +134,25 @@ class TopicReading(Reading):
         self._tables.append(columns.recorded(self.stream, run.bag_ns)[keep])
 
     def table(self) -> messages.PoseTable:
+        (name,) = self.topics
         table = messages.PoseTable.joined(self._tables)
-        is_right, (name,) = are_believable(table.stamps_ns, table.bag_ns), self.topics
+        n_read = len(table)
+        table = self._stamped(table)
+        is_right = are_believable(table.stamps_ns, table.bag_ns)
         if not is_right.all():
             self.notes.append(
                 f"{name}: {(~is_right).sum()} poses were left out: their stamps jump away from "
                 "the bag's own time and back; the bag may be damaged"
             )
             table = table[is_right]
-        if without := self._reader.n_left_out:
+        n_null = self._reader.n_left_out
+        if n_null and self._measures != "poses":
             self.notes.append(
-                f"{name}: {without} messages without a fix, or without the quantity that is read, "
+                f"{name}: {n_null} messages without a fix, or without the quantity that is read, "
                 "were left out"
             )
+        else:
+            self._note_null(n_null, n_null + n_read)
         return table
 
 
@@ -112,6 +178,10 @@ class JoinedReading(Reading):
     def __init__(self, *parts: TopicReading) -> None:
         super().__init__(parts[0].stream, *(topic for part in parts for topic in part.topics))
         self._parts = parts
+
+    def use_stamps(self, stamps: str) -> None:
+        for part in self._parts:
+            part.use_stamps(stamps)
 
     def take(self, run: messages.Run) -> None:
         for part in self._parts:
@@ -140,6 +210,13 @@ class PathReading(Reading):
 
     _newest: messages.Run | None = None
 
+    def use_stamps(self, stamps: str) -> None:
+        if stamps == "receive":
+            raise ConfigError(
+                f"{self.topics[0]} is a path, which is received as a whole: its poses have no "
+                f"times of receipt; leave out `{self.stream}_stamps`"
+            )
+
     def take(self, run: messages.Run) -> None:
         self._newest = run._replace(messages=run.messages[-1:])
 
@@ -155,8 +232,11 @@ class PathReading(Reading):
                 "odometry that the path was made from"
             )
         frame = printable(path.header.frame_id)
-        table = messages.PoseTable.of(stamps_ns, np.reshape(rows, (-1, 7)), frame)
-        return table.recorded(self.stream, stamps_ns)
+        poses = np.reshape(rows, (-1, 7))
+        is_null = are_null(poses)
+        self._note_null(int(is_null.sum()), len(poses))
+        table = messages.PoseTable.of(stamps_ns, poses, frame).recorded(self.stream, stamps_ns)
+        return self._stamped(table[~is_null])
 
 
 class ImageReading(Reading):
@@ -181,7 +261,7 @@ class ImageReading(Reading):
         self.notes.append(f"{self.topics[0]}: {found}")
         poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
         table = messages.PoseTable.of(self._stamps_ns, poses, "target", self._frame)
-        return table.recorded(self.stream, self._bag_ns)
+        return self._stamped(table.recorded(self.stream, self._bag_ns))
 
 
 class FieldReading(Reading):
@@ -209,10 +289,15 @@ class FieldReading(Reading):
     def take(self, run: messages.Run) -> None:
         rows = [[self._cell(each, path) for path in self._paths] for each in run.decoded()]
         # As of an estimator that has not started.
-        is_known = [_NOT_FINITE.isdisjoint(row) for row in rows]
+        is_known = [_NOT_FINITE.isdisjoint(row) and not self._is_null(row) for row in rows]
         self._n_left_out += is_known.count(False)
         self._table.fill(enumerate(compress(rows, is_known), len(self._bag_ns) + 1), list)
         self._bag_ns += run.bag_ns[is_known].tolist()
+
+    def _is_null(self, row: list[str]) -> bool:
+        """Return whether the quaternion of a row is zero."""
+        quaternion = [cell for name, cell in zip(self._names, row, strict=True) if name in _QUAT]
+        return len(quaternion) == len(_QUAT) and {*quaternion} <= _ZEROS
 
     def _cell(self, value: Any, path: list[str]) -> str:
         """A value of a message, stamps in seconds with all their digits."""
@@ -232,11 +317,13 @@ class FieldReading(Reading):
             topic = self.topics[0]
             raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
         stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
-        if self._n_left_out:
-            table.guess(f"{self._n_left_out} messages with values that are not finite left out")
-        are_twists = table.measures == "twists"
-        poses = _integrated(stamps_ns, table.values()) if are_twists else np.c_[poses_of(table)]
-        return messages.PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
+        self._note_null(self._n_left_out, self._n_left_out + len(stamps_ns))
+        if table.measures == "twists":
+            poses = _integrated(stamps_ns, table.values())
+        else:
+            poses = np.column_stack(poses_of(table))
+        found = messages.PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
+        return self._stamped(found)
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
@@ -254,17 +341,31 @@ class TransformReading(Reading):
         super().__init__(stream, *(topic for topic in topics if not topic.endswith("tf_static")))
         self._source = source
         self._found: list[tuple[Any, ...]] = []
+        self._n_null = 0
+        self._n_zero = 0
+        self._n_taken = 0
 
     def take(self, run: messages.Run) -> None:
         for bag_ns, transform in run.transforms():
-            poses = self._source.edges_at(transform, False)
-            self._found += ((bag_ns, *pose) for pose in poses)
+            if self.stamps == "receive":
+                transform = transform._replace(stamp_ns=bag_ns)
+            self._n_taken += 1
+            self._n_zero += transform.stamp_ns == 0
+            try:
+                poses = [*self._source.edges_at(transform, False)]
+            except NoPoseError:
+                self._n_null += 1
+            else:
+                self._found += ((bag_ns, *pose) for pose in poses)
 
     def table(self) -> messages.PoseTable:
         frames = self._source.source
+        self._refuse_zeros(self._n_zero, self._n_taken)
         if not self._found:
             raise InputError(f"{frames}: {self._source.describe_missing()}")
         bag_ns, stamps_ns, rows = zip(*self._found, strict=True)
         moving = {frame: np.array([each[frame] for each in rows]) for frame in rows[0]}
         poses = se3.to_rows(self._source.composed(moving))
-        return messages.PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
+        self._note_null(self._n_null, self._n_null + len(poses))
+        table = messages.PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
+        return self._stamped(table)
