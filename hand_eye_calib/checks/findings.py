@@ -239,6 +239,73 @@ _ROWS = {
         "that moves",
         severity=_WARNING,
     ),
+    # ------------------------------------------------------------------ of stops
+    "frozen_stops": _Row(
+        "the {stream}'s pose is the same as before at {share:.0%} of the stops, while the other "
+        "side moves",
+        "read the pose anew at every stop, once it stands still; leave these stops out",
+        "a pose that was stored before it was updated",
+        code="frozen",
+    ),
+    "rows": _Row(
+        "the rows of both sides do not belong together: they agree {text}",
+        "pair each pose with the one of the same stop",
+        "a row that is missing on one side, or files sorted by name",
+    ),
+    "angles": _Row(
+        "{whose} rotations agree with the other's if their numbers are {detail}",
+        "convert them, or name the columns of the file by what they are: roll_deg, pitch_deg, "
+        "yaw_deg or rotvec_x, rotvec_y, rotvec_z",
+    ),
+    "unrelated_stops": _Row(
+        "both sides rotate by different angles between the stops ({off_deg:.0f} deg in the median)",
+        "check that both are of one session and row by row of the same stops, and what the numbers "
+        "of the rotations are: angles or rotation vectors, degrees or radians",
+        code="unrelated",
+    ),
+    "disagreeing_stops": _Row(
+        "no camera and target explain {share:.0%} of the {part} of these stops",
+        "check axes and conventions of both sides, that the camera and the target are fixed, and "
+        "that rows belong together",
+        "positions of another frame than the rotations, a target or a camera that moved, wrong "
+        "parameters of the arm",
+        code="unrelated",
+    ),
+    "inverse_stops": _Row(
+        "one of the two files has inverse poses (of the world in the sensor, such as a target in "
+        "the camera)",
+        "give parent_invert poses if it is the parent's; if it is the child's",
+        code="inverse",
+    ),
+    "ambiguous_stops": _Row(
+        "another mistake explains these stops as well: {detail}",
+        "say with options which of both it is",
+        code="ambiguous",
+    ),
+    "stop_units": _Row(
+        "{whose} lengths are {unit}",
+        "convert them to metres, or solve with",
+        code="units",
+    ),
+    "target_scale": _Row(
+        "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f}: they are "
+        "{times:.4g} times as long as the parent's",
+        "measure the target and give its size, or have the scale estimated",
+        "a target of another size, or a wrong focal length",
+        code="scale",
+    ),
+    "reading": _Row(
+        "{what}: probably the poses of one or both sides are inverse, or both are exchanged",
+        "give parent_invert poses if the robot's are, child_invert poses if the target's are, both "
+        "if both are, and parent_invert none with child_invert none if all is right",
+        code="inverse",
+    ),
+    "turning_about_one_axis": _Row(
+        "the stops do not turn about two axes",
+        "turn the hand about at least two axes between them",
+        severity=_NOTE,
+        code="one_axis",
+    ),
     "mount_moved": _Row(
         "the extrinsic changes {at_s:.0f} s after the start by {size}",
         "tighten it and record again, or calibrate the parts before and after on their own",

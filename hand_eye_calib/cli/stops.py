@@ -3,15 +3,26 @@ a hand and images of a target.
 """
 
 from argparse import Namespace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
-from hand_eye_calib.cli.options import STREAMS, note, options_from, with_progress
+from hand_eye_calib.cli.options import (
+    FILE_OPTIONS,
+    STREAMS,
+    flag,
+    note,
+    options_from,
+    with_progress,
+)
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
 from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io import target_images
 from hand_eye_calib.io.stops import read_arm_samples
+from hand_eye_calib.option import Options
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
 
@@ -20,6 +31,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     """The calibration, and where the poses came from in plain values."""
     options = options_from(arguments)
     config = CalibratorConfig.from_options(options)
+    _refuse_ignored(arguments)
     if len(arguments.paths) == 1:
         path = arguments.paths[0]
         samples = read_arm_samples(path)
@@ -34,6 +46,8 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
             raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
         images = target_images.images_in(child_path)
     of_poses = [parent_path] if arguments.target else arguments.paths
+    if arguments.pair_by == "time":
+        arguments.pair_by = "row"
     (parent, *others), _ = read_files(arguments, of_poses, options)
     n_child = len(others[0]) if others else len(images)
     if len(parent) != n_child:
@@ -41,6 +55,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
             f"{parent_path} has {len(parent)} poses and {child_path} {n_child}: stops are paired "
             "by the rows, and by the names of images; give as many of both"
         )
+    config = _measuring(config, dict(zip(STREAMS, (parent, *others), strict=False)))
     if others:
         found = calibrate_stops(parent.poses, others[0].poses, config)
     else:
@@ -54,3 +69,28 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         found = calibrate_arm(parent.poses[seen.images], seen.Ts_camera_target, config)
     counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
     return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}
+
+
+def _refuse_ignored(arguments: Namespace) -> None:
+    """Refuse arguments that stops have no use for."""
+    names = ["topics", *(f"{stream}_{name}" for stream in STREAMS for name in ("topic", "fields"))]
+    if len(arguments.paths) == 1:
+        names += [*FILE_OPTIONS]
+        names += [f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS]
+    for name in names:
+        if getattr(arguments, name, None):
+            raise ConfigError(f"--{flag(name)} has no meaning for stops; leave it out")
+
+
+def _measuring(config: CalibratorConfig, streams: Mapping[str, Trajectory]) -> CalibratorConfig:
+    """The options with what the files measure, where the user has not said it."""
+    for stream, trajectory in streams.items():
+        name = f"{stream}_measures"
+        if trajectory.measures not in ("poses", "rotations"):
+            raise ConfigError(
+                f"stops need poses or rotations; those of the {stream} are {trajectory.measures}"
+            )
+        if name not in config.given or getattr(config, name) == "auto":
+            measures: Options = {name: trajectory.measures}
+            config = replace(config, **measures)
+    return config

@@ -1,38 +1,94 @@
-"""From stops of an arm to a calibration: ``A X = Z B`` solved, judged, and named by its frames."""
+"""From stops of an arm to a calibration: ``A X = Z B`` checked, solved, judged, and named by its
+frames.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import combined
+from hand_eye_calib.assessment.covariance import UNKNOWN_SIGMAS, combined
 from hand_eye_calib.assessment.prior import fuse
-from hand_eye_calib.checks.findings import finding
+from hand_eye_calib.checks.findings import Finding, finding
+from hand_eye_calib.checks.stops import (
+    GivenStops,
+    Mistakes,
+    examine,
+    scale_finding,
+    turns_about_two_axes,
+)
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import calibration_of
+from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import pose_stack
+from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.records import Finding, Residuals
-from hand_eye_calib.solvers.robot_world import RobotWorld, Stops, solve
+from hand_eye_calib.results.records import Residuals, gravest_first
+from hand_eye_calib.solvers.robot_world import MIN_STOPS, RobotWorld, Stops, solve
 
-# Poses of one sensor are taken for inverse if so the errors are smaller by this factor.
-_CLEARLY = 3.0
+# Options that mean something for stops; those of groups by the beginnings of their names.
+_OBEYED = {
+    "min_pairs",
+    "parent_frame",
+    "child_frame",
+    "scale",
+    "parent_scale",
+    *(f"{stream}_{name}" for stream in ("parent", "child") for name in ("invert", "quaternion")),
+    *(f"{stream}_{name}" for stream in ("parent", "child") for name in ("measures", "kind")),
+}
+_OBEYED_GROUPS = ("prior_", "target_")
+
+# A scale is used, or contradicts, if it is so many of its standard deviations and this share off.
+_SCALE_SIGMAS = 3.0
+_SCALE_SHARE = 0.01
+
+# Scales beyond this factor are no size of a target.
+_WRONG_SCALE = 10.0
+
+# Steps to the scale; a step below this share of its standard deviation ends them.
+_SCALE_ROUNDS = 10
+_SMALL_STEP = 0.02
+
+# What is on a hand is nearer to it than this (m), or than twice the way from the base to what is
+# fixed there.
+_ON_HAND_M = 0.3
+_NEARER = 0.5
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A fit with the stops, the options and the findings that lead to it."""
+
+    fit: RobotWorld
+    stops: Stops
+    is_inverse: bool
+    config: CalibratorConfig
+    scale: float
+    scale_sigma: float
+    findings: tuple[Finding, ...]
+    warnings: tuple[str, ...]
 
 
 def calibrate_stops(
-    Ts_world_parent: FloatArray,
-    Ts_world_child: FloatArray,
+    Ts_world_parent: Any,
+    Ts_world_child: Any,
     config: CalibratorConfig | None = None,
 ) -> Calibration:
     """Solve and assess stops, which are poses without an order.
 
     Parameters
     ----------
-    Ts_world_parent, Ts_world_child : (N, 4, 4) arrays
+    Ts_world_parent, Ts_world_child : array-likes
         Poses of both sensors, each in its own world: of a hand in the base of a robot, and of the
-        camera in the hand in the frame of a target.
+        camera in the hand in the frame of a target. Matrices (N, 4, 4), rows (N, 7) of x, y, z, qx,
+        qy, qz, qw, or a pair (R, t) of rotations (N, 3, 3) or rotation vectors (N, 3) and
+        translations (N, 3).
     config : CalibratorConfig, optional
-        Its priors, targets and names of frames count.
+        Conventions, units, scale, priors, targets and names of frames. Other options raise if they
+        are set.
 
     Returns
     -------
@@ -43,6 +99,10 @@ def calibrate_stops(
     ------
     NotEnoughDataError
         If there are fewer than three stops.
+    InputError
+        If the poses are none, or not as many on both sides.
+    ConfigError
+        For an option that has no meaning for stops.
 
     Examples
     --------
@@ -50,18 +110,21 @@ def calibrate_stops(
     >>> hec.calibrate_stops(hand, camera.poses).T_world_world.shape
     (4, 4)
     """
-    config = config or CalibratorConfig()
-    stops = Stops.of_one(Ts_world_parent, Ts_world_child)
-    fit, other = solve(stops), solve(Stops.of_one(Ts_world_parent, se3.inverse(Ts_world_child)))
-    is_smaller = max(other.level_m / fit.level_m, other.level_rad / fit.level_rad) < 1.0 / _CLEARLY
-    findings = [finding("inverse", "child")] if is_smaller and other.converged else []
-    frames = ["parent", "child", "parent_world", "child_world"]
-    return _assessed(fit, stops, config, frames, *findings)
+    config = _usable(config)
+    given = _given(Ts_world_parent, Ts_world_child, config, ("parent", "child"))
+    solved = _solved(given, config)
+    if not {"parent_invert", "child_invert"} & config.given:
+        both = (
+            "read as poses of both sensors in their worlds; if both hold inverse poses, which fit "
+            "as well, give parent_invert poses and child_invert poses"
+        )
+        solved = replace(solved, warnings=(*solved.warnings, both))
+    return _assessed(solved, ["parent", "child", "parent_world", "child_world"])
 
 
 def calibrate_arm(
-    robot: FloatArray,
-    tracking: FloatArray,
+    robot: Any,
+    tracking: Any,
     config: CalibratorConfig | None = None,
     names: Mapping[str, str] | None = None,
 ) -> Calibration:
@@ -71,11 +134,14 @@ def calibrate_arm(
 
     Parameters
     ----------
-    robot, tracking : (N, 4, 4) arrays
-        Transforms between base and hand, and between camera and target. For a camera in the hand
-        ``robot`` is the pose of the hand in the base (or the inverse for a camera beside it), and
-        ``tracking`` the pose of the target in the camera, as MoveIt and easy_handeye2 have them.
+    robot, tracking : array-likes
+        Poses of the hand in the base (parent), and of the target in the camera (child), as MoveIt
+        and easy_handeye2 have them. Matrices (N, 4, 4), rows (N, 7) of x, y, z, qx, qy, qz, qw, or
+        a pair (R, t) as ``cv2.calibrateHandEye`` takes them: rotations (N, 3, 3) or rotation
+        vectors (N, 3), and translations (N, 3).
     config : CalibratorConfig, optional
+        Conventions, units, scale, priors, targets and names of frames. Other options raise if they
+        are set.
     names : mapping of str to str, optional
         Names of the frames base, hand, camera, target.
 
@@ -85,29 +151,278 @@ def calibrate_arm(
         The camera in the hand, and the target in the base; or the camera in the base, and the
         target in the hand.
 
+    Raises
+    ------
+    NotEnoughDataError
+        If there are fewer than three stops.
+    InputError
+        If the poses are none, or not as many on both sides.
+    ConfigError
+        For an option that has no meaning for stops.
+
     Examples
     --------
     >>> samples = hec.read_arm_samples("samples.yaml")
     >>> hec.calibrate_arm(samples.robot, samples.tracking).n_poses
     40
     """
+    if not isinstance(names, Mapping | None):
+        raise InputError(
+            "calibrate_arm takes robot and tracking; give OpenCV's arrays as two pairs: "
+            "calibrate_arm((R_gripper2base, t_gripper2base), (R_target2cam, t_target2cam))"
+        )
+    config = _usable(config)
     named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
-    Ts_target_camera = se3.inverse(tracking)
-    fits = [
-        (solve(stops := Stops.of_one(poses, Ts_target_camera)), stops, parent, world)
-        for poses, parent, world in ((robot, "hand", "base"), (se3.inverse(robot), "base", "hand"))
-    ]
-    fit, stops, parent, world = min(fits, key=lambda each: each[0].objective)
-    frames = [named[each] for each in (parent, "camera", world, "target")]
-    return _assessed(fit, stops, config or CalibratorConfig(), frames)
+    given = _given(robot, tracking, config, ("robot", "tracking"), is_arm=True)
+    solved = _solved(given, config)
+    parent, world = ("base", "hand") if solved.is_inverse else ("hand", "base")
+    is_unusable = any(found.makes_unusable for found in solved.findings)
+    if not is_unusable and not {"parent_invert", "child_invert"} <= config.given:
+        doubts, warnings = _reading(solved, named)
+        findings = gravest_first((*solved.findings, *doubts))
+        solved = replace(solved, findings=findings, warnings=(*solved.warnings, *warnings))
+    return _assessed(solved, [named[name] for name in (parent, "camera", world, "target")])
 
 
-def _assessed(
-    fit: RobotWorld, stops: Stops, config: CalibratorConfig, frames: list[str], *findings: Finding
-) -> Calibration:
+# ------------------------------------------------------------------ what is given
+
+
+def _usable(config: CalibratorConfig | None) -> CalibratorConfig:
+    """The options, of which those that mean nothing for stops may not be set."""
+    if not isinstance(config, CalibratorConfig | None):
+        raise InputError(
+            f"the options are a CalibratorConfig; found {type(config).__name__}. Give OpenCV's "
+            "arrays as two pairs: (R_gripper2base, t_gripper2base), (R_target2cam, t_target2cam)"
+        )
+    config = config or CalibratorConfig()
+    for name, field in CalibratorConfig.__dataclass_fields__.items():
+        is_obeyed = name in _OBEYED or name.startswith(_OBEYED_GROUPS)
+        if name in config.given and not is_obeyed and getattr(config, name) != field.default:
+            value = getattr(config, name)
+            raise ConfigError(
+                f"{option_name(field)} {value} has no meaning for stops, which have no order and "
+                "one solver; leave it out"
+            )
+    if config.measured not in ("poses", "rotations"):
+        raise ConfigError(f"stops need poses or rotations of both sides, not {config.measured}")
+    return config
+
+
+def _given(
+    parent: Any,
+    child: Any,
+    config: CalibratorConfig,
+    sides: tuple[str, str],
+    is_arm: bool = False,
+) -> GivenStops:
+    """Both sides as checked stacks of poses."""
+    poses = [pose_stack(values, side) for values, side in zip((parent, child), sides, strict=True)]
+    counts = [len(Ts) for Ts in poses]
+    if counts[0] != counts[1]:
+        raise InputError(
+            f"{counts[0]} poses of {sides[0]}, {counts[1]} of {sides[1]}: each stop needs one of "
+            "both"
+        )
+    least = config.min_pairs if "min_pairs" in config.given else MIN_STOPS
+    if counts[0] < least:
+        raise NotEnoughDataError(
+            f"{counts[0]} stops are too few: at least {least}, with rotations about two axes, are "
+            "necessary; 15 or more are better"
+        )
+    has_positions = config.measured == "poses"
+    if not has_positions:
+        zeros = np.zeros((counts[0], 3))
+        poses = [se3.from_rotation_translation(Ts[:, :3, :3], zeros) for Ts in poses]
+    return GivenStops(poses[0], poses[1], is_arm, has_positions)
+
+
+def _put_right(given: GivenStops, config: CalibratorConfig) -> GivenStops:
+    """The poses in the usual convention, in metres, from that of the options."""
+    scale = 1.0 if isinstance(config.scale, str) else config.scale
+    parent = se3.put_right(given.parent, config.parent_invert, config.parent_quaternion)
+    child = se3.put_right(given.child, config.child_invert, config.child_quaternion)
+    return replace(given, parent=_scaled(parent, config.parent_scale), child=_scaled(child, scale))
+
+
+def _scaled(Ts: FloatArray, factor: float) -> FloatArray:
+    return se3.from_rotation_translation(Ts[:, :3, :3], factor * Ts[:, :3, 3])
+
+
+# ------------------------------------------------------------------ the solve
+
+
+def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
+    """Check the stops, repair what is certain, solve, and estimate the scale if it matters."""
+    stops = _put_right(given, config)
+    examination = examine(stops)
+    findings = [_as_set(found, config) for found in examination.findings]
+    settled = {found.code for found in examination.repairs if {*found.options} & config.given}
+    repairs = []
+    for repair in examination.repairs:
+        if repair.code in settled:
+            findings.append(_as_set(repair, config))
+        else:
+            repairs.append(repair)
+    warnings = []
+    for repair in repairs:
+        options = _composed(repair, config)
+        told = ", ".join(f"{name} {value}" for name, value in options.items())
+        undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
+        warnings.append(f"repaired: {repair.what}. Solved with {told} (undo with {undo})")
+        config = replace(config, **options)
+    stops = _put_right(given, config) if repairs else stops
+    # The rough scale is that of lengths whose units are put right.
+    scale = None if settled else examination.scale
+    return _with_scale(stops, config, scale, findings, warnings)
+
+
+def _composed(repair: Finding, config: CalibratorConfig) -> dict[str, Any]:
+    """The options of a repair; factors on top of those that are set."""
+    options = dict(repair.options)
+    if "parent_scale" in options:
+        options["parent_scale"] = float(options["parent_scale"]) * config.parent_scale
+    return options
+
+
+def _as_set(found: Finding, config: CalibratorConfig) -> Finding:
+    """A finding whose options go on top of those that the user has set."""
+    options: dict[str, float | str] = {}
+    for name, value in found.options.items():
+        current = getattr(config, name)
+        is_undone = current == value or {current, value} == {"wxyz", "yzwx"}
+        if is_undone:
+            # What was put right already, and needs it again or the contrary, was right before.
+            options[name] = getattr(CalibratorConfig, name)
+        elif isinstance(value, float) and isinstance(current, float):
+            options[name] = value * current
+        else:
+            options[name] = value
+    return replace(found, options=options)
+
+
+def _with_scale(
+    given: GivenStops,
+    config: CalibratorConfig,
+    rough_scale: float | None,
+    findings: list[Finding],
+    warnings: list[str],
+) -> _Solved:
+    """Solve with the scale that the options ask for, or that the stops clearly show."""
+    base = 1.0 if isinstance(config.scale, str) else config.scale
+    wants_scale = config.scale == "estimate"
+    if wants_scale and not given.has_positions:
+        raise ConfigError("scale estimate needs positions; both sides have rotations alone")
+    start = rough_scale or 1.0
+    fit, stops, is_inverse = _fit(given, start)
+    is_unusable = any(found.makes_unusable for found in findings)
+    scale, sigma = 1.0, 0.0
+    if wants_scale or (rough_scale and not is_unusable):
+        free = _with_free_scale(given, start, is_inverse)
+        scale, sigma = free[2], free[3]
+        is_clear = abs(scale - 1.0) > max(_SCALE_SIGMAS * sigma, _SCALE_SHARE)
+        is_given = "scale" in config.given and config.scale not in ("auto", "estimate")
+        is_size = 1.0 / _WRONG_SCALE < scale < _WRONG_SCALE
+        is_used = wants_scale or (is_clear and is_size and not is_given)
+        if is_clear and not wants_scale:
+            findings = [*findings, scale_finding(base * scale, base * sigma, is_used)]
+        if is_used:
+            fit, stops = free[0], free[1]
+            if not wants_scale:
+                undo = "none" if base == 1.0 else base
+                warnings = [
+                    *warnings,
+                    f"solved with the child's lengths times {base * scale:.4f} +/- "
+                    f"{base * sigma:.4f}; to take them as they are, give scale {undo}",
+                ]
+        else:
+            scale, sigma = 1.0, 0.0
+    if scale == 1.0 and start != 1.0:
+        fit, stops, is_inverse = _fit(given, 1.0)
+    if given.has_positions and not turns_about_two_axes(given.parent):
+        findings = [*findings, finding("turning_about_one_axis")]
+    return _Solved(
+        fit=fit,
+        stops=stops,
+        is_inverse=is_inverse,
+        config=config,
+        scale=base * scale,
+        scale_sigma=base * sigma,
+        findings=gravest_first(findings),
+        warnings=tuple(warnings),
+    )
+
+
+def _fit(given: GivenStops, scale: float) -> tuple[RobotWorld, Stops, bool]:
+    """The likelier solution of both ways round, if both are possible."""
+    fits = []
+    for is_inverse in (False, True) if given.is_arm else (False,):
+        stops = _stops(given, scale, is_inverse)
+        fits.append((solve(stops), stops, is_inverse))
+    return min(fits, key=lambda fit: fit[0].objective)
+
+
+def _stops(given: GivenStops, scale: float, is_inverse: bool) -> Stops:
+    scaled = replace(given, child=_scaled(given.child, scale))
+    return Stops.of_one(*scaled.sides(Mistakes(is_inverse=is_inverse)))
+
+
+def _with_free_scale(
+    given: GivenStops, scale: float, is_inverse: bool
+) -> tuple[RobotWorld, Stops, float, float]:
+    """Solution, stops, scale and its standard deviation, with the scale as one more value."""
+    for _ in range(_SCALE_ROUNDS):
+        stops = _stops(given, scale, is_inverse)
+        fit = solve(stops, stretch=np.inf)
+        if not np.isfinite(fit.scale_sigma):
+            break
+        if abs(fit.scale_step) < _SMALL_STEP * fit.scale_sigma:
+            break
+        scale *= 1.0 + float(np.clip(fit.scale_step, -0.5, 1.0))
+    return fit, stops, scale, scale * fit.scale_sigma
+
+
+# ------------------------------------------------------------------ the result
+
+
+def _reading(solved: _Solved, named: Mapping[str, str]) -> tuple[list[Finding], list[str]]:
+    """Other readings of the samples that fit as well: a warning that says which was taken, and a
+    finding if the lengths speak for another one.
+    """
+    camera, target, hand, base = (named[name] for name in ("camera", "target", "hand", "base"))
+    on_parent_m = float(np.linalg.norm(solved.fit.Ts_parent_child[0][:3, 3]))
+    on_world_m = float(np.linalg.norm(solved.fit.Ts_world_world[0][:3, 3]))
+    if solved.is_inverse:
+        place = "beside the robot"
+        on_hand_m, on_base_m = on_world_m, on_parent_m
+        moving, fixed = target, camera
+    else:
+        place = "on the hand"
+        on_hand_m, on_base_m = on_parent_m, on_world_m
+        moving, fixed = camera, target
+    text = (
+        f"read as a camera {place}; if that is wrong, one side or both hold inverse poses: give "
+        "parent_invert poses (robot), child_invert poses (target), or both; or exchange both sides"
+    )
+    if not solved.fit.undetermined().size and solved.stops.Ts_world_child[:, :3, 3].any():
+        is_odd = on_hand_m > _ON_HAND_M and on_base_m < _NEARER * on_hand_m
+        if is_odd:
+            what = f"{moving} would be {on_hand_m:.2g} m from {hand}, {fixed} {on_base_m:.2g} m "
+            return [finding("reading", what=what + f"from {base}")], [text]
+    return [], [text]
+
+
+def _assessed(solved: _Solved, frames: list[str]) -> Calibration:
+    fit, stops, config = solved.fit, solved.stops, solved.config
     X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
     parent, child, parent_world, child_world = frames
-    fused = fuse(combined(X, fit.covariance[:6, :6], None, fit.undetermined()), config.prior())
+    covariance, of_Z, unknown = fit.covariance[:6, :6], fit.covariance[6:, 6:], fit.undetermined()
+    if config.measured == "rotations":
+        covariance, of_Z = _without_positions(covariance), _without_positions(of_Z)
+        of_rotation = unknown[3:, np.linalg.norm(unknown[3:], axis=0) > _NEARER]
+        unknown = np.zeros((6, 3 + of_rotation.shape[1]))
+        unknown[:3, :3] = np.eye(3)
+        unknown[3:, 3:] = of_rotation
+    fused = fuse(combined(X, covariance, None, unknown), config.prior())
     errors = se3.log(se3.inverse(Z @ stops.Ts_world_child) @ stops.Ts_world_parent @ X)
     rows = np.arange(len(errors))
     residuals = Residuals(
@@ -123,14 +438,25 @@ def _assessed(
         residuals,
         rows,
         config,
+        solved.warnings,
         T_method=X,
+        measured=config.measured,
         reference="stops",
         stamp_ns=0,
-        findings=findings,
+        findings=solved.findings,
+        scale=solved.scale,
+        scale_sigma=solved.scale_sigma,
         parent_frame=config.parent_frame or parent,
         child_frame=config.child_frame or child,
         T_world_world=Z,
-        cov_world_world=fit.covariance[6:, 6:],
+        cov_world_world=of_Z,
         parent_world_frame=parent_world,
         child_world_frame=child_world,
     )
+
+
+def _without_positions(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a transform whose translation is not known."""
+    without = np.diag(UNKNOWN_SIGMAS**2)
+    without[3:, 3:] = covariance[3:, 3:]
+    return without

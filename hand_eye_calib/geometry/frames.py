@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.errors import InputError, NoPoseError
+from hand_eye_calib.errors import InputError, NoPoseError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
 
 # A matrix whose rotation is further than this from one is none.
 _ROTATION_WITHIN = 1e-2
+
+# The last row of a matrix is 0 0 0 1 within this.
+LAST_ROW_WITHIN = 1e-6
 
 # Edges that are listed in a message.
 _MOST_LISTED = 50
@@ -74,7 +77,7 @@ def pose_of(*values: Any) -> FloatArray:
     if not np.isfinite(flat).all():
         raise InputError("a number is not finite")
     if sizes in ((16,), (12,)):
-        T[:3] = flat[:12].reshape(3, 4)
+        T.flat[: len(flat)] = flat
     elif sizes == (7,):
         T = checked_pose(flat[:3], flat[3:])
     elif sizes == (3, 4):
@@ -92,7 +95,110 @@ def pose_of(*values: Any) -> FloatArray:
     rotation = se3.nearest_rotation(T[:3, :3])
     if np.abs(rotation - T[:3, :3]).max() > _ROTATION_WITHIN:
         raise InputError("the rotation is not one")
+    if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > LAST_ROW_WITHIN:
+        raise InputError(wrong_last_row(T))
     return se3.from_rotation_translation(rotation, T[:3, 3])
+
+
+def pose_stack(values: Any, what: str) -> FloatArray:
+    """Poses (N, 4, 4) of many at once, checked.
+
+    Parameters
+    ----------
+    values : array-like
+        Matrices (N, 4, 4) or (N, 3, 4), rows (N, 7) of x, y, z, qx, qy, qz, qw, or a pair (R, t):
+        rotations (N, 3, 3) or rotation vectors (N, 3), rad, and translations (N, 3), m.
+    what : str
+        Name of the poses in messages.
+
+    Raises
+    ------
+    InputError
+        If a pose is none; the message names its row, counted from 1.
+    """
+    pair = _pair_of_stacks(values)
+    Ts = _joined(*pair, what) if pair else _one_stack(values, what)
+    rows = np.flatnonzero(~np.isfinite(Ts).all(axis=(1, 2)))
+    if len(rows):
+        raise InputError(f"{what}, row {rows[0] + 1}: a number is not finite")
+    _require_last_row(Ts, what)
+    rotations = se3.nearest_rotation(Ts[:, :3, :3])
+    off = np.abs(rotations - Ts[:, :3, :3]).max(axis=(1, 2), initial=0.0)
+    rows = np.flatnonzero(off > _ROTATION_WITHIN)
+    if len(rows):
+        raise InputError(f"{what}, row {rows[0] + 1}: the rotation is not one")
+    return se3.from_rotation_translation(rotations, Ts[:, :3, 3])
+
+
+def _numbers(values: Any) -> FloatArray | None:
+    """Values as an array; None if they are no numbers, or rows of different lengths."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        return None
+
+
+def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
+    """Rotations and translations, if the values are such a pair."""
+    if not isinstance(values, tuple | list) or len(values) != 2:
+        return None
+    first, second = (_numbers(value) for value in values)
+    if first is None or second is None or first.ndim < 2 or second.ndim < 2:
+        return None
+    if first.shape[1:] not in ((3, 3), (3,), (3, 1)) or second.shape[1:] not in ((3,), (3, 1)):
+        return None
+    return first, second
+
+
+def _joined(rotations: FloatArray, translations: FloatArray, what: str) -> FloatArray:
+    """Poses (N, 4, 4) of rotations or rotation vectors, and translations."""
+    if len(rotations) != len(translations):
+        raise InputError(
+            f"{what}: {len(rotations)} rotations, {len(translations)} translations; each pose "
+            "needs both"
+        )
+    if rotations.shape[1:] != (3, 3):
+        rotations = se3.rotation_exp(rotations.reshape(-1, 3))
+    return se3.from_rotation_translation(rotations, translations.reshape(-1, 3))
+
+
+def _one_stack(values: Any, what: str) -> FloatArray:
+    """Poses (N, 4, 4) of matrices or rows."""
+    array = _numbers(values)
+    if array is not None and array.ndim == 2 and array.shape[1] == 7:
+        rows = enumerate(array.tolist(), 1)
+        stack = []
+        for number, row in rows:
+            with located(f"{what}, row {number}"):
+                stack.append(checked_pose(row[:3], row[3:]))
+        return np.reshape(stack, (-1, 4, 4))
+    if array is not None and array.shape[1:] == (3, 4):
+        return se3.from_rotation_translation(array[:, :, :3], array[:, :, 3])
+    if array is None or array.shape[1:] != (4, 4):
+        shape = "rows of different shapes" if array is None else f"an array {array.shape}"
+        raise InputError(
+            f"{what}: expected poses as (N, 4, 4), (N, 7) of x, y, z, qx, qy, qz, qw, or a pair of "
+            f"rotations (N, 3, 3) and translations (N, 3); found {shape}"
+        )
+    return array
+
+
+def _require_last_row(Ts: FloatArray, what: str) -> None:
+    """Check that the last row of matrices (N, 4, 4) is 0 0 0 1."""
+    last = np.array([0.0, 0.0, 0.0, 1.0])
+    wrong = np.abs(Ts[:, 3] - last).max(axis=1, initial=0.0) > LAST_ROW_WITHIN
+    if not wrong.any():
+        return
+    row = int(np.argmax(wrong))
+    raise InputError(f"{what}, row {row + 1}: {wrong_last_row(Ts[row])}")
+
+
+def wrong_last_row(T: FloatArray) -> str:
+    """Return what is wrong with a matrix (4, 4) whose last row is not 0 0 0 1."""
+    numbers = " ".join(f"{value:.4g}" for value in T[3])
+    is_transposed = np.allclose(T[:, 3], [0.0, 0.0, 0.0, 1.0], atol=LAST_ROW_WITHIN)
+    cause = ": the matrix is transposed, write it row by row" if is_transposed else ""
+    return f"the last row of the matrix is {numbers}, expected 0 0 0 1{cause}"
 
 
 def numbers_of(value: Any) -> list[float]:

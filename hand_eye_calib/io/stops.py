@@ -2,10 +2,11 @@
 
 Read are the samples of MoveIt's calibration (YAML of ``effector_wrt_world``,
 ``object_wrt_sensor``, or JSON of pairs of matrices), of easy_handeye and easy_handeye2, pairs
-``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV, and the stacks ``robot`` and ``tracking`` of an
-``.npz``.
+``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV, the stacks ``robot`` and ``tracking`` of an
+``.npz``, and the arguments of OpenCV's ``calibrateHandEye`` by their names, in any of these files.
 """
 
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import pose_of
+from hand_eye_calib.geometry.frames import pose_of, pose_stack
 from hand_eye_calib.io.yaml_files import read_yaml
 
 # Names of both poses of a sample, the robot's first.
@@ -33,8 +34,29 @@ _FRAMES = {
 
 _EXPECTED = (
     "samples of an arm: a list of effector_wrt_world and object_wrt_sensor (MoveIt), of robot and "
-    "tracking (easy_handeye2), of pairs of 4 x 4 matrices, or T1_0, T2_0, ... (OpenCV)"
+    "tracking (easy_handeye2), of pairs of 4 x 4 matrices, T1_0, T2_0, ... (OpenCV), or "
+    "R_gripper2base, t_gripper2base, R_target2cam, t_target2cam (OpenCV)"
 )
+
+# Names of the arguments of OpenCV's solvers: the quantity, and the frames it leads from and to.
+_OF_OPENCV = re.compile(r"([a-z]+)_([a-z]+)2([a-z]+)")
+_QUANTITIES = {
+    "r": "rotation",
+    "rvec": "rotation",
+    "rvecs": "rotation",
+    "t": "translation",
+    "tvec": "translation",
+    "tvecs": "translation",
+}
+_OPENCV_FRAMES = {
+    **dict.fromkeys(("gripper", "hand", "ee", "eef", "flange", "tool", "tcp"), "hand"),
+    **dict.fromkeys(("base", "robot"), "base"),
+    **dict.fromkeys(("target", "world", "board", "marker", "tag", "object", "obj"), "target"),
+    **dict.fromkeys(("cam", "camera", "sensor"), "camera"),
+}
+
+# Longest name that is compared with those of OpenCV.
+_LONGEST_NAME = 40
 
 
 @dataclass(frozen=True)
@@ -56,12 +78,25 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     InputError
         If the file cannot be read or has no samples; one line that names the file.
 
+    Notes
+    -----
+    Arguments of OpenCV are read by their names, also those of base2gripper and cam2target. For a
+    camera beside the robot OpenCV takes the poses of the base in the gripper under the name
+    gripper2base: give ``parent_invert="poses"`` then.
+
     Examples
     --------
     >>> hec.read_arm_samples("samples.yaml").robot.shape
     (40, 4, 4)
     """
-    document: Any = _stacks(path) if Path(path).suffix == ".npz" else read_yaml(path, _EXPECTED)
+    is_npz = Path(path).suffix == ".npz"
+    document: Any = _arrays(path) if is_npz else read_yaml(path, _EXPECTED)
+    if isinstance(document, Mapping):
+        with located(path):
+            if samples := _of_opencv(document):
+                return samples
+    if is_npz:
+        document = _rows_of_stacks(path, document)
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
@@ -83,14 +118,64 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
 
 
-def _stacks(path: str | Path) -> list[dict[str, FloatArray]]:
-    """The samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
+def _arrays(path: str | Path) -> dict[str, FloatArray]:
+    """The arrays of an .npz by their names."""
     try:
         with np.load(path, allow_pickle=False) as stacks:
-            names, poses = list(stacks), [stacks[name] for name in stacks]
-        return [dict(zip(names, sample, strict=True)) for sample in zip(*poses, strict=True)]
+            return {name: stacks[name] for name in stacks}
     except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
         raise InputError(f"cannot read {path}: {error}") from None
+
+
+def _rows_of_stacks(
+    path: str | Path, stacks: Mapping[str, FloatArray]
+) -> list[dict[str, FloatArray]]:
+    """The samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
+    names = next((names for names in _NAMES if {*names} <= stacks.keys()), None)
+    if names is None or any(stacks[name].ndim < 2 for name in names):
+        raise InputError(f"{path}: expected {_EXPECTED}; found {', '.join(stacks) or 'nothing'}")
+    robot, tracking = (stacks[name] for name in names)
+    if len(robot) != len(tracking):
+        raise InputError(
+            f"{path}: {len(robot)} poses of the robot, {len(tracking)} of the target: each stop "
+            "needs one of both"
+        )
+    pairs = zip(robot, tracking, strict=True)
+    return [dict(zip(names, pair, strict=True)) for pair in pairs]
+
+
+def _of_opencv(document: Mapping[str, Any]) -> ArmSamples | None:
+    """The samples of OpenCV's arguments, such as R_gripper2base; None if there are none."""
+    parts: dict[tuple[str, str], dict[str, Any]] = {}
+    for name, value in document.items():
+        match = _OF_OPENCV.fullmatch(str(name)[:_LONGEST_NAME].lower())
+        if match is None or match[1] not in _QUANTITIES:
+            continue
+        frames = _OPENCV_FRAMES.get(match[2], ""), _OPENCV_FRAMES.get(match[3], "")
+        parts.setdefault(frames, {})[_QUANTITIES[match[1]]] = value
+    robot = _joined(parts, "hand", "base")
+    tracking = _joined(parts, "target", "camera")
+    if robot is None or tracking is None:
+        return None
+    if len(robot) != len(tracking):
+        raise InputError(
+            f"{len(robot)} poses of the robot, {len(tracking)} of the target: each stop needs one "
+            "of both"
+        )
+    return ArmSamples(robot, tracking, {})
+
+
+def _joined(
+    parts: Mapping[tuple[str, str], Mapping[str, Any]], source: str, target: str
+) -> FloatArray | None:
+    """Poses (N, 4, 4) of one frame in another, of rotations and translations either way."""
+    for frames in ((source, target), (target, source)):
+        pair = parts.get(frames, {})
+        if "rotation" in pair and "translation" in pair:
+            rotation, translation = pair["rotation"], pair["translation"]
+            Ts = pose_stack((rotation, translation), f"{frames[0]} in {frames[1]}")
+            return Ts if frames == (source, target) else se3.inverse(Ts)
+    return None
 
 
 def _pair(sample: Any) -> Sequence[Any]:

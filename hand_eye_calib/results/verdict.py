@@ -203,9 +203,11 @@ def _nothing_known(result: Result) -> Iterator[_Found]:
     if all(axis.is_hidden for axis in _axes(result)):
         text = "nothing about the mounting can be determined from this motion"
         yield text, "record motion with rotations about all axes", (), {}
-    elif result.reference == "stops" and result.unobservable():
+    elif result.reference == "stops" and result.hidden:
         text, advice, axes, _ = next(_hidden(result))
-        text = text.replace("this motion", "these stops, which do not turn about two axes")
+        is_flat = any(finding.code == "one_axis" for finding in result.findings)
+        why = "do not turn about two axes" if is_flat else "turn too little for their errors"
+        text = text.replace("this motion", f"these stops, which {why}")
         yield text, f"turn the hand about at least two axes between them, or {advice}", axes, {}
 
 

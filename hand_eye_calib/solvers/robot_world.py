@@ -6,6 +6,7 @@ the base of a robot and a target, for instance (robot-world calibration; eye-to-
 carries the target).
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,7 +47,7 @@ _UNDETERMINED = 8.0
 _LASTING = np.array([(0.03, 1.0), (0.05, 0.1), *((0.03 * 4.0**k, 0.1) for k in range(6))])
 
 # Distances to a target are too long by this share: a usual one, of its size or the focal length.
-_STRETCH = 0.03
+STRETCH = 0.03
 
 # So many stops at once are looked at.
 _AT_ONCE = 300
@@ -107,6 +108,10 @@ class RobotWorld:
     objective : float
         Negative log likelihood.
     converged : bool
+    scale_step, scale_sigma : float
+        Share by which longer positions of the children would fit best, to first order, and its
+        standard deviation; infinite if the stops do not determine it. Of several sensors or
+        targets, those of the pair with most stops.
     """
 
     Ts_parent_child: FloatArray
@@ -118,6 +123,8 @@ class RobotWorld:
     level_rad: float
     objective: float
     converged: bool
+    scale_step: float = 0.0
+    scale_sigma: float = float("inf")
 
     def undetermined(self, child: int = 0) -> FloatArray:
         """Directions (6, k) of X, as right perturbations, that the stops do not determine."""
@@ -132,13 +139,16 @@ class RobotWorld:
         return directions[:, powers < _UNDETERMINED * self.level_rad**2]
 
 
-def solve(stops: Stops) -> RobotWorld:
+def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
     """The most likely X and Z.
 
     Parameters
     ----------
     stops : Stops
         At least three.
+    stretch : float
+        Standard deviation, as a share, of the scale of the children's lengths before the solve;
+        infinite if nothing is known of it. The covariance contains what it does.
 
     Raises
     ------
@@ -178,19 +188,34 @@ def solve(stops: Stops) -> RobotWorld:
         fits.append((replace(fit, weights=weights, objective=objective), in_world))
     best, in_world = min(fits, key=lambda each: each[0].objective)
     kept = best.weights > 0.0
-    return replace(best, covariance=_widened(stops[kept], best, in_world, alone[kept], views[kept]))
+    return _widened(stops[kept], best, in_world, alone[kept], views[kept], stretch)
+
+
+def closest_rotations(
+    R_a: FloatArray, R_b: FloatArray, weights: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations X and Z (3, 3) that bring ``R_a X`` and ``Z R_b`` closest, in closed form.
+
+    Parameters
+    ----------
+    R_a, R_b : (N, 3, 3) arrays
+    weights : (N,) array, optional
+        Weights of the stops.
+    """
+    weighted = R_a if weights is None else weights[:, None, None] * R_a
+    # The sum of tr(X' R_a' Z R_b), as a bilinear form of X and Z.
+    form = np.einsum("nji,nka->iajk", weighted, R_b).reshape(9, 9)
+    left, _, right = np.linalg.svd(form)
+    both = np.stack([left[:, 0].reshape(3, 3), right[0].reshape(3, 3)])
+    sign = -1.0 if np.linalg.det(both[0]) < 0 else 1.0
+    X, Z = se3.nearest_rotation(sign * both)
+    return X, Z
 
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
     """X and Z (4, 4) of one child and one world."""
     A, B = stops.Ts_world_parent, stops.Ts_world_child
-    # The sum of tr(R_X' R_A' R_Z R_B), as a bilinear form of R_X and R_Z.
-    form = np.einsum("nji,nka->iajk", A[:, :3, :3], B[:, :3, :3]).reshape(9, 9)
-    left, _, right = np.linalg.svd(form)
-    rotation_x, rotation_z = left[:, 0].reshape(3, 3), right[0].reshape(3, 3)
-    if np.linalg.det(rotation_x) < 0:
-        rotation_x, rotation_z = -rotation_x, -rotation_z
-    rotation_x, rotation_z = se3.nearest_rotation(np.stack([rotation_x, rotation_z]))
+    rotation_x, rotation_z = closest_rotations(A[:, :3, :3], B[:, :3, :3])
     columns = np.concatenate([A[:, :3, :3], -np.broadcast_to(np.eye(3), (len(A), 3, 3))], axis=2)
     values = B[:, :3, 3] @ rotation_z.T - A[:, :3, 3]
     translations = np.linalg.lstsq(columns.reshape(-1, 6), values.ravel(), rcond=1e-9)[0]
@@ -336,12 +361,20 @@ def _shares(kernels: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _widened(
-    stops: Stops, fit: RobotWorld, in_world: bool, alone: FloatArray, views: FloatArray
-) -> FloatArray:
-    """Covariance of a fit for time-correlated or recurring errors, and targets of another size."""
+    stops: Stops,
+    fit: RobotWorld,
+    in_world: bool,
+    alone: FloatArray,
+    views: FloatArray,
+    stretch: float,
+) -> RobotWorld:
+    """A fit with the covariance for time-correlated or recurring errors, and for targets of another
+    size.
+    """
     errors, jacobian = _linearise(stops, fit.Ts_parent_child, fit.Ts_world_world, in_world)
     T = stops.Ts_world_child if in_world else se3.inverse(stops.Ts_world_child)
-    longer = np.concatenate([T[:, :3, 3], np.zeros((len(T), 3))], axis=1)
+    sign = -1.0 if in_world else 1.0
+    longer = np.concatenate([sign * T[:, :3, 3], np.zeros((len(T), 3))], axis=1)
     rows = np.concatenate([jacobian, longer[..., None], errors[..., None]], axis=2)
     rows /= np.repeat([fit.level_m, fit.level_rad], 3)[:, None]
     told = rows * np.sqrt(fit.weights[fit.weights > 0.0])[:, None, None]
@@ -357,15 +390,24 @@ def _widened(
             more[np.ix_(columns, columns)] += np.einsum("kni,knj->ij", across, kernel @ across)
     more *= (_TAILS + 6.0) / (_TAILS + 8.0)
     larger = 1.0 + np.trace(more @ fit.covariance) / len(more)
+    step = 0.0
+    sigma = math.inf
     for own, columns in pairs:
         part = (np.sqrt(alone[own])[:, None, None] * told[own]).reshape(-1, 14)
         products = part.T @ part + 1e-12 * np.sum(part**2) * np.eye(14)
         of_one, of_errors = np.linalg.cholesky(products)[12:, 12]
-        known = of_one**2 / larger + _STRETCH**-2.0
+        # What keeps the matrix definite is no information about the scale.
+        is_known = of_one > 2e-6 * math.sqrt(float(np.sum(part**2)))
+        if len(own) >= len(most) and is_known:
+            step = -of_errors / of_one
+            sigma = math.sqrt(larger) / of_one
+        known = of_one**2 / larger + stretch**-2.0
         square = (of_one * of_errors / larger / known) ** 2 + 1.0 / known
         more[np.ix_(columns, columns)] += square * np.outer(products[:12, 12], products[:12, 12])
     few = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * len(more), 0.5)  # hardly know the levels
-    return few * (fit.covariance + fit.covariance @ more @ fit.covariance)
+    widened = few * (fit.covariance + fit.covariance @ more @ fit.covariance)
+    sigma *= math.sqrt(few)
+    return replace(fit, covariance=widened, scale_step=step, scale_sigma=sigma)
 
 
 def _variances(means: FloatArray, stops: Stops, n_values: int) -> FloatArray:

@@ -32,6 +32,7 @@ from hand_eye_calib.io.trajectory_files.table import (
     SCALAR_FIRST,
     UNNAMED,
     Table,
+    is_brief,
     seconds,
 )
 from hand_eye_calib.stats import median
@@ -217,6 +218,7 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
         if {"yaw", "heading"} & table.at.keys():
             return _from_angles(table, positions, convention)
         if ROTATION_VECTOR[0] in table.at:
+            _require_rotation_vectors(table)
             return se3.to_quat_xyzw(se3.rotation_exp(_in_si(table, ROTATION_VECTOR, "angle")))
         return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
     quats = table.values(names)
@@ -252,6 +254,23 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
             "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
         )
     return ways[usual]
+
+
+def _require_rotation_vectors(table: Table) -> None:
+    """Refuse columns rx, ry, rz that are angles in degrees: nothing names their order."""
+    vectors = table.values(ROTATION_VECTOR)
+    if not is_brief(table.names[table.at[ROTATION_VECTOR[0]]]):
+        return
+    lengths = np.linalg.norm(vectors, axis=1)
+    table.refuse(
+        lengths > _KINDS["angle"][1],
+        lambda row: (
+            f"rx, ry, rz are {lengths[row]:.4g} long, more than a turn: angles in degrees? Name "
+            "the columns roll_deg, pitch_deg, yaw_deg (about the fixed axes x, y, z), or "
+            "rotvec_x_deg, rotvec_y_deg, rotvec_z_deg"
+        ),
+    )
+    table.guess("rx, ry, rz read as a rotation vector, as Universal Robots have it")
 
 
 def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:

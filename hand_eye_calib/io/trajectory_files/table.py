@@ -77,7 +77,9 @@ _ALIASES = {
         for axis in "xyzw"
     },
     **{name: f"{name} quat_{name}" for name in (*SCALAR_FIRST, *UNNAMED)},
-    **{name: f"{name} actual_tcp_pose_{k}" for k, name in enumerate(ROTATION_VECTOR, 3)},
+    **{
+        name: f"{name} actual_tcp_pose_{k} r{name[-1]}" for k, name in enumerate(ROTATION_VECTOR, 3)
+    },
     **{name: f"{name} t{int(name[1:]) - 11:02d}" for name in MATRIX},
 }
 # Names, after each other, of some part of an orientation or of a position, known or not.
@@ -219,9 +221,19 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
         ends = tuple(f"_{alias}" for alias in known if "_" in alias)
         columns = [at for at, name in enumerate(plain) if name in known]
         columns = columns or [at for at, name in enumerate(plain) if name.endswith(ends)]
+        if wanted in ROTATION_VECTOR:
+            # In degrees they are rather angles, in an order that nothing names.
+            columns = [at for at in columns if not (is_brief(names[at]) and units[at] == "deg")]
         if columns:
             found[wanted] = columns
     return found, [*units]
+
+
+def is_brief(name: str) -> bool:
+    """Whether a column is called rx, ry or rz: a rotation vector of Universal Robots, or angles of
+    other robots.
+    """
+    return _split(name)[0] in ("rx", "ry", "rz")
 
 
 def _measured(

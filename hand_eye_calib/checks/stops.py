@@ -1,0 +1,572 @@
+"""Checks of stops before they are solved: rows, rotations, conventions, units, and frozen poses.
+
+Between any two stops both sensors rotate through the same angle, whatever the extrinsic is. Rows
+that do not belong together break this, and so do Euler angles that were read as rotation vectors.
+Quaternions in another order do not: reading w x y z as x y z w turns a rotation into an inverse
+one, seen from other axes. Only the positions contradict. So each usual mistake is undone in turn,
+and a robust fit of ``A X = Z B`` shows whether rotations and positions agree without it.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.checks.findings import CONVENTIONS, Finding, Severity, conventions, finding
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.solvers.robot_world import closest_rotations
+from hand_eye_calib.stats import median, medians
+
+# Fewest stops that can contradict: four have twelve coordinates for seven unknown lengths.
+_FEWEST = 6
+
+# Most stops that are compared with each other: pairs are their square.
+_MOST = 150
+
+# Shares of the rotation or of the positions that stay unexplained. Real arms leave up to 0.08
+# (CamOdoCal's example), sides that do not belong together 0.5 and more.
+_EXPLAINED = 0.12
+_HOLDS = 0.3
+_UNRELATED = 0.5
+
+# A mistake is named if without it so many times less stays unexplained.
+_DECISIVE = 3.0
+
+# Mistakes that leave about as much unexplained, and are as simple, cannot be told apart.
+_ABOUT_EQUAL = 1.5
+
+# A hand or a target that rotates less than this between stops (rad) hardly rotates: 3 deg.
+_ROTATES = 0.05
+
+# A pose that is repeated differs from the one before by less than this (m, rad): by rounding.
+_REPEATED = 1e-6
+
+# Largest shift of rows that is looked for.
+_MOST_SHIFTED = 3
+
+# A stop agrees with the others if its angles to a third of them do, within three times their usual
+# difference; a block that was shifted is named if it has at least this share of the stops.
+_AGREEING = 0.3
+_BLOCK = 0.15
+
+# Rounds of weights of a fit.
+_ROUNDS = 8
+
+# Positions spread over more than this (m) are not those of an arm: cm beyond it, then mm.
+_WIDEST_M = 10.0
+_WIDEST_CM = 60.0
+
+# A factor between the lengths of both sides is a unit if it is within this share of it.
+_UNIT_WITHIN = 0.03
+
+_CENTIMETRE = 0.01
+_MILLIMETRE = 0.001
+_UNITS = {_CENTIMETRE: "centimetres", _MILLIMETRE: "millimetres"}
+
+
+@dataclass(frozen=True)
+class GivenStops:
+    """Poses of both sensors at N stops as they were given, before conventions are put right.
+
+    Attributes
+    ----------
+    parent, child : (N, 4, 4) arrays
+        Poses of the parent sensor in its world and of the child sensor in its own. Of an arm:
+        poses of the hand in the base, and of the target in the camera.
+    is_arm : bool
+        The camera may be on the hand or beside the robot.
+    has_positions : bool
+        False if only the rotations are known.
+    """
+
+    parent: FloatArray
+    child: FloatArray
+    is_arm: bool = False
+    has_positions: bool = True
+
+    def __len__(self) -> int:
+        return len(self.parent)
+
+    def __getitem__(self, rows: IntArray) -> "GivenStops":
+        parent, child = self.parent[rows], self.child[rows]
+        return GivenStops(parent, child, self.is_arm, self.has_positions)
+
+    def sides(self, mistakes: "Mistakes") -> tuple[FloatArray, FloatArray]:
+        """A and B (N, 4, 4) of A X = Z B without these mistakes."""
+        A = _put_right(self.parent, mistakes.parent)
+        B = _put_right(self.child, mistakes.child)
+        if self.is_arm:
+            B = se3.inverse(B)
+        if mistakes.is_inverse:
+            A = se3.inverse(A)
+        return A, B
+
+
+@dataclass(frozen=True)
+class Mistakes:
+    """Codes of the conventions that are wrong, empty for none; ``is_inverse`` if one side is
+    inverse: of an arm, the camera is beside the robot.
+    """
+
+    parent: str = ""
+    child: str = ""
+    is_inverse: bool = False
+
+    @property
+    def complexity(self) -> int:
+        """Number of different mistakes: one exporter often makes the same on both sides."""
+        return len({self.parent, self.child} - {""})
+
+
+@dataclass(frozen=True)
+class RoughFit:
+    """Robust closed-form fit of ``A X = Z B``.
+
+    Attributes
+    ----------
+    turning, placing : float
+        Shares of the rotations and of the positions that stay unexplained.
+    scale : float or None
+        Factor of the child's lengths; None if the stops do not determine it.
+    """
+
+    turning: float
+    placing: float
+    scale: float | None
+
+    @property
+    def unexplained(self) -> float:
+        """The larger one of both shares."""
+        return max(self.turning, self.placing)
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What stops look like before the solve.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        Errors that no option repairs for certain.
+    repairs : tuple of Finding
+        Mistakes that their options repair.
+    scale : float or None
+        Rough factor of the child's lengths after the repairs; None if it is not determined.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    repairs: tuple[Finding, ...] = ()
+    scale: float | None = None
+
+
+def examine(given: GivenStops) -> Examination:
+    """Look for usual mistakes in stops.
+
+    Parameters
+    ----------
+    given : GivenStops
+        With the options of the user applied.
+    """
+    if len(given) < _FEWEST:
+        return Examination()
+    findings = [*_frozen(given)]
+    if all(each.evidence["share"] < 1.0 for each in findings):
+        findings += _rows(given)
+    if not findings:
+        findings += _angles(given)
+    if findings:
+        return Examination(tuple(findings))
+    few = given[_spread_over(len(given))]
+    if not turns_about_two_axes(given.parent):
+        # The rotations do not determine where the positions belong.
+        return _of_lengths(few, None, [], [])
+    mistakes, fit, rivals = _explained(few)
+    if fit.unexplained >= _HOLDS:
+        return Examination(tuple(_disagreeing(few, fit)))
+    findings, repairs = _named(given, mistakes, rivals)
+    return _of_lengths(few, fit.scale, findings, repairs)
+
+
+def _of_lengths(
+    few: GivenStops, scale: float | None, findings: list[Finding], repairs: list[Finding]
+) -> Examination:
+    """The examination with what there is to say of units."""
+    if few.has_positions:
+        lengths, scale = _units(few, scale)
+        # Stops of two vehicles may be far apart; an arm is not that large.
+        is_sure = few.is_arm or (len(lengths) == 1 and scale is not None)
+        (repairs if is_sure else findings).extend(lengths)
+    return Examination(tuple(findings), tuple(repairs), scale)
+
+
+# ------------------------------------------------------------------ rows and rotations
+
+
+def angles_between(Ts: FloatArray) -> FloatArray:
+    """Angles (N, N), rad, of the rotations between stops."""
+    quats = se3.to_quat_xyzw(Ts)
+    return np.asarray(2.0 * np.arccos(np.clip(np.abs(quats @ quats.T), 0.0, 1.0)))
+
+
+def turns_about_two_axes(Ts: FloatArray) -> bool:
+    """Whether poses (N, 4, 4) differ by rotations about two axes at least, of 3 deg and more."""
+    rotations = Ts[:, :3, :3]
+    central = rotations[int(np.argmin(medians(angles_between(Ts))))]
+    vectors = se3.rotation_log(central.T @ rotations)
+    sizes = np.linalg.svd(vectors, compute_uv=False) / np.sqrt(len(vectors))
+    return bool(sizes[1] > _ROTATES)
+
+
+def _spread_over(n: int) -> IntArray:
+    """Rows of at most 150 of n stops, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(np.int64))
+
+
+def _upper(angles: FloatArray) -> FloatArray:
+    return np.asarray(angles[np.triu_indices(len(angles), 1)])
+
+
+def _frozen(given: GivenStops) -> Iterator[Finding]:
+    """A side that repeats its pose at stops between which the other side rotates."""
+    sides = {"parent": given.parent, "child": given.child}
+    for stream, other in (("parent", "child"), ("child", "parent")):
+        steps = se3.log(se3.inverse(sides[stream][:-1]) @ sides[stream][1:])
+        is_repeated = np.abs(steps).max(axis=1) < _REPEATED
+        others = sides[other]
+        turned = se3.rotation_angle(np.swapaxes(others[:-1, :3, :3], 1, 2) @ others[1:, :3, :3])
+        share = float(np.mean(is_repeated & (turned > _ROTATES)))
+        if share > 0.0:
+            everywhere = is_repeated.all() and median(turned) > _ROTATES
+            share = 1.0 if everywhere else min(share, 0.99)
+            yield finding("frozen_stops", stream, share=share)
+
+
+def _rows(given: GivenStops) -> Iterator[Finding]:
+    """Rows that belong together only if those of one side are shifted, or in another order."""
+    n = min(len(given), _MOST)
+    of_parent, of_child = angles_between(given.parent[:n]), angles_between(given.child[:n])
+    apart = median(np.abs(_upper(of_parent - of_child)))
+    best, least = "", apart / _DECISIVE
+    for text, rows in _orders(n):
+        left = median(
+            np.abs(_upper(of_parent[np.ix_(rows[0], rows[0])] - of_child[np.ix_(rows[1], rows[1])]))
+        )
+        if left < least:
+            best, least = text, left
+    # Rows of poses that hardly differ agree anyhow.
+    if best and apart > _ROTATES / 2:
+        yield finding("rows", text=best)
+        return
+    yield from _shifted_block(of_parent, of_child)
+
+
+def _orders(n: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
+    """Usual orders of rows: what is said of them, and the rows of both sides that pair up."""
+    rows = np.arange(n)
+    for shift in range(1, _MOST_SHIFTED + 1):
+        if n - shift < _FEWEST:
+            continue
+        times = f"{shift} row{'s' if shift > 1 else ''}"
+        later, earlier = rows[shift:], rows[:-shift]
+        yield f"if the child's are moved down by {times}", (later, earlier)
+        yield f"if the parent's are moved down by {times}", (earlier, later)
+    yield "if those of one side are read from the last to the first", (rows, rows[::-1])
+    for first in (0, 1):
+        names = np.argsort([str(row + first) for row in rows], kind="stable")
+        if np.any(names != rows):
+            text = f"if one side was sorted by names {first}, {first + 1}, 10, 11, ..."
+            yield text + " and the other by numbers (child)", (names, rows)
+            yield text + " and the other by numbers (parent)", (rows, names)
+
+
+def _shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterator[Finding]:
+    """Rows that agree from some row on only if one side is shifted: a row is missing there."""
+    n = len(of_parent)
+    usual = _agreeing(of_parent, of_child)
+    for shift in (1, -1):
+        later, earlier = (
+            slice(max(shift, 0), n + min(shift, 0)),
+            slice(max(-shift, 0), n - max(shift, 0)),
+        )
+        agreeing = _agreeing(of_parent[later, later], of_child[earlier, earlier])
+        lost = agreeing & ~usual[later] & ~usual[earlier]
+        if lost.mean() > _BLOCK:
+            first = int(np.flatnonzero(lost)[0]) + 1
+            yield finding("rows", text=f"from row {first} on if one side is moved by one row")
+            return
+
+
+def _agreeing(of_parent: FloatArray, of_child: FloatArray) -> BoolArray:
+    """Whether (N,) each stop rotates as far from a third of the others on both sides."""
+    apart = np.abs(of_parent - of_child)
+    within = 3.0 * float(np.quantile(_upper(apart), 0.2)) + 1e-9
+    return np.asarray(np.mean(apart < min(within, _ROTATES), axis=1) > _AGREEING)
+
+
+# ------------------------------------------------------------------ angles read as others
+
+_Triple: TypeAlias = Callable[[FloatArray], FloatArray]
+
+
+def _moving_axes(angles: FloatArray) -> FloatArray:
+    """Rotations of angles about the moving axes x, y, z in this order."""
+    about_x, about_y, about_z = (
+        se3.rotation_exp(angles[:, axis, None] * np.eye(3)[axis]) for axis in range(3)
+    )
+    return np.asarray(about_x @ about_y @ about_z)
+
+
+def _reversed_angles(angles: FloatArray) -> FloatArray:
+    return se3.rotation_from_rpy(angles[:, ::-1])
+
+
+def _vectors(rotations: FloatArray) -> FloatArray:
+    return se3.rotation_log(rotations)
+
+
+def _long_vectors(rotations: FloatArray) -> FloatArray:
+    """The rotation vectors beyond half a turn of the same rotations."""
+    vectors = se3.rotation_log(rotations)
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
+    return np.asarray(vectors * (1.0 - 2.0 * np.pi / lengths))
+
+
+_FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
+_MOVING = "angles about the moving axes x, y, z"
+_REVERSED = "angles about z, y, x in the order of the columns (A, B, C or yaw, pitch, roll)"
+_OF_VECTORS: dict[str, _Triple] = {
+    _FIXED: se3.rotation_from_rpy,
+    _MOVING: _moving_axes,
+    _REVERSED: _reversed_angles,
+}
+_OF_ANGLES: dict[str, _Triple] = {
+    "rotation vectors": se3.rotation_exp,
+    _MOVING: _moving_axes,
+    _REVERSED: _reversed_angles,
+}
+
+
+def _angles(given: GivenStops) -> Iterator[Finding]:
+    """Rotations that agree once their three numbers are taken for other angles."""
+    few = given[_spread_over(len(given))]
+    given_angles = {"parent": angles_between(few.parent), "child": angles_between(few.child)}
+    apart = median(np.abs(_upper(given_angles["parent"] - given_angles["child"])))
+    spread = max(median(_upper(given_angles["parent"])), median(_upper(given_angles["child"])))
+    if apart < 0.5 * _ROTATES or apart < 0.05 * spread:
+        return
+    best, least = None, min(apart / _DECISIVE, _HOLDS * spread)
+    for detail, of_parent in _read_otherwise(few.parent):
+        left = median(np.abs(_upper(of_parent - given_angles["child"])))
+        if left < least:
+            best, least = ("parent", detail), left
+    for detail, of_child in _read_otherwise(few.child):
+        left = median(np.abs(_upper(given_angles["parent"] - of_child)))
+        if left < least:
+            best, least = ("child", detail), left
+    if best:
+        yield finding("angles", best[0], detail=best[1])
+    elif apart > max(_ROTATES, _UNRELATED * spread / 2.0) and _is_unrelated(given_angles):
+        yield finding("unrelated_stops", off_deg=float(np.degrees(apart)))
+
+
+def _read_otherwise(Ts: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Other readings of the three numbers behind rotations, and the angles between stops then."""
+    rotations = Ts[:, :3, :3]
+    for numbers in (_vectors(rotations), _long_vectors(rotations), _usual_vectors(rotations)):
+        for detail, rotation_of in _OF_VECTORS.items():
+            yield f"{detail}, not rotation vectors", angles_between(rotation_of(numbers))
+    numbers = se3.rotation_to_rpy(rotations)
+    for detail, rotation_of in _OF_ANGLES.items():
+        text = f"{detail}, not angles about the fixed axes x, y, z"
+        yield text, angles_between(rotation_of(numbers))
+
+
+def _usual_vectors(rotations: FloatArray) -> FloatArray:
+    """Rotation vectors on the side of their median, so that a tool that points down has angles near
+    half a turn of one sign.
+    """
+    vectors, others = _vectors(rotations), _long_vectors(rotations)
+    axis = int(np.argmax(medians(np.abs(vectors.T))))
+    is_other = vectors[:, axis] < 0.0
+    return np.where(is_other[:, None], others, vectors)
+
+
+def _is_unrelated(angles: dict[str, FloatArray]) -> bool:
+    """Whether the stops of both sides agree hardly better than in any other order."""
+    of_parent, of_child = angles["parent"], angles["child"]
+    random = np.random.default_rng(0)
+    apart = median(np.abs(_upper(of_parent - of_child)))
+    others = []
+    for _ in range(_ROUNDS):
+        rows = random.permutation(len(of_child))
+        others.append(median(np.abs(_upper(of_parent - of_child[np.ix_(rows, rows)]))))
+    return apart > _UNRELATED * median(others)
+
+
+# ------------------------------------------------------------------ conventions
+
+_WAYS = ("", "quaternion_order", "quaternion_names", "inverse_orientation")
+
+
+def _put_right(Ts: FloatArray, code: str) -> FloatArray:
+    return se3.put_right(Ts, **dict([CONVENTIONS[code]])) if code else Ts
+
+
+def _explained(few: GivenStops) -> tuple[Mistakes, RoughFit, list[Mistakes]]:
+    """The mistakes that explain the stops best, none unless they are decisively better; their fit;
+    and other mistakes that are as simple and about as good.
+    """
+    plain = [Mistakes()] + [Mistakes(is_inverse=True)] * few.is_arm
+    chosen, fit = min(((each, rough_fit(few, each)) for each in plain), key=_badness)
+    if fit.unexplained < _EXPLAINED:
+        return chosen, fit, []
+    tried = []
+    for parent in _WAYS:
+        for child in _WAYS:
+            for is_inverse in (False, True):
+                mistakes = Mistakes(parent, child, is_inverse)
+                if mistakes not in plain:
+                    tried.append((mistakes, rough_fit(few, mistakes)))
+    least = min(each.unexplained for _, each in tried)
+    if not (least < _HOLDS and _DECISIVE * least < fit.unexplained):
+        return chosen, fit, []
+    good = [each for each in tried if each[1].unexplained <= _ABOUT_EQUAL * least]
+    simplest = min(mistakes.complexity for mistakes, _ in good)
+    good = [each for each in good if each[0].complexity == simplest]
+    chosen, fit = min(good, key=_badness)
+    return chosen, fit, [mistakes for mistakes, _ in good if mistakes != chosen]
+
+
+def _badness(tried: tuple[Mistakes, RoughFit]) -> float:
+    return tried[1].unexplained
+
+
+def rough_fit(given: GivenStops, mistakes: Mistakes) -> RoughFit:
+    """Fit stops without these mistakes robustly, with a free scale if the stops determine it."""
+    A, B = given.sides(mistakes)
+    weights = np.ones(len(A))
+    for _ in range(_ROUNDS):
+        X, Z = closest_rotations(A[:, :3, :3], B[:, :3, :3], weights)
+        left = se3.rotation_angle(np.swapaxes(Z @ B[:, :3, :3], 1, 2) @ A[:, :3, :3] @ X)
+        weights = 1.0 / (1.0 + (left / max(median(left), 1e-12)) ** 2)
+    spread = max(median(_upper(angles_between(A))), median(_upper(angles_between(B))))
+    # Rotations of a few degrees are not judged: noise may be as large.
+    turning = median(left) / max(spread, _ROTATES)
+    if not given.has_positions:
+        return RoughFit(turning, 0.0, None)
+    placing, scale = _placed(A, B, Z)
+    return RoughFit(turning, placing, scale)
+
+
+def _placed(A: FloatArray, B: FloatArray, Z: FloatArray) -> tuple[float, float | None]:
+    """Share of the positions that stays unexplained, and the factor of the child's lengths."""
+    ones = np.broadcast_to(-np.eye(3), (len(A), 3, 3))
+    of_child = B[:, :3, 3] @ Z.T
+    levers = np.concatenate([A[:, :3, :3], ones], axis=2)
+    free = np.concatenate([levers, -of_child[:, :, None]], axis=2)
+    without, _ = _least(levers, A[:, :3, 3])
+    left, values = _least(free, A[:, :3, 3])
+    spreads = [_spread(A[:, :3, 3]), _spread(of_child)]
+    scale = float(values[6])
+    if scale > 0.0 and left < without / _DECISIVE:
+        return left / max(min(spreads[0], scale * spreads[1]), 1e-12), scale
+    # A hand that moves about one point, or a fault: one unit of length.
+    left, _ = _least(levers, A[:, :3, 3] - of_child)
+    return left / max(*spreads, 1e-12), None
+
+
+def _spread(positions: FloatArray) -> float:
+    """Median distance of positions (N, 3) from their median."""
+    return median(np.linalg.norm(positions - medians(positions.T), axis=1))
+
+
+def _least(rows: FloatArray, positions: FloatArray) -> tuple[float, FloatArray]:
+    """Median length of ``rows @ values + positions``, and the values (k,), by robust weights."""
+    weights = np.ones(len(rows))
+    for _ in range(_ROUNDS):
+        roots = np.sqrt(weights)
+        scaled = (roots[:, None, None] * rows).reshape(-1, rows.shape[2])
+        target = -(roots[:, None] * positions).ravel()
+        values = np.linalg.lstsq(scaled, target, rcond=1e-9)[0]
+        lengths = np.linalg.norm(rows @ values + positions, axis=1)
+        weights = 1.0 / (1.0 + (lengths / max(median(lengths), 1e-12)) ** 2)
+    return median(lengths), np.asarray(values, dtype=float)
+
+
+def _named(
+    given: GivenStops, mistakes: Mistakes, rivals: Collection[Mistakes]
+) -> tuple[list[Finding], list[Finding]]:
+    """Findings of mistakes that no option repairs for certain, and of those that one does."""
+    streams = _streams(mistakes)
+    repairs = [finding(code, stream, options=conventions(code, stream)) for code, stream in streams]
+    others = [other for other in rivals if _streams(other) != streams]
+    findings: list[Finding] = []
+    if mistakes.is_inverse and not given.is_arm:
+        findings.append(finding("inverse_stops", "child", options={"child_invert": "poses"}))
+    if others:
+        told = [f"{code} of {stream}" for code, stream in _streams(others[0])]
+        doubt = " and ".join(told).replace("_", " ")
+        findings.append(finding("ambiguous_stops", detail=doubt))
+    return findings, repairs
+
+
+def _streams(mistakes: Mistakes) -> list[tuple[str, str]]:
+    """Code and stream of each mistake."""
+    if mistakes.parent == mistakes.child:
+        return [(mistakes.parent, "both")] if mistakes.parent else []
+    pairs = ((mistakes.parent, "parent"), (mistakes.child, "child"))
+    return [(code, stream) for code, stream in pairs if code]
+
+
+def _disagreeing(few: GivenStops, fit: RoughFit) -> Iterator[Finding]:
+    """Stops that no usual mistake explains."""
+    part = "rotations" if fit.turning > fit.placing else "positions"
+    share = min(fit.unexplained, 1.0)
+    yield finding("disagreeing_stops", part=part, share=share)
+
+
+# ------------------------------------------------------------------ lengths
+
+
+def _units(few: GivenStops, scale: float | None) -> tuple[list[Finding], float | None]:
+    """Findings of sides whose lengths are in other units, and the scale that is left then."""
+    of_parent = _unit_of_size(_spread(few.parent[:, :3, 3]))
+    of_child = _unit_of_size(_spread(few.child[:, :3, 3]))
+    if scale is not None:
+        left = scale * of_parent
+        by_ratio = [unit for unit in (1.0, *_UNITS) if abs(left / unit - 1.0) < _UNIT_WITHIN]
+        of_child = by_ratio[0] if by_ratio else of_child
+        scale = left / of_child
+    findings = []
+    for stream, unit, option in (
+        ("parent", of_parent, "parent_scale"),
+        ("child", of_child, "scale"),
+    ):
+        if unit != 1.0:
+            findings.append(
+                finding("stop_units", stream, options={option: unit}, unit=_UNITS[unit])
+            )
+    return findings, scale
+
+
+def _unit_of_size(spread: float) -> float:
+    """The unit of positions that spread this far: 1 for metres."""
+    if spread <= _WIDEST_M:
+        return 1.0
+    return _CENTIMETRE if spread <= _WIDEST_CM else _MILLIMETRE
+
+
+def scale_finding(scale: float, sigma: float, is_used: bool) -> Finding:
+    """The finding that the child's lengths are those of a target of another size."""
+    severity = Severity.WARNING if is_used else Severity.ERROR
+    return finding(
+        "target_scale",
+        "child",
+        severity,
+        {"scale": "estimate"},
+        scale=scale,
+        sigma=sigma,
+        times=1.0 / scale,
+    )
