@@ -179,7 +179,7 @@ def _judged(key: str, result: Calibration, T_parent_child: FloatArray | None) ->
     rotation = T_parent_child[:3, :3]
     along = np.concatenate([rotation @ xi[:3], rotation @ xi[3:]])
     seen = np.isfinite(result.sigmas)
-    ratios = np.abs(along[seen]) / np.maximum(result.sigmas_with_floor[seen], 1e-9)
+    ratios = np.abs(along[seen]) / np.maximum(result.sigmas[seen], 1e-9)
     return replace(
         known,
         metres=float(np.linalg.norm(along[:3][seen[:3]])),

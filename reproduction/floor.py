@@ -38,7 +38,7 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
     if found is None:
         return
     speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
-    stated, whole = found.sigmas**2, found.sigmas_with_floor**2
+    stated, whole = found.sigmas_measured**2, found.sigmas**2
     error = deviation(found.T_parent_child, case.T_parent_child)
     for k in np.flatnonzero(np.isfinite(stated) & np.isfinite(case.sigmas)):
         yield {

@@ -26,7 +26,8 @@ from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import between, real_rigs
 from reproduction.writing import markdown_table, seed_of, show, study_parser
 
-# Runs with any version since 0.1: answer and covariance, with the floor or without, of all streams.
+# Runs with any version since 0.1: the answer, and its covariance without and with the allowance. In
+# earlier versions covariance was without it.
 _SOLVE = """
 import pickle, sys, warnings
 import numpy as np
@@ -37,8 +38,9 @@ for streams, options in pickle.load(open(sys.argv[1], "rb")):
     try:
         result = hec.calibrate(*(hec.Trajectory(*each) for each in streams), **options)
         known = np.isfinite([dof.sigma for dof in result.observability])
+        measured = getattr(result, "covariance_measured", result.covariance)
         whole = getattr(result, "covariance_with_floor", result.covariance)
-        found.append((result.T_parent_child, result.covariance, whole, known))
+        found.append((result.T_parent_child, measured, whole, known))
     except Exception:
         found.append(None)
 pickle.dump(found, open(sys.argv[2], "wb"))

@@ -218,7 +218,7 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
             result = hec.calibrate(*pair)
             relative = se3.inverse(truth) @ result.T_parent_child
             errors.append(np.r_[relative[:3, 3], np.degrees(se3.rotation_log(relative[:3, :3]))])
-            covariances = np.array([result.covariance_with_floor, result.covariance])
+            covariances = np.array([result.covariance, result.covariance_measured])
             stated.append(_SHRIMP_UNITS * np.sqrt(np.diagonal(covariances, 0, 1, 2)))
             verdicts.append(result.verdict.value)
         ours = " ".join(f"{value:.3f}" for value in np.mean(np.abs(errors), axis=0))
@@ -254,9 +254,9 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
         parent = hec.read_trajectory(data / f"{flight}_odometry.csv", "csv")
         child = hec.read_trajectory(data / f"{flight}_leica_pose.csv", "csv", measures="positions")
         result = hec.calibrate(parent, child, child_measures="positions", time_offset="estimate")
-        offset, sigmas = result.T_parent_child[:3, 3], result.sigmas_with_floor[:3]
+        offset, sigmas = result.T_parent_child[:3, 3], result.sigmas[:3]
         offsets.append(offset)
-        precisions.append(1.0 / result.sigmas[:3] ** 2)
+        precisions.append(1.0 / result.sigmas_measured[:3] ** 2)
         ours = " ".join(f"{value:.4f}" for value in offset)
         sigmas_mm = " ".join(f"{1e3 * sigma:.1f}" for sigma in sigmas)
         z = np.max(np.abs(offset - published) / sigmas)

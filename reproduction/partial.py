@@ -125,7 +125,7 @@ def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
             parent, child, lever_arm = simulated_positions(name, seed)
             result = hec.calibrate(parent, child)
             errors.append(result.T_parent_child[:3, 3] - lever_arm)
-            stated.append(result.sigmas[:3])
+            stated.append(result.sigmas_measured[:3])
         known = np.isfinite(stated)
         yield {
             "Machine": name,
@@ -165,7 +165,7 @@ def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
             result = hec.calibrate(parent, child)
             error = se3.rotation_log(rotation @ result.T_parent_child[:3, :3].T)
             angles.append(np.degrees(np.linalg.norm(error)))
-            ratios.append(error / result.sigmas[3:])
+            ratios.append(error / result.sigmas_measured[3:])
             offsets.append(abs(result.time_offset_s - _LATE_S))
         yield {
             "Motion, poses from": name,

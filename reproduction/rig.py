@@ -90,7 +90,7 @@ def outcome(rig: Rig) -> Outcome:
     for first, second in combinations(range(len(names)), 2):
         back = se3.inverse(rig.Xs[second]) @ rig.Xs[first]
         errors[first, second] = se3.log(back @ found.T(names[first], names[second]))
-        own.append(np.diag(found.covariance(names[first], names[second])))
+        own.append(np.diag(found.covariance_measured(names[first], names[second])))
     pairwise = [
         se3.log(se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ each.T_parent_child)
         for at, each in enumerate(found.neighbours, start=1)

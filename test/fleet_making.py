@@ -61,9 +61,9 @@ def outcome(name, vehicle, T, covariance, day=0):
     sigmas = np.sqrt(np.diag(covariance)).tolist()
     found = calibration(
         T_parent_child=T,
-        covariance=covariance,
+        covariance_measured=covariance,
         status=SolveStatus.OK,
-        observability=dofs(sigmas),
+        observability_measured=dofs(sigmas),
         warnings=(),
         child_frame="camera",
     )

@@ -31,9 +31,9 @@ def calibration(**changes):
     sigmas = np.where([name == "z" for name in NAMES], np.inf, random.uniform(1e-7, 1e-2, 6))
     values = {
         "T_parent_child": se3.exp(random.normal(size=6)),
-        "covariance": covariance,
+        "covariance_measured": covariance,
         "status": SolveStatus.UNOBSERVABLE,
-        "observability": dofs(sigmas, "z"),
+        "observability_measured": dofs(sigmas, "z"),
         "objective": 1 / 3,
         "method": "dnlo",
         "reference": "B10",
@@ -63,9 +63,9 @@ def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
     T[:3, :3] = se3.rotation_exp(off[3:]) @ T[:3, :3]
     T[:3, 3] += off[:3]
     to_child = np.kron(np.eye(2), T[:3, :3].T)
-    fields = {"status": SolveStatus.OK, "observability": dofs(sigmas, [hidden])} | fields
+    fields = {"status": SolveStatus.OK, "observability_measured": dofs(sigmas, [hidden])} | fields
     covariance = to_child @ np.diag(sigmas**2) @ to_child.T
-    return calibration(T_parent_child=T, covariance=covariance, **fields)
+    return calibration(T_parent_child=T, covariance_measured=covariance, **fields)
 
 
 def shift(axis, size):
@@ -77,8 +77,8 @@ def good_calibration(**changes):
     sigmas = [0.003] * 3 + [0.001] * 3
     values = {
         "status": SolveStatus.OK,
-        "observability": dofs(sigmas),
-        "covariance": np.diag(np.square(sigmas)),
+        "observability_measured": dofs(sigmas),
+        "covariance_measured": np.diag(np.square(sigmas)),
     }
     return calibration(**(values | changes))
 

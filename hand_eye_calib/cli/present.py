@@ -3,7 +3,7 @@
 import argparse
 import shlex
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +20,14 @@ from hand_eye_calib.cli.options import (
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration, DofVerdict, Verdict
-from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
+from hand_eye_calib.results.document import (
+    allowance_in_words,
+    parts_of_sigmas,
+    printed_numbers,
+    summary,
+    transforms_of,
+    usable_numbers,
+)
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown
 from hand_eye_calib.text import listing
@@ -123,6 +130,8 @@ def as_lines(
             reach = () if name == "T_world_world" else calibration.out_of_reach
             lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
             lines += transform_lines(transforms[name], reach, with_details)
+            if name == "T_parent_child":
+                lines += allowance_lines(calibration)
     lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
     if command := calibration.static_transform_command():
         by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
@@ -191,19 +200,40 @@ def next_steps(
     return steps
 
 
+def allowance_lines(calibration: Calibration) -> list[str]:
+    """What the printed standard deviations contain beside what the recording shows."""
+    words = allowance_in_words(calibration)
+    return [f"  +/- is 1 sigma; it {words}"] if words else []
+
+
 def transform_lines(
-    transform: "Notation", out_of_reach: Sequence[str] = (), with_quaternion: bool = False
+    transform: "Notation", out_of_reach: Sequence[str] = (), with_details: bool = False
 ) -> Iterator[str]:
-    """A row for each axis: the translation along it and an angle, with one standard deviation."""
-    numbers, columns = printed_numbers(transform, out_of_reach), []
+    """A row for each axis: the translation along it and an angle, with one standard deviation; with
+    details a row for each number with the parts of its standard deviation, and the quaternion.
+    """
+    numbers = printed_numbers(transform, out_of_reach)
+    if with_details:
+        yield from _detailed_lines(transform, numbers)
+        return
+    columns = []
     for axes, width in ((TRANSLATIONS, 1), (ROTATIONS, 5)):
         told = numbers.get(listing(axes))
         rows = ["", f"{listing(axes)} are {told}", ""]
         columns.append(rows if told else [f"{each:<{width}} {numbers[each]:>24}" for each in axes])
     for metres, degrees in zip(*columns, strict=True):
         yield f"  {metres:<30}  {degrees}".rstrip()
-    if with_quaternion:
-        words = ["unknown"]
-        if (quat := transform.quat_xyzw) is not None:
-            words = [f"{name} {value:.6f}" for name, value in zip("xyzw", quat, strict=True)]
-        yield f"  quaternion {' '.join(words)}"
+
+
+def _detailed_lines(transform: "Notation", numbers: Mapping[str, str]) -> Iterator[str]:
+    """A row for each number with the parts of its standard deviation, and the quaternion."""
+    parts = parts_of_sigmas(transform)
+    for axis, number in numbers.items():
+        told = f" ({parts[axis]})" if axis in parts else ""
+        verb = " are" if "," in axis else ""
+        yield f"  {axis}{verb} {number}{told}"
+    words = ["unknown"]
+    if transform.quat_xyzw is not None:
+        quaternion = zip("xyzw", transform.quat_xyzw, strict=True)
+        words = [f"{name} {value:.6f}" for name, value in quaternion]
+    yield f"  quaternion {' '.join(words)}"

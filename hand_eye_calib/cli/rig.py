@@ -11,7 +11,13 @@ from hand_eye_calib.cli.options import (
     refuse_stamps,
     waiting_for,
 )
-from hand_eye_calib.cli.present import exit_code, transform_lines, verdict_lines, wrapped
+from hand_eye_calib.cli.present import (
+    allowance_lines,
+    exit_code,
+    transform_lines,
+    verdict_lines,
+    wrapped,
+)
 from hand_eye_calib.cli.reading import read_files
 from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError
@@ -83,7 +89,8 @@ def as_lines(rig: "RigCalibration") -> list[str]:
     for each in rig.calibrations:
         first, *others = verdict_lines(each)
         lines += [f"{each.child_frame} in {each.parent_frame}: {first}", *others]
-        lines += [*transform_lines(transforms_of(each)["T_parent_child"]), ""]
+        lines += transform_lines(transforms_of(each)["T_parent_child"])
+        lines += [*allowance_lines(each), ""]
     lines += ["Results for two sensors at a time"]
     for one in rig.closures:
         lines += wrapped(one.sentence, "  ", "    ")

@@ -116,7 +116,7 @@ class Solved:
             warnings,
             measured=self.measured,
             T_method=found.T_parent_child,
-            floor=self.floor,
+            covariance_allowance=self.floor,
             proved_global=self.proved_global,
             method=self.method,
             method_reason=self.method_reason,
@@ -160,8 +160,8 @@ def calibration_of(
     fields.setdefault("stamp_ns", int(stamps_ns[-1]))
     return Calibration(
         T_parent_child=fused.T_parent_child,
-        covariance=fused.cov_parent_child_in_child,
-        observability=dofs,
+        covariance_measured=fused.cov_parent_child_in_child,
+        observability_measured=dofs,
         status=status,
         objective=solution.objective,
         n_poses=len(stamps_ns),
@@ -372,7 +372,7 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
     robust = _sound(others)
     # One of a reference was solved where the motion shows most, which others need not see.
     if len(robust) >= _MIN_OTHERS and not METHODS[result.method].uses_reference:
-        of_others = np.array([other.sigmas for other in robust])
+        of_others = np.array([other.sigmas_measured for other in robust])
         unseen = np.isfinite(result.sigmas) & np.isinf(of_others).all(axis=0)
         if unseen.any():
             result = solved.calibration(np.array(AXES)[unseen].tolist())
@@ -423,29 +423,29 @@ def compare_answers(
     those count that do not reject half of the motion pairs, and from the first and the second half
     of the recording, or fewer.
     """
-    sigmas, floor = calibration.sigmas, calibration.sigmas_of_floor
+    sigmas, allowance = calibration.sigmas_measured, calibration.allowance
     sound = _sound(others)
     pairs = [_apart(calibration, other) for other in sound]
     apart, joint = np.reshape(pairs, (-1, 2, 6)).swapaxes(0, 1)
     own = np.maximum(sigmas, _ROUNDING)
-    as_certain = np.reshape([other.sigmas for other in sound], (-1, 6)) < _AS_CERTAIN * own
+    as_certain = np.reshape([other.sigmas_measured for other in sound], (-1, 6)) < _AS_CERTAIN * own
     of_as_certain = _robust_sigma(np.where(as_certain, apart, np.nan), _MIN_AS_CERTAIN)
     of_halves = excess_of_halves = np.full(6, np.nan)
     if len(halves) == 2:
         between, allowed = _apart(*halves)
         # The whole is the mean of both halves: its standard deviation is half of that of their
-        # difference. They do not state the floor and, of another method, time-correlated errors.
+        # difference. They do not state the allowance and, of another method, slow errors.
         of_halves = between / 2
         is_same = halves[0].method == calibration.method
-        beside = floor if is_same else calibration.sigmas_with_floor
+        beside = allowance if is_same else calibration.sigmas
         excess_of_halves = of_halves / np.hypot(allowed / 2, beside)
     columns = {
-        "sigma": sigmas,
+        "sigma": calibration.sigmas,
         "of_methods": _robust_sigma(apart, _MIN_OTHERS),
         "of_halves": of_halves,
-        "excess_of_methods": _robust_sigma(apart / np.hypot(joint, floor), _MIN_OTHERS),
+        "excess_of_methods": _robust_sigma(apart / np.hypot(joint, allowance), _MIN_OTHERS),
         "excess_of_halves": excess_of_halves,
-        "excess_over_own": of_as_certain / np.hypot(own, floor),
+        "excess_over_own": of_as_certain / np.hypot(own, allowance),
     }
     table = np.where(np.isfinite(sigmas), [*columns.values()], np.nan).T.tolist()
     rows = [[each if math.isfinite(each) else None for each in row] for row in table]
@@ -464,7 +464,7 @@ def _apart(first: Calibration, second: Calibration) -> tuple[FloatArray, FloatAr
     the axis.
     """
     distance = np.abs(deviation(first.T_parent_child, second.T_parent_child))
-    joint = np.hypot(first.sigmas, second.sigmas)
+    joint = np.hypot(first.sigmas_measured, second.sigmas_measured)
     known = np.isfinite(joint)
     return np.where(known, distance, np.nan), np.where(known, np.maximum(joint, _ROUNDING), np.nan)
 

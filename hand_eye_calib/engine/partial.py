@@ -87,7 +87,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         measured="positions",
         noise=solution.describe(stamps_ns),
         T_method=T,
-        floor=2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+        covariance_allowance=2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
         time_offset_s=offset_s,
         time_offset_sigma_s=solution.time_offset_sigma_s,
         scale=given * scale,

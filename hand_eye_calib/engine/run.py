@@ -304,7 +304,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> checkin
     scale = calibration.scale if calibration else snapshot.config.scale
     known = None
     if calibration:
-        sigmas = np.sqrt(np.diag(calibration.covariance))
+        sigmas = np.sqrt(np.diag(calibration.covariance_measured))
         is_known = not calibration.unobservable()
         known = calibration.T_parent_child, np.where(is_known, sigmas, np.inf)
     result = checking.check_streams(

@@ -97,7 +97,9 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
         raise InputError(
             f"{path}: is about {found[1]} in {found[0]}; expected {child_frame} in {parent_frame}"
         )
-    return Extrinsic(result.T_parent_child, str(path), result.covariance, is_calibration=True)
+    return Extrinsic(
+        result.T_parent_child, str(path), result.covariance_measured, is_calibration=True
+    )
 
 
 # ---- files of other programs

@@ -66,7 +66,7 @@ def _trend(result: Calibration, number: int) -> Drawn:
     apart = np.array([bool(each.left_out) for each in recordings])
     figure = Figure(figsize=(LOOK.width, 3.9), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True).ravel()
-    for axis, panel, sigma in zip(_AXES, panels, result.sigmas, strict=True):
+    for axis, panel, sigma in zip(_AXES, panels, result.sigmas_measured, strict=True):
         factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
         points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
         values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
@@ -88,7 +88,8 @@ def _trend(result: Calibration, number: int) -> Drawn:
     panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
     said = (
         "Difference of each recording from the common value along and about the parent's axes, "
-        "with its standard deviation. The band is three standard deviations of the common value. "
+        "with its standard deviation. The band is three standard deviations of the common value, "
+        "without the allowance for constant errors, which all recordings share. "
         "Squares do not belong to the others."
     )
     title = "Each recording against the common extrinsic"

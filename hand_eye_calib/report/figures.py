@@ -372,7 +372,7 @@ def plot(calibration: Calibration, ax: Any = None) -> Figure:
 
 def said_of_views(*calibrations: Calibration) -> str:
     """What the three views show, in words."""
-    sigmas = np.array([each.sigmas_with_floor[:3] for each in calibrations])
+    sigmas = np.array([each.sigmas[:3] for each in calibrations])
     known = np.isfinite(sigmas)
     text = "Axes of all sensors: x red, y green, z blue."
     if known.any():
@@ -399,7 +399,7 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
             _draw_sensor(panel, T[seen], calibration.child_frame, CHILD, axis_m, -14)
             is_known = np.isfinite(calibration.sigmas[seen])
             if is_known.all():
-                R, covariance = T[seen, :3], calibration.covariance_with_floor[:3, :3]
+                R, covariance = T[seen, :3], calibration.covariance[:3, :3]
                 values, vectors = np.linalg.eigh(R @ covariance @ R.T)
                 wide, high = 2 * LOOK.sigmas * np.sqrt(np.maximum(values, 0.0))
                 turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))

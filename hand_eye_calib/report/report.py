@@ -23,7 +23,13 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.plain import Document
 from hand_eye_calib.report.figures import LOOK, figure_of_views, figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
-from hand_eye_calib.results.document import printed_numbers, summary, transforms_of, usable_numbers
+from hand_eye_calib.results.document import (
+    allowance_in_words,
+    printed_numbers,
+    summary,
+    transforms_of,
+    usable_numbers,
+)
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
 from hand_eye_calib.session.rig import RigCalibration
@@ -115,6 +121,7 @@ def render(
         directions=[*transforms_of(calibration).values()][:2],
         numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
         axes=list(_axes(calibration)),
+        allowance=allowance_in_words(calibration),
         advice=advice,
         command=command,
         unknown=text.listing(by_hand),
@@ -158,7 +165,7 @@ def _at_distance(calibration: Calibration) -> str:
     errors = []
     for point in LOOK.distance_m * np.eye(3):
         J = np.hstack([np.eye(3), -se3.skew(point)])
-        errors.append(np.linalg.eigvalsh(J @ calibration.covariance_with_floor @ J.T)[-1])
+        errors.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
     child = printable(calibration.child_frame)
     return (
         f"An object {LOOK.distance_m:.0f} m from {child} is misplaced by up to "
@@ -187,17 +194,16 @@ class AxisRow(NamedTuple):
 
 def _axes(calibration: Calibration) -> Iterable[AxisRow]:
     """Rows of the table of uncertainties, along and about the parent's axes."""
-    totals = calibration.sigmas_with_floor.tolist()
     is_bad = calibration.verdict is Verdict.DO_NOT_USE
-    for dof, total in zip(calibration.observability, totals, strict=True):
+    for dof in calibration.observability:
         if dof.name not in calibration.out_of_reach:
             yield AxisRow(
                 dof.name,
                 _AXIS_NAMES[dof.name],
-                text.amount(dof.name, total),
+                text.amount(dof.name, dof.sigma),
                 dof.verdict.value,
                 _WORDS["unobservable" if is_bad else dof.verdict.value],
-                _bar(total / target_of(dof.name, calibration)),
+                _bar(dof.sigma / target_of(dof.name, calibration)),
             )
 
 

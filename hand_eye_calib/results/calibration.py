@@ -61,8 +61,8 @@ class Calibration(Judged):
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
-        printed = zip(self.observability, se3.xyz_rpy(self.T_parent_child), strict=True)
-        values = ", ".join(f"{dof.name} {at:.6g} +/- {dof.sigma:.2g}" for dof, at in printed)
+        printed = zip(AXES, se3.xyz_rpy(self.T_parent_child), self.sigmas_printed, strict=True)
+        values = ", ".join(f"{axis} {at:.6g} +/- {sigma:.2g}" for axis, at, sigma in printed)
         return (
             f"<Calibration: {self.headline}\n {frames}: {values} (m, rad), "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
@@ -70,7 +70,7 @@ class Calibration(Judged):
 
     def to_frame(self) -> "pd.DataFrame":
         """DataFrame with a row for each of x, y, z, roll, pitch, yaw: the printed number, its
-        standard deviation with the common-mode uncertainty (m, rad), and the verdict.
+        standard deviation with the allowance (m, rad), and the verdict.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class Calibration(Judged):
         child sensor's frame. What was compared with it is left out.
         """
         T, Z, of_Z = self.T_parent_child, self.T_world_world, self.cov_world_world
-        covariance = inverse_covariance(T, self.covariance)
+        covariance = inverse_covariance(T, self.covariance_measured)
         sigmas = sigmas_in_parent(self.T_child_parent[:3, :3], covariance)
         if self.unobservable():
             sigmas[sigmas > document.UNKNOWN_M] = np.inf
@@ -106,9 +106,9 @@ class Calibration(Judged):
             T_world_world=None if Z is None else se3.inverse(Z),
             cov_world_world=None if Z is None or of_Z is None else inverse_covariance(Z, of_Z),
             T_base_parent=None,
-            covariance=covariance,
-            floor=inverse_covariance(T, self.floor),
-            observability=observability,
+            covariance_measured=covariance,
+            covariance_allowance=inverse_covariance(T, self.covariance_allowance),
+            observability_measured=observability,
             parent_frame=self.child_frame,
             child_frame=self.parent_frame,
             parent_world_frame=self.child_world_frame,

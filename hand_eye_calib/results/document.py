@@ -2,8 +2,9 @@
 programs read.
 """
 
+import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,19 +16,24 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.geometry.trajectory import check_poses
 from hand_eye_calib.plain import Document, from_plain, plain
-from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, by_hand
+from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS, CrossCheck, by_hand
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.results.verdict import Judged, Verdict
-from hand_eye_calib.text import fixed, given_or_estimated, listing, with_sigma
+from hand_eye_calib.text import amount, fixed, given_or_estimated, listing, with_sigma
 
-# Format and version of a document. A change that an older reader cannot understand raises the
-# version.
-_FORMAT = {"format": "hand_eye_calib/extrinsic", "version": 1}
+# A change that an older reader cannot understand raises the version. In version 1, covariance and
+# sigma were without the allowance, which was called floor.
+_FORMAT = "hand_eye_calib/extrinsic"
+_VERSION = 2
+_READABLE = (1, 2)
 
 # Fields that a document has under other names, as matrices; and those that files do not have.
 _TRANSFORMS = ("T_parent_child", "T_method", "T_world_world", "T_base_parent")
-_COVARIANCES = ("covariance", "cov_world_world", "floor")
+_COVARIANCES = ("covariance_measured", "covariance_allowance", "cov_world_world")
 _NOT_IN_FILES = ("motion_residuals", "recording")
+
+# The fields of a covariance in version 2 and what they were called in version 1.
+_OLD_COVARIANCES = {"covariance_measured": "covariance", "covariance_allowance": "floor"}
 
 # With a direction unobservable, a larger standard deviation (m) in other axes comes from that.
 UNKNOWN_M = 0.9
@@ -42,19 +48,19 @@ _OfResult = TypeVar("_OfResult", bound=Result)
 class Notation:
     """A transform in the notations that people and programs use: ``maps`` names source and target.
 
-    Each printed number, m and deg, has a standard deviation without and with the common-mode
-    uncertainty. What is unknown is NaN, with an infinite one; an unknown rotation has no
-    quaternion.
+    Each printed number, m and deg, has a standard deviation, and the part of it that the recording
+    shows: the rest is the allowance. What is unknown is NaN, with an infinite one; an unknown
+    rotation has no quaternion.
     """
 
     maps: str
     translation: FloatArray
     sigma_translation: FloatArray
-    sigma_total_translation: FloatArray
+    sigma_measured_translation: FloatArray
     quat_xyzw: FloatArray | None
     rpy_deg: FloatArray
     sigma_rpy_deg: FloatArray
-    sigma_total_rpy_deg: FloatArray
+    sigma_measured_rpy_deg: FloatArray
     matrix: FloatArray
 
 
@@ -65,17 +71,15 @@ def document_of(result: Judged) -> Document:
         "verdict": result.verdict,
         "headline": result.headline,
         "reasons": result.reasons,
-        **_FORMAT,
+        "format": _FORMAT,
+        "version": _VERSION,
         "parent_frame": parent,
         "child_frame": child,
         **transforms_of(result),
         "status": result.status,
-        "covariance": _matrix_of("error xi in T_parent_child @ exp(xi)", child, result.covariance)
-        | {"order": ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]},
-        "observability": [
-            plain(dof) | {"sigma_total": total, "frame": parent}
-            for dof, total in zip(result.observability, result.sigmas_with_floor, strict=True)
-        ],
+        **_covariances_of(result),
+        "sigma": dict(zip(AXES, result.sigmas, strict=True)),
+        "observability": _observability_of(result),
     }
     if result.T_method is not None:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
@@ -83,21 +87,42 @@ def document_of(result: Judged) -> Document:
     if result.cov_world_world is not None:
         of, world = "error xi in T_world_world @ exp(xi)", result.child_world_frame
         document["cov_world_world"] = _matrix_of(of, world, result.cov_world_world)
-    of = "errors of a whole recording, the same in every part; not in the covariance"
-    document["floor"] = _matrix_of(of, child, result.floor)
-    document["sigma_total"] = dict(zip(AXES, result.sigmas_with_floor, strict=True))
+    left_out = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
     for name in (each.name for each in fields(result)):
-        if name not in (*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, *document):
+        if name not in left_out.union(document):
             document[name] = getattr(result, name)
     return plain(document)
+
+
+def _covariances_of(result: Result) -> Document:
+    """The covariance of a document, and its two parts."""
+    of, child = "error xi in T_parent_child @ exp(xi)", result.child_frame
+    order = ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]
+    measured = f"{of}: the part that the recording shows"
+    allowance = f"{of}: the allowance for constant errors, which no recording shows"
+    return {
+        "covariance": _matrix_of(of, child, result.covariance) | {"order": order},
+        "covariance_measured": _matrix_of(measured, child, result.covariance_measured),
+        "covariance_allowance": _matrix_of(allowance, child, result.covariance_allowance),
+    }
+
+
+def _observability_of(result: Result) -> list[Document]:
+    """Rows of a document: each axis with its standard deviation and the two parts of it."""
+    parts = zip(result.sigmas_measured, result.allowance, strict=True)
+    return [
+        plain(dof)
+        | {"sigma_measured": measured, "allowance": allowance, "frame": result.parent_frame}
+        for dof, (measured, allowance) in zip(result.observability, parts, strict=True)
+    ]
 
 
 def transforms_of(result: Result) -> dict[str, Notation]:
     """The transforms of a result by their names."""
     T, parent, child = result.T_parent_child, result.parent_frame, result.child_frame
-    own = result.covariance, result.floor
+    own = result.covariance_measured, result.covariance_allowance
     exchanged = [inverse_covariance(T, each) for each in own]
-    known_m, hidden = result.sigmas[:3], {*result.unobservable()}
+    known_m, hidden = result.sigmas_measured[:3], {*result.unobservable()}
     # Where the rotation is out of reach, the axes of both sensors are the same by convention.
     of_inverse_m = known_m if {*ROTATIONS} <= {*result.out_of_reach} else None
     rows: list[tuple[str, FloatArray, str, str, Sequence[FloatArray], FloatArray | None]] = [
@@ -112,8 +137,9 @@ def transforms_of(result: Result) -> dict[str, Notation]:
         rows.append(("T_world_world", result.T_world_world, *worlds, of_worlds, None))
     found = {}
     for name, T, source, target, covariances, sigmas_m in rows:
-        sigmas, of_floor = (sigmas_rpy(T, each) for each in covariances)
-        along, floor_m = (sigmas_in_parent(T[:3, :3], each)[:3] for each in covariances)
+        measured, allowance = covariances
+        sigmas = sigmas_rpy(T, measured)
+        along, allowance_m = (sigmas_in_parent(T[:3, :3], each)[:3] for each in covariances)
         if sigmas_m is None:
             is_unsure = bool(hidden) or name == "T_world_world"
             sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
@@ -123,12 +149,12 @@ def transforms_of(result: Result) -> dict[str, Notation]:
         found[name] = Notation(
             maps=f"coordinates of {source} into {target}",
             translation=np.where(np.isfinite(sigmas_m), T[:3, 3], np.nan),
-            sigma_translation=sigmas_m,
-            sigma_total_translation=np.hypot(sigmas_m, floor_m),
+            sigma_translation=np.hypot(sigmas_m, allowance_m),
+            sigma_measured_translation=sigmas_m,
             quat_xyzw=se3.to_quat_xyzw(T) if is_turn_known else None,
             rpy_deg=np.degrees(np.where(known, se3.rotation_to_rpy(T[:3, :3]), np.nan)),
-            sigma_rpy_deg=np.degrees(sigmas),
-            sigma_total_rpy_deg=np.degrees(np.hypot(sigmas, of_floor)),
+            sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
+            sigma_measured_rpy_deg=np.degrees(sigmas),
             matrix=T,
         )
     return found
@@ -166,13 +192,13 @@ def printed_numbers(
     transform: Notation, out_of_reach: Collection[str], sign: str = "+/-"
 ) -> dict[str, str]:
     """The printed numbers of a transform by axis: x, y, z (m), roll, pitch and yaw (deg), each with
-    its standard deviation, the common-mode uncertainty included. Axes that are out of reach of the
+    its standard deviation. Axes that are out of reach of the
     streams stand together.
     """
     found = {}
     for axes, values, sigmas, unit in (
-        (TRANSLATIONS, transform.translation, transform.sigma_total_translation, "m"),
-        (ROTATIONS, transform.rpy_deg, transform.sigma_total_rpy_deg, "deg"),
+        (TRANSLATIONS, transform.translation, transform.sigma_translation, "m"),
+        (ROTATIONS, transform.rpy_deg, transform.sigma_rpy_deg, "deg"),
     ):
         if {*axes} & {*out_of_reach}:
             found[listing(axes)] = "not estimated"
@@ -186,6 +212,38 @@ def printed_numbers(
                 text = with_sigma(value, sigma, 3 if unit == "m" else 2).replace("+/-", sign)
                 found[axis] = f"{text} {unit}"
     return found
+
+
+def parts_of_sigmas(transform: Notation) -> dict[str, str]:
+    """The parts of each printed standard deviation by axis, such as "4 mm measured, 8 mm allowance
+    for constant errors"; axes without an allowance, or that are unknown, are left out.
+    """
+    sigmas = np.r_[transform.sigma_translation, np.radians(transform.sigma_rpy_deg)]
+    measured = np.r_[
+        transform.sigma_measured_translation, np.radians(transform.sigma_measured_rpy_deg)
+    ]
+    parts = {}
+    for axis, sigma, of_recording in zip(AXES, sigmas.tolist(), measured.tolist(), strict=True):
+        if math.isfinite(sigma) and sigma > of_recording:
+            rest = amount(axis, math.sqrt(sigma**2 - of_recording**2))
+            recorded = amount(axis, of_recording)
+            parts[axis] = f"{recorded} measured, {rest} allowance for constant errors"
+    return parts
+
+
+def allowance_in_words(result: Result) -> str:
+    """How large the allowance in the standard deviations is, in a sentence; empty without one."""
+    known = np.isfinite(result.sigmas)
+    sizes = []
+    for axes in (TRANSLATIONS, ROTATIONS):
+        rows = [index for index, axis in enumerate(AXES) if axis in axes and known[index]]
+        largest = float(result.allowance[rows].max(initial=0.0))
+        if largest > 0.0:
+            sizes.append(amount(axes[0], largest))
+    if not sizes:
+        return ""
+    of = "" if result.measured == "positions" else "odometry "
+    return f"includes an allowance of up to {listing(sizes)} for constant {of}errors"
 
 
 # ------------------------------------------------------------------------ for robots
@@ -235,7 +293,7 @@ def usable_angles(result: Result) -> dict[str, float | str]:
     T = result.mounting[1]
     known = np.full(3, True)  # near gimbal lock roll and yaw have no sigma and are known
     if set(result.unobservable()).intersection(ROTATIONS):
-        known = np.isfinite(sigmas_rpy(T, result.covariance))
+        known = np.isfinite(sigmas_rpy(T, result.covariance_measured))
     angles = se3.rotation_to_rpy(T[:3, :3]).tolist()
     return {
         name: angle if is_known else by_hand(name)
@@ -250,20 +308,39 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     """A calibration from its document, which may have been changed by hand, or damaged; an
     InputError that says what is wrong.
     """
-    found = {name: data.get(name) if isinstance(data, Mapping) else None for name in _FORMAT}
-    if found != _FORMAT:
+    is_document = isinstance(data, Mapping)
+    form = data.get("format") if is_document else None
+    version = data.get("version") if is_document else None
+    if form != _FORMAT or version not in _READABLE:
         raise InputError(
-            f"expected format {_FORMAT['format']}, version {_FORMAT['version']}; "
-            f"found format {found['format']}, version {found['version']}"
+            f"expected format {_FORMAT}, version {_READABLE[0]} or {_READABLE[1]}; "
+            f"found format {form}, version {version}"
         )
     try:
-        return _result_from(of, data)
+        return _result_from(of, _measured_parts(data))
     except KeyError as error:
         raise InputError(f"the calibration has no {error}: restore or repeat it") from None
     except (TypeError, ValueError) as error:
         raise InputError(
             f"the calibration was changed after it was written: {error}; restore or repeat it"
         ) from None
+
+
+def _measured_parts(data: Mapping[str, Any]) -> Document:
+    """A document of any version with the fields of a result: measured parts and allowance."""
+    document = dict(data)
+    if data["version"] == 1:
+        document |= {name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data}
+        document["observability_measured"] = data["observability"]
+        return document
+    whole = _covariance_of(data["covariance"])
+    parts = [_covariance_of(data[name]) for name in _OLD_COVARIANCES]
+    if not np.allclose(whole, parts[0] + parts[1], rtol=1e-6, atol=1e-300):
+        raise ValueError("covariance is not the sum of covariance_measured and its allowance")
+    document["observability_measured"] = [
+        {**row, "sigma": row["sigma_measured"]} for row in data["observability"]
+    ]
+    return document
 
 
 def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
@@ -281,6 +358,8 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     known = {name: each for name, each in data.items() if name not in _NOT_IN_FILES}
     types = {each.__name__: each for each in (Comparison, Progress, RateBias, Together)}
     result: _OfResult = from_plain(of, known | arrays, **types)
+    if data["version"] == 1 and result.cross_check:
+        result = replace(result, cross_check=_with_allowance(result))
     if tuple(dof.name for dof in result.observability) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
     for name in ("contradictions", "target_axes", "cross_check"):
@@ -289,6 +368,16 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     if result.method not in METHODS:
         raise ValueError(f"method {result.method} is not known")
     return result
+
+
+def _with_allowance(result: Result) -> CrossCheck:
+    """The cross-check of a document of version 1, whose standard deviations lack the allowance."""
+    sizes = dict(zip(AXES, result.allowance.tolist(), strict=True))
+    rows = dict(result.cross_check or {})
+    for axis, row in rows.items():
+        if axis in sizes and row.sigma is not None:
+            rows[axis] = replace(row, sigma=math.hypot(row.sigma, sizes[axis]))
+    return rows
 
 
 def _transform_of(data: Mapping[str, Any]) -> FloatArray:

@@ -70,7 +70,8 @@ class DofObservability:
         x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
     verdict : DofVerdict
     sigma : float
-        One standard deviation, in m or rad; ``inf`` if unobservable.
+        One standard deviation, in m or rad; ``inf`` if unobservable. It contains the allowance for
+        constant errors in ``observability``, not in ``observability_measured``.
     """
 
     name: str
@@ -260,13 +261,13 @@ class AxisScatter:
     Attributes
     ----------
     sigma : float or None
-        The result's standard deviation; None if the axis is unobservable.
+        The result's standard deviation, with the allowance; None if the axis is unobservable.
     of_methods : float or None
         Robust standard deviation of other methods and references about the result.
     of_halves : float or None
         Standard deviation that follows from the difference between both halves of the recording.
     excess_of_methods, excess_of_halves : float or None
-        The same in joint standard deviations, which contain the common-mode uncertainty; those of
+        The same in joint standard deviations, which contain the allowance; those of
         the halves also the result's own if the halves are solved with another method.
     excess_over_own : float or None
         Distance of other methods and references in the result's own standard deviations, over those

@@ -1,7 +1,7 @@
 """An extrinsic with all that is known of its quality, as values."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,15 +56,16 @@ class Result:
 
     Uncertainty
 
-    covariance : (6, 6) array
+    covariance_measured : (6, 6) array
         Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child
-        sensor's frame, m and rad.
-    observability : tuple of DofObservability
-        x, y, z, roll, pitch, yaw in the parent sensor's frame.
-    floor : (6, 6) array
-        Common-mode uncertainty: covariance, of the same xi, of errors that are the same in every
-        part of the recording, so that nothing in it shows them
-        (:mod:`hand_eye_calib.assessment.covariance`). ``covariance`` does not contain it.
+        sensor's frame, m and rad: the part that the recording shows.
+    covariance_allowance : (6, 6) array
+        Covariance of the same xi from errors that are constant during the recording, which no
+        recording shows (:mod:`hand_eye_calib.assessment.covariance`). :attr:`covariance` is the sum
+        of both.
+    observability_measured : tuple of DofObservability
+        x, y, z, roll, pitch, yaw in the parent sensor's frame, with the measured part of their
+        standard deviations; :attr:`observability` has the whole.
     contradictions : mapping
         Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
 
@@ -137,9 +138,9 @@ class Result:
     T_world_world: FloatArray | None = None
     cov_world_world: FloatArray | None = None
 
-    covariance: FloatArray
-    observability: tuple[records.DofObservability, ...]
-    floor: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    covariance_measured: FloatArray
+    covariance_allowance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    observability_measured: tuple[records.DofObservability, ...]
     contradictions: Mapping[str, float] = field(default_factory=dict)
 
     measured: str = "poses"
@@ -211,43 +212,53 @@ class Result:
         return self.parent_frame, self.T_parent_child
 
     @property
+    def covariance(self) -> FloatArray:
+        """(6, 6) array: covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho,
+        phi), in the child sensor's frame, m and rad: the measured part and the allowance.
+        """
+        return self.covariance_measured + self.covariance_allowance
+
+    @property
     def sigmas(self) -> FloatArray:
         """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
-        frame; infinite if unobservable.
+        frame, with the allowance; infinite if unobservable.
         """
-        return np.array([dof.sigma for dof in self.observability])
+        return np.hypot(self.sigmas_measured, self.allowance)
+
+    @property
+    def sigmas_measured(self) -> FloatArray:
+        """(6,) array: the part of :attr:`sigmas` that the recording shows."""
+        return np.array([dof.sigma for dof in self.observability_measured])
+
+    @property
+    def allowance(self) -> FloatArray:
+        """(6,) array: the part of :attr:`sigmas` that allows for constant errors of the odometries,
+        which no recording shows.
+        """
+        return sigmas_in_parent(self.T_parent_child[:3, :3], self.covariance_allowance)
+
+    @property
+    def observability(self) -> tuple[records.DofObservability, ...]:
+        """x, y, z, roll, pitch, yaw in the parent sensor's frame, with their :attr:`sigmas`."""
+        return tuple(
+            replace(dof, sigma=sigma)
+            for dof, sigma in zip(self.observability_measured, self.sigmas.tolist(), strict=True)
+        )
 
     @property
     def sigmas_rpy(self) -> FloatArray:
-        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed;
-        infinite if one is unknown. Those of ``sigmas`` are of rotations about the parent's axes.
+        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed, with
+        the allowance; infinite if one is unknown. Those of ``sigmas`` are of rotations about the
+        parent's axes.
         """
         return sigmas_rpy(self.T_parent_child, self.covariance)
 
     @property
     def sigmas_printed(self) -> FloatArray:
-        """(6,) array: standard deviations, common-mode uncertainty included, of the printed x, y, z
-        (m), roll, pitch and yaw (rad); infinite if one is unknown.
+        """(6,) array: standard deviations of the printed x, y, z (m), roll, pitch and yaw (rad),
+        with the allowance; infinite if one is unknown.
         """
-        of_angles = sigmas_rpy(self.T_parent_child, self.covariance_with_floor)
-        return np.concatenate([self.sigmas_with_floor[:3], of_angles])
-
-    @property
-    def covariance_with_floor(self) -> FloatArray:
-        """(6, 6) array: covariance and common-mode uncertainty together."""
-        return self.covariance + self.floor
-
-    @property
-    def sigmas_of_floor(self) -> FloatArray:
-        """(6,) array: common-mode standard deviations along (m) and about (rad) the axes of the
-        parent sensor's frame.
-        """
-        return sigmas_in_parent(self.T_parent_child[:3, :3], self.floor)
-
-    @property
-    def sigmas_with_floor(self) -> FloatArray:
-        """(6,) array: :attr:`sigmas` and the common-mode uncertainty together."""
-        return np.hypot(self.sigmas, self.sigmas_of_floor)
+        return np.concatenate([self.sigmas[:3], self.sigmas_rpy])
 
     def residuals(self) -> records.Residuals:
         """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.
@@ -266,7 +277,9 @@ class Result:
     def unobservable(self) -> list[str]:
         """Names of the degrees of freedom that the motion does not determine."""
         return [
-            dof.name for dof in self.observability if dof.verdict is records.DofVerdict.UNOBSERVABLE
+            dof.name
+            for dof in self.observability_measured
+            if dof.verdict is records.DofVerdict.UNOBSERVABLE
         ]
 
     @property

@@ -231,7 +231,7 @@ def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
             is_far |= of_target > CONTRADICTED_TARGETS
         if is_far:
             told[axis.name] = f"about {axes_in_words([axis.name])} by {amount(axis.name, scatter)}"
-            sigmas.append(f"+/- {amount(axis.name, axis.sigma)}")
+            sigmas.append(f"+/- {amount(axis.name, axis.total)}")
     if told:
         who, advice = _OTHERS[kind]
         differ = f"{who} disagree {listing([*told.values()])}"
@@ -321,10 +321,10 @@ class _Axis(NamedTuple):
 
 
 def _axes(result: Result) -> list[_Axis]:
-    hidden, totals = result.unobservable(), result.sigmas_with_floor.tolist()
+    hidden, totals = result.unobservable(), result.sigmas.tolist()
     return [
         _Axis(dof.name, dof.sigma, total, target_of(dof.name, result), dof.name in hidden)
-        for dof, total in zip(result.observability, totals, strict=True)
+        for dof, total in zip(result.observability_measured, totals, strict=True)
         if dof.name not in result.out_of_reach
     ]
 
@@ -400,7 +400,7 @@ RULES = (
     Rule(
         "floor",
         _CARE,
-        "an axis is worse than its target only together with the common-mode floor",
+        "an axis is worse than its target only together with the allowance for constant errors",
         _floor,
     ),
 )

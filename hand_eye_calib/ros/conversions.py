@@ -67,7 +67,7 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message.header.frame_id = calibration.parent_frame
     T, pose = calibration.T_parent_child, message.pose.pose
     _put(T, pose.position, pose.orientation)
-    covariance = turned(T[:3, :3], calibration.covariance_with_floor)
+    covariance = turned(T[:3, :3], calibration.covariance)
     message.pose.covariance = covariance.ravel().tolist()
     return message
 

@@ -164,7 +164,7 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
         return calibration
     index = AXES.index(hidden[0])
     T = calibration.T_parent_child.copy()
-    covariance = turned(T[:3, :3], calibration.covariance)
+    covariance = turned(T[:3, :3], calibration.covariance_measured)
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
     # The other axes follow as far as the motion has tied them to this one.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing

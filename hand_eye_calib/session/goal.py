@@ -21,7 +21,7 @@ from hand_eye_calib.text import axes_in_words, duration
 
 # An axis is known if its standard deviation is below this share of its target ...
 _SHARE = 0.7
-# ... or what the common-mode floor leaves of it, of the variance at least this share, ...
+# ... or what the allowance leaves of it, of the variance at least this share, ...
 _LEAST_ROOM = 0.25
 # ... at two results in a row, after so many seconds of motion, and so many correlation times of
 # time-correlated errors.
@@ -165,14 +165,14 @@ class Goal:
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
             will_not_get_there=bool(stuck),
-            axes=self._by_axis(calibration.sigmas_with_floor, np.zeros(6) if is_done else left_s),
+            axes=self._by_axis(calibration.sigmas, np.zeros(6) if is_done else left_s),
         )
         return self.progress
 
     def _is_confirmed(self, newest: Calibration) -> bool:
         """Whether the result before, from less motion, reaches the goal as the newest one does.
 
-        Options may have changed in between: floor and priors are those of the newest result.
+        Options may have changed in between: allowance and priors are those of the newest result.
         """
         before = self._before
         if before is None or before.faults:
@@ -183,15 +183,15 @@ class Goal:
         return bool(is_long and self._ratios(before.calibration, newest).max() <= 1.0)
 
     def _ratios(self, calibration: Calibration, newest: Calibration) -> FloatArray:
-        """Variances (6,) over what the common-mode floor leaves of the targets: a floor above them
-        cannot be driven away. Floor and priors are those of the newest result.
+        """Measured variances (6,) over what the allowance leaves of the targets: an allowance above
+        them cannot be driven away. Allowance and priors are those of the newest result.
         """
         wanted = _SHARE * self._targets
-        room = np.maximum(wanted**2 - newest.sigmas_of_floor**2, _LEAST_ROOM * wanted**2)
+        room = np.maximum(wanted**2 - newest.allowance**2, _LEAST_ROOM * wanted**2)
         # What somebody measured by hand, no motion would tell better; some streams never show all.
         exempt = np.isin(AXES, newest.out_of_reach)
         exempt |= [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
-        return np.asarray(np.where(exempt, 0.0, calibration.sigmas**2 / room))
+        return np.asarray(np.where(exempt, 0.0, calibration.sigmas_measured**2 / room))
 
     def _told(self, left_s: FloatArray) -> FloatArray:
         """The steps (6,) that are told of these times: estimates jump, and a person who is told 4

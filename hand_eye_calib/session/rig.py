@@ -245,9 +245,16 @@ class RigCalibration:
     def covariance(self, first: str, second: str) -> FloatArray:
         """Covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``, m and rad.
 
-        It is that of the answer for both. Without one it is the sum of those with the first sensor:
-        rather too large, as it has that sensor's errors twice.
+        It is that of the answer for both, with the allowance. Without one it is the sum of those
+        with the first sensor: rather too large, as it has that sensor's errors twice.
         """
+        return self._covariance(first, second, with_allowance=True)
+
+    def covariance_measured(self, first: str, second: str) -> FloatArray:
+        """The part (6, 6) of :meth:`covariance` that the recordings show."""
+        return self._covariance(first, second, with_allowance=False)
+
+    def _covariance(self, first: str, second: str, with_allowance: bool) -> FloatArray:
         near, far = sorted(map(self.sensors.index, (first, second)))
         if near == far:
             return np.zeros((6, 6))
@@ -255,7 +262,7 @@ class RigCalibration:
         if 0 < near == far - 1:
             answers = [(self.neighbours[near - 1], self.Xs[far])]
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
-        in_first = np.sum([_moved(*each) for each in answers], axis=0)
+        in_first = np.sum([_moved(*each, with_allowance) for each in answers], axis=0)
         return np.asarray(to_second @ in_first @ to_second.T)
 
     def to_dict(self) -> Document:
@@ -270,10 +277,14 @@ class RigCalibration:
         }
 
 
-def _moved(calibration: Calibration, X: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of an answer in the frame that its child has the pose X (4, 4) in."""
+def _moved(calibration: Calibration, X: FloatArray, with_allowance: bool = False) -> FloatArray:
+    """Covariance (6, 6) of an answer in the frame that its child has the pose X (4, 4) in; the
+    measured part, unless the allowance is asked for.
+    """
     adjoint = se3.adjoint(X)
-    covariance = calibration.covariance + _ROUNDING * np.eye(6)
+    covariance = calibration.covariance_measured + _ROUNDING * np.eye(6)
+    if with_allowance:
+        covariance = covariance + calibration.covariance_allowance
     return np.asarray(adjoint @ covariance @ adjoint.T)
 
 

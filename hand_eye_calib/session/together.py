@@ -152,7 +152,7 @@ def row_of_result(calibration: Document) -> Document:
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
     columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
     values = [*transform["translation"], *transform["rpy_deg"]]
-    sigmas = [*transform["sigma_total_translation"], *transform["sigma_total_rpy_deg"]]
+    sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
     for column, value, sigma in zip(columns, values, sigmas, strict=True):
         row |= {column: value, f"sigma_{column}": sigma}
     return row | {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
@@ -209,7 +209,7 @@ def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) ->
     level is that of :func:`agreement_of`.
     """
     Ts = np.array([each.T_parent_child for each in results])
-    covariances = turned(Ts[:, :3, :3], np.array([each.covariance for each in results]))
+    covariances = turned(Ts[:, :3, :3], np.array([each.covariance_measured for each in results]))
     usual = [np.diag(scatter_of_recordings(each)) for each in covariances]
     return agreement_of(Ts, covariances, np.sqrt(np.median(usual, axis=0)), level)
 
@@ -238,7 +238,8 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
     T = found.T_parent_child
     covariance, by_prior = found.covariance.copy(), set()
     for axis, name in enumerate(AXES):
-        known = [one.observability[axis] for one in used if math.isfinite(one.sigmas[axis])]
+        dofs = [one.observability_measured[axis] for one in used]
+        known = [dof for dof in dofs if math.isfinite(dof.sigma)]
         if known and all(dof.verdict is DofVerdict.PRIOR for dof in known):
             # All have it from one measurement by hand.
             by_prior.add(name)
@@ -256,9 +257,9 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
     offset_s, scale = own_clock.pop() if len(own_clock) == 1 else (0.0, 1.0)
     return Calibration(
         T_parent_child=T,
-        covariance=assessed.cov_parent_child_in_child,
-        observability=observability,
-        floor=np.mean([one.floor for one in used], axis=0),
+        covariance_measured=assessed.cov_parent_child_in_child,
+        covariance_allowance=np.mean([one.covariance_allowance for one in used], axis=0),
+        observability_measured=observability,
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=found.chi2,
         method=Counter(one.method for one in used).most_common(1)[0][0],
@@ -354,10 +355,10 @@ def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> 
 
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     (first_name, one), (second_name, two) = first, second
-    covariance, scatter, floor = _spread(one) + _spread(two)
+    covariance, scatter, allowance = _spread(one) + _spread(two)
     if not (_is_found(one) and _is_found(two)):
         # What is the same in all recordings is in one of both only: the larger of both, by axis.
-        scatter = floor + np.diag(np.maximum(np.diag(scatter - floor), 0.0))
+        scatter = allowance + np.diag(np.maximum(np.diag(scatter - allowance), 0.0))
     values = deviation(two.T_parent_child, one.T_parent_child)
     limits = SEEN_TARGETS * np.array([target_of(axis, two) for axis in AXES])
     found = moved(values, covariance + scatter, limits)
@@ -377,15 +378,16 @@ def _is_found(given: Calibration | Extrinsic) -> bool:
 
 def _spread(given: Calibration | Extrinsic) -> FloatArray:
     """Covariance (6, 6) along and about the parent's axes, how recordings of its rig scatter, and
-    its floor, stacked.
+    its allowance, stacked.
     """
     rotation = given.T_parent_child[:3, :3]
-    covariance, floor = np.diag(UNKNOWN**2), np.zeros((6, 6))
-    if np.isfinite(given.covariance).all():
-        covariance = turned(rotation, given.covariance)
+    covariance, allowance = np.diag(UNKNOWN**2), np.zeros((6, 6))
+    measured = given.covariance_measured if isinstance(given, Calibration) else given.covariance
+    if np.isfinite(measured).all():
+        covariance = turned(rotation, measured)
     if isinstance(given, Calibration):
         hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
         covariance = covariance + np.diag(np.where(hidden, UNKNOWN**2, 0.0))
-        floor = turned(rotation, given.floor)
+        allowance = turned(rotation, given.covariance_allowance)
     scatter = scatter_of_recordings(covariance) if _is_found(given) else np.zeros((6, 6))
-    return np.array([covariance, scatter, floor])
+    return np.array([covariance, scatter, allowance])

@@ -81,16 +81,16 @@ def _class_case(
         "bound_t": _squared(xi[:3], bound[:3, :3]),
         "bound_r": _squared(xi[3:], bound[3:, 3:]),
     }
-    if np.isfinite(found.covariance).all():
-        case["nees"] = _squared(xi, found.covariance)
+    if np.isfinite(found.covariance_measured).all():
+        case["nees"] = _squared(xi, found.covariance_measured)
     return case | _covers(xi, found)
 
 
 def _covers(xi: FloatArray, found: Calibration) -> dict[str, float]:
     """The share of the components in their intervals, if there are any."""
-    if not np.isfinite(found.covariance).all():
+    if not np.isfinite(found.covariance_measured).all():
         return {}
-    within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance))
+    within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance_measured))
     return {"covers": float(within.mean())}
 
 
@@ -128,8 +128,8 @@ def truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]
     # A rotation whose axis is not known to the truth has no small rotation vector.
     if not np.isfinite(truth.sigmas[3:]).all():
         error[3:] = _angle_differences(found.T_parent_child, truth.T_parent_child)
-    sigmas = np.where(known, found.sigmas, 1.0)
-    with_floor = np.where(known, found.sigmas_with_floor, 1.0)
+    sigmas = np.where(known, found.sigmas_measured, 1.0)
+    with_floor = np.where(known, found.sigmas, 1.0)
     apart = np.where(known, np.abs(error), 0.0)
     of_truth = np.where(known, truth.sigmas, 0.0)
     cases = {
@@ -192,7 +192,7 @@ def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
     if len(good) < len(answers) or len(good) < 2:
         return {}
     known = np.logical_and.reduce([_knows(one) for one in good])
-    sigmas = np.array([one.sigmas for one in good])
+    sigmas = np.array([one.sigmas_measured for one in good])
     off = np.array([deviation(one.T_parent_child, good[0].T_parent_child) for one in good])
     stated = (np.where(known, sigmas, 1.0) ** 2).mean(axis=0)
     ratios = off.var(axis=0, ddof=1) / stated
@@ -230,7 +230,7 @@ def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:
         stretch = np.repeat([scale, 1.0], 3)
         moved = se3.adjoint(se3.inverse(T))
         covariance = moved @ covariance @ moved.T
-        covariance += one.covariance * np.outer(stretch, stretch)
+        covariance += one.covariance_measured * np.outer(stretch, stretch)
         closed = closed @ T
         scale *= one.scale
     return se3.log(closed), covariance

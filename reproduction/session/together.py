@@ -125,12 +125,12 @@ def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
             assert each.truth is not None
             for some in _subsets(each.results, count):
                 joint = together(some) if count > 1 else next(iter(some.values()))
-                known = np.isfinite(each.truth.sigmas) & np.isfinite(joint.sigmas)
+                known = np.isfinite(each.truth.sigmas) & np.isfinite(joint.sigmas_measured)
                 error = deviation(joint.T_parent_child, each.truth.T_parent_child)
                 # One recording shows its own mount only: its interval is of that.
                 of = each.own.get(min(some), each.truth) if count == 1 else each.truth
                 apart = deviation(joint.T_parent_child, of.T_parent_child)
-                stated = joint.sigmas if "simulated" in kind else joint.sigmas_with_floor
+                stated = joint.sigmas_measured if "simulated" in kind else joint.sigmas
                 sigmas = np.hypot(stated, each.truth.sigmas)
                 inside.extend((np.abs(apart) < _NORMAL_90 * sigmas)[known])
                 parts = np.split(error * known, 2)

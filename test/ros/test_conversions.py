@@ -73,7 +73,7 @@ def test_messages_carry_frames_stamp_and_transform():
     assert ns_of(transform.header.stamp) == 1_700_000_000_123_456_789
     pose = conversions.to_pose_with_covariance(calibration(np.eye(6)))
     assert pose.header == transform.header
-    total = calibration(np.eye(6), floor=np.eye(6))
+    total = calibration(np.eye(6), covariance_allowance=np.eye(6))
     total = conversions.to_pose_with_covariance(total).pose.covariance
     np.testing.assert_allclose(np.reshape(total, (6, 6)), 2.0 * np.eye(6), atol=1e-12)
     for place, turn in (
@@ -95,7 +95,8 @@ def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
 
     topics = ResultTopics(SimpleNamespace(create_publisher=create, destroy_publisher=gone.append))
     sure, unsure = (
-        calibration(np.eye(6), observability=dofs([0.01] * 6, hidden)) for hidden in ((), NAMES)
+        calibration(np.eye(6), observability_measured=dofs([0.01] * 6, hidden))
+        for hidden in ((), NAMES)
     )
     for each in (unsure, sure, unsure, unsure):  # the last is not new
         topics.publish(each)

@@ -189,12 +189,14 @@ def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatc
 
 def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(monkeypatch):
     found = result()
-    dofs = [*found.observability]
+    dofs = [*found.observability_measured]
     dofs[2] = DofObservability("z", DofVerdict.UNOBSERVABLE, np.inf)
     covariance = np.eye(6) * 1e-6
     R = found.T_parent_child[:3, :3]
     covariance[:3, :3] += 9.0 * np.outer(R[2], R[2])
-    hidden = dataclasses.replace(found, observability=tuple(dofs), covariance=covariance)
+    hidden = dataclasses.replace(
+        found, observability_measured=tuple(dofs), covariance_measured=covariance
+    )
     heard = Heard(monkeypatch, installed="7 8 9 0 0 0")
     T = heard.robot.complete(hidden).T_parent_child
     np.testing.assert_allclose(T[:2, 3], found.T_parent_child[:2, 3], atol=1e-4)

@@ -177,9 +177,9 @@ class TestNode:
         faulty = "the streams are faulty"
         broadcaster.look(calibration, faulty)
         assert broadcaster.state == (Broadcast.WAITING, faulty)
-        dofs = [*calibration.observability]
+        dofs = [*calibration.observability_measured]
         dofs[2] = dataclasses.replace(dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf)
-        broadcaster.look(dataclasses.replace(calibration, observability=tuple(dofs)), "")
+        broadcaster.look(dataclasses.replace(calibration, observability_measured=tuple(dofs)), "")
         assert broadcaster.state == (Broadcast.REFUSED, "z not determined")
         broadcaster.look(dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), "")
         assert broadcaster.state[0] is Broadcast.REFUSED

@@ -145,7 +145,7 @@ class TestFloor:
         found = np.sqrt(np.diag(uncertainty.common_mode_floor(speed_m_s=2.4)))
         np.testing.assert_allclose(found[:3], 0.013)
         fast = hec.calibrate(*(each.scaled(20.0) for each in streams()), checks=False)
-        assert fast.sigmas_of_floor[:3].min() > 2 * uncertainty.FLOOR_TRANSLATION
+        assert fast.allowance[:3].min() > 2 * uncertainty.FLOOR_TRANSLATION
 
     def test_neither_stops_nor_jumps_count_for_the_usual_speed(self):
         stamps_ns = np.arange(600) * 100_000_000
@@ -159,22 +159,20 @@ class TestFloor:
         both = hec.calibrate(*streams(), parent_kind="exact", child_kind="exact", checks=False)
         kinds = "exact", "odometry"
         one, none = (hec.calibrate(*streams(), child_kind=each, checks=False) for each in kinds)
-        assert not both.floor.any()
-        np.testing.assert_allclose(2.0 * one.floor, none.floor)
+        assert not both.allowance.any()
+        np.testing.assert_allclose(2.0 * one.covariance_allowance, none.covariance_allowance)
 
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
         result = hec.calibrate(*streams(), method=method, checks=False)
+        np.testing.assert_allclose(result.allowance[3:], uncertainty.FLOOR_ROTATION, rtol=1e-3)
+        assert 0.999 * uncertainty.FLOOR_TRANSLATION < result.allowance[:3].max() < 0.01
+        assert result.sigmas_measured[3:].max() < uncertainty.FLOOR_ROTATION
         np.testing.assert_allclose(
-            result.sigmas_of_floor[3:], uncertainty.FLOOR_ROTATION, rtol=1e-3
-        )
-        assert 0.999 * uncertainty.FLOOR_TRANSLATION < result.sigmas_of_floor[:3].max() < 0.01
-        assert result.sigmas[3:].max() < uncertainty.FLOOR_ROTATION
-        np.testing.assert_allclose(
-            result.sigmas_with_floor**2, result.sigmas**2 + result.sigmas_of_floor**2
+            result.sigmas**2, result.sigmas_measured**2 + result.allowance**2
         )
         np.testing.assert_array_equal(
-            result.covariance_with_floor, result.covariance + result.floor
+            result.covariance, result.covariance_measured + result.covariance_allowance
         )
 
 
@@ -215,7 +213,7 @@ class TestWhichAnswerStands:
         result = hec.calibrate(*streams, method="auto", checks=False)
         model = hec.calibrate(*streams, method="adaptive", checks=False)
         np.testing.assert_array_equal(result.T_parent_child, model.T_parent_child)
-        np.testing.assert_array_equal(result.covariance, model.covariance)
+        np.testing.assert_array_equal(result.covariance_measured, model.covariance_measured)
         assert (result.method, result.reference) == ("adaptive", "increments")
         assert result.method_reason == "auto: adaptive, because its noise model works here"
         assert result.noise == model.noise
@@ -240,7 +238,7 @@ class TestWhichAnswerStands:
         reference = result.reference
         dnlo = hec.calibrate(*streams, method="dnlo", reference=reference, checks=False)
         np.testing.assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
-        np.testing.assert_array_equal(result.covariance, dnlo.covariance)
+        np.testing.assert_array_equal(result.covariance_measured, dnlo.covariance_measured)
         assert (result.method, result.noise) == ("dnlo", None)
         assert result.method_reason == f"auto: dnlo on reference {reference}, because {why}"
 
@@ -287,7 +285,7 @@ def flat_drive(noise=0.001, mount=MOUNT):
 
 
 def sigmas(result):
-    return {dof.name: dof.sigma for dof in result.observability}
+    return {dof.name: dof.sigma for dof in result.observability_measured}
 
 
 class TestOption:
@@ -384,7 +382,7 @@ class TestFullMotion:
         assert result.reasons[0].sentence.startswith(f"the prior on {axis} is ")
         assert result.reasons[0].what_to_do == f"check value, unit and sign of prior.{axis}"
         np.testing.assert_array_equal(result.T_parent_child, plain.T_parent_child)
-        np.testing.assert_array_equal(result.covariance, plain.covariance)
+        np.testing.assert_array_equal(result.covariance_measured, plain.covariance_measured)
 
 
 def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():

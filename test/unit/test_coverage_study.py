@@ -119,14 +119,16 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
 
 
 def _calibration(T_parent_child, covariance, scale):
-    known = {"T_parent_child": T_parent_child, "covariance": covariance, "scale": scale}
-    return calibration(**known, status=SolveStatus.OK, observability=())
+    known = {"T_parent_child": T_parent_child, "covariance_measured": covariance, "scale": scale}
+    return calibration(**known, status=SolveStatus.OK, observability_measured=())
 
 
 def test_coverage_with_the_floor_is_told_apart():
     observability = tuple(DofObservability(axis, DofVerdict.OBSERVED, 0.001) for axis in AXES)
     found = _calibration(np.eye(4), 1e-6 * np.eye(6), 1.0)
-    found = dataclasses.replace(found, observability=observability, floor=1e-4 * np.eye(6))
+    found = dataclasses.replace(
+        found, observability_measured=observability, covariance_allowance=1e-4 * np.eye(6)
+    )
     T_truth = np.eye(4)
     T_truth[0, 3] = 0.01
     cases = truth_cases(found, Truth.within(T_truth, 0.0, 0.0))

@@ -125,9 +125,9 @@ def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
     calibration, others, _ = answers
     known = dataclasses.replace(
         calibration,
-        observability=(
+        observability_measured=(
             DofObservability("x", DofVerdict.PRIOR, 1.0),
-            *calibration.observability[1:],
+            *calibration.observability_measured[1:],
         ),
     )
     assert contradictions(known, [moved(other, 0.3) for other in others]) == []

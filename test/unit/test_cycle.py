@@ -33,7 +33,7 @@ def result(sigmas_m=0.005, **fields):
     verdicts = [DofVerdict.OBSERVED if s < np.inf else DofVerdict.UNOBSERVABLE for s in sigmas]
     dofs = tuple(map(DofObservability, AXES, verdicts, sigmas))
     fields = {"status": SolveStatus.OK, "noise": None, "warnings": (), "findings": ()} | fields
-    return dataclasses.replace(calibration(), observability=dofs, **fields)
+    return dataclasses.replace(calibration(), observability_measured=dofs, **fields)
 
 
 @pytest.fixture

@@ -64,13 +64,18 @@ def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
     assert excitation.what_is_missing(seen_in(poses), result) == ""
     weak = dataclasses.replace(
         result,
-        observability=(DofObservability("x", DofVerdict.WEAK, 0.08), *result.observability[1:]),
+        observability_measured=(
+            DofObservability("x", DofVerdict.WEAK, 0.08),
+            *result.observability_measured[1:],
+        ),
     )
     assert excitation.what_is_missing(seen_in(poses), weak).startswith(
         "x still uncertain after the motion"
     )
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
-    hiding = dataclasses.replace(result, observability=(*result.observability[:5], hidden))
+    hiding = dataclasses.replace(
+        result, observability_measured=(*result.observability_measured[:5], hidden)
+    )
     assert excitation.what_is_missing(seen_in(poses), hiding) == (
         "the rotation about z cannot be determined from the motion so far: rotations about y help "
         "most"

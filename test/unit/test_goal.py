@@ -29,7 +29,7 @@ def result(sigmas_m=0.005, sigmas_rad=0.001, verdicts=(), **fields):
         for axis, sigma in zip(AXES, sigmas, strict=True)
     )
     fields = {"status": SolveStatus.OK, "noise": None} | fields
-    return dataclasses.replace(made(), observability=dofs, **fields)
+    return dataclasses.replace(made(), observability_measured=dofs, **fields)
 
 
 def told(goal, *results):

@@ -48,21 +48,21 @@ def result(streams):
 
 def distances(result):
     """Errors over their standard deviations."""
-    return (result.T_parent_child[:3, 3] - LEVER_ARM) / result.sigmas[:3]
+    return (result.T_parent_child[:3, 3] - LEVER_ARM) / result.sigmas_measured[:3]
 
 
 class TestLeverArm:
     def test_it_is_found_within_its_sigma(self, result):
         assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
         assert np.abs(distances(result)).max() < 4.0
-        assert result.sigmas[:3].max() < 0.005
+        assert result.sigmas_measured[:3].max() < 0.005
         assert abs(result.time_offset_s) < 0.005
 
     def test_the_rotation_is_out_of_reach_and_no_number(self, result):
         assert result.measured == "positions"
         assert result.out_of_reach == ("roll", "pitch", "yaw")
         assert result.T_parent_child[:3, :3].tolist() == np.eye(3).tolist()
-        assert np.isinf(result.sigmas[3:]).all()
+        assert np.isinf(result.sigmas_measured[3:]).all()
         assert result.covariance[3, 3] > 1.0
         assert usable_numbers(result)["yaw"] == "MEASURE_YAW_BY_HAND"
         assert result.status is hec.SolveStatus.OK
@@ -120,7 +120,10 @@ class TestLeverArm:
     def test_a_drift_with_the_path_is_within_sigma(self):
         parent, child, lever_arm = simulated_positions("car", seed=3)
         found = hec.calibrate(parent, child, checks=False)
-        assert np.abs((found.T_parent_child[:3, 3] - lever_arm) / found.sigmas[:3]).max() < 4.0
+        assert (
+            np.abs((found.T_parent_child[:3, 3] - lever_arm) / found.sigmas_measured[:3]).max()
+            < 4.0
+        )
 
     def test_positions_that_are_worse_for_a_time_are_as_if_they_were_missing(self, streams):
         parent, child = streams
@@ -134,7 +137,7 @@ class TestLeverArm:
         left_out = next(each for each in found.noise.in_words if "far less precise" in each)
         assert 20 < int(left_out.partition("%")[0]) < 30
         difference = found.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
-        assert np.abs(difference / apart.sigmas[:3]).max() < 0.5
+        assert np.abs(difference / apart.sigmas_measured[:3]).max() < 0.5
 
     def test_float_solutions_outages_and_a_jump_do_little(self, streams):
         parent, child = streams

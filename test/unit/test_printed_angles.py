@@ -5,6 +5,7 @@ import pytest
 from result_making import calibration as made
 from result_making import dofs
 
+from hand_eye_calib.cli.present import as_lines
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.results.calibration import SolveStatus
@@ -55,7 +56,7 @@ def test_near_gimbal_lock_roll_and_yaw_are_printed_without_a_sigma():
     assert pitch < np.radians(0.4)
     result = calibration(rotation, (0.3, 0.2, 0.1))
     document = result.to_dict()["T_parent_child"]
-    assert document["sigma_rpy_deg"][0] is document["sigma_total_rpy_deg"][2] is None
+    assert document["sigma_rpy_deg"][0] is document["sigma_measured_rpy_deg"][2] is None
     assert printed_numbers(transforms_of(result)["T_parent_child"], ())["roll"] == "20.00 deg"
 
 
@@ -70,7 +71,10 @@ def calibration(rotation, sigmas_deg):
     T, covariance = transform(rotation), covariance_about_parent(rotation, sigmas_deg)
     sigmas = np.r_[0.01, 0.02, 0.03, np.radians(sigmas_deg)]
     return made(
-        T_parent_child=T, covariance=covariance, status=SolveStatus.OK, observability=dofs(sigmas)
+        T_parent_child=T,
+        covariance_measured=covariance,
+        status=SolveStatus.OK,
+        observability_measured=dofs(sigmas),
     )
 
 
@@ -83,3 +87,43 @@ def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
     np.testing.assert_allclose(there["sigma_translation"], [0.01, 0.02, 0.03])
     # An error of the rotation moves the parent, which is 0.37 m from the child.
     assert back["sigma_translation"][0] > 0.02
+
+
+def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
+    measured_m, allowance_m = 0.0043, 0.008
+    T, covariance = (
+        transform(np.eye(3)),
+        np.diag(np.r_[np.full(3, measured_m**2), np.full(3, 1e-6)]),
+    )
+    allowance = np.diag(np.r_[np.full(3, allowance_m**2), np.full(3, 1e-6)])
+    result = made(
+        T_parent_child=T,
+        covariance_measured=covariance,
+        covariance_allowance=allowance,
+        status=SolveStatus.OK,
+        observability_measured=dofs([measured_m] * 3 + [1e-3] * 3),
+    )
+    whole_m = np.hypot(measured_m, allowance_m)
+    document = result.to_dict()
+    in_python = [result.sigmas[0], result.sigmas_printed[0], result.covariance[0, 0] ** 0.5]
+    in_documents = [
+        document["observability"][0]["sigma"],
+        document["sigma"]["x"],
+        document["T_parent_child"]["sigma_translation"][0],
+        document["covariance"]["matrix"][0][0] ** 0.5,
+        result.observability[0].sigma,
+    ]
+    assert [*in_python, *in_documents] == pytest.approx([whole_m] * 8)
+    assert result.sigmas_measured[0] == pytest.approx(measured_m)
+    assert result.allowance[0] == pytest.approx(allowance_m)
+    assert "x 0.3 +/- 0.0091" in repr(result)
+    assert "  x 0.3000 +/- 0.0091 m (4.3 mm measured, 8 mm allowance for constant errors)" in (
+        as_lines(result, with_details=True)
+    )
+    explained = "includes an allowance of up to 8 mm and 0.057 deg for constant odometry errors"
+    assert f"  +/- is 1 sigma; it {explained}" in as_lines(result)
+
+
+def test_the_axis_of_a_sigma_with_only_a_measured_part_has_no_parts_printed():
+    result = calibration(np.eye(3), (0.1, 0.1, 0.1))
+    assert not any("allowance" in line for line in as_lines(result, with_details=True))

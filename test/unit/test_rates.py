@@ -66,13 +66,13 @@ class TestRates:
         assert result.rate_bias.rad_per_s == pytest.approx(BIAS, abs=1e-3)
         assert result.time_offset_s == pytest.approx(OFFSET_S, abs=1e-3)
         assert 0 < result.time_offset_sigma_s < 1e-3
-        assert result.sigmas_of_floor[3:] == pytest.approx(np.radians(0.15))
+        assert result.allowance[3:] == pytest.approx(np.radians(0.15))
 
     def test_the_translation_is_out_of_reach_and_no_number(self, result):
         assert result.measured == "rotations"
         assert result.out_of_reach == ("x", "y", "z")
-        assert np.isinf(result.sigmas[:3]).all()
-        assert result.covariance[0, 0] > 1.0
+        assert np.isinf(result.sigmas_measured[:3]).all()
+        assert result.covariance_measured[0, 0] > 1.0
         assert usable_numbers(result)["x"] == "MEASURE_X_BY_HAND"
         assert result.verdict is hec.Verdict.USE
         assert "out of reach" in result.headline

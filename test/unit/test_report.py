@@ -142,11 +142,11 @@ def test_numbers_are_the_calibrations(drive, request):
     for transform in (document["T_parent_child"], document["T_child_parent"]):
         for value in transform["quat_xyzw"]:
             assert f"{round(value, 4) + 0.0:.4f}" in page.text
-        sigmas = [*transform["sigma_total_translation"], *transform["sigma_total_rpy_deg"]]
+        sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
         values = [*transform["translation"], *transform["rpy_deg"]]
         for value, sigma, decimals in zip(values, sigmas, (3, 3, 3, 2, 2, 2), strict=True):
             assert with_sigma(value, sigma, decimals).replace("+/-", "±") in page.text
-    totals = calibration.sigmas_with_floor.tolist()
+    totals = calibration.sigmas.tolist()
     for dof, total in zip(calibration.observability, totals, strict=True):
         if dof.verdict is DofVerdict.UNOBSERVABLE:
             continue
@@ -222,7 +222,7 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
     calibration, _, page = partial["positions"]
     assert "Along the axes of antenna: positions have none of their own." in page.text
     lever_arm = calibration.to_dict()["T_child_parent"]
-    sigmas = lever_arm["sigma_total_translation"]
+    sigmas = lever_arm["sigma_translation"]
     for value, sigma in zip(lever_arm["translation"], sigmas, strict=True):
         assert sigma < 1.0
         assert with_sigma(value, sigma, 3).replace("+/-", "±") in page.text
@@ -373,7 +373,7 @@ def test_labels_names_of_files_and_what_it_means_at_a_distance(hilly):
     assert "vehicle: 7 <b>" in page.text[: page.text.index("Verdict")]
     found = re.search(r"10 m from /camera/odometry is misplaced by up to ([\d.]+) cm", page.text)
     J = np.hstack([np.eye(3), -se3.skew(np.array([10.0, 0.0, 0.0]))])
-    one = J @ calibration.covariance_with_floor @ J.T
+    one = J @ calibration.covariance @ J.T
     assert float(found[1]) >= 95 * np.sqrt(np.linalg.eigvalsh(one)[-1])
 
 

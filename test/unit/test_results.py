@@ -24,7 +24,7 @@ from hand_eye_calib.io.yaml_files import yaml_text
 from hand_eye_calib.plain import json_text, plain
 from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.context import AxisProgress, Progress, RateBias
-from hand_eye_calib.results.records import CorrelatedError, Noise
+from hand_eye_calib.results.records import AxisScatter, CorrelatedError, Noise
 
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 
@@ -96,8 +96,8 @@ def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
 def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robot(tmp_path):
     written = calibration(
         T_parent_child=se3.exp(np.array([1.0, 2, 3, 0, 0, 0.3])),
-        covariance=np.diag([1e-4] * 5 + [1e4]),
-        observability=dofs([0.01] * 5 + [np.inf], ["yaw"]),
+        covariance_measured=np.diag([1e-4] * 5 + [1e4]),
+        observability_measured=dofs([0.01] * 5 + [np.inf], ["yaw"]),
     )
     transform = yaml.safe_load(save_result(written, tmp_path).read_text())["T_parent_child"]
     assert transform["quat_xyzw"] is None
@@ -132,7 +132,7 @@ def test_the_file_says_where_it_came_from(tmp_path):
     document = yaml.safe_load(
         save_result(calibration(), tmp_path, inputs).read_text(encoding="utf-8")
     )
-    assert (document["format"], document["version"]) == ("hand_eye_calib/extrinsic", 1)
+    assert (document["format"], document["version"]) == ("hand_eye_calib/extrinsic", 2)
     assert document["T_parent_child"]["maps"] == "coordinates of caméra: links into lidar"
     product = np.array(document["T_parent_child"]["matrix"]) @ document["T_child_parent"]["matrix"]
     np.testing.assert_allclose(product, np.eye(4), atol=1e-14)
@@ -254,9 +254,9 @@ def edited(**changes):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "hand_eye_calib/extrinsic, version 1; found format None, version None"),
+        ("", "hand_eye_calib/extrinsic, version 1 or 2; found format None, version None"),
         ("- 1", "found format None, version None"),
-        (edited(version=2), "expected format .*, version 1; found .*, version 2"),
+        (edited(version=3), "expected format .*, version 1 or 2; found .*, version 3"),
         (edited(format="urdf"), "found format urdf"),
         (edited(T_parent_child={}), "the calibration has no 'matrix'"),
         (edited(T_parent_child={"matrix": [[1.0, 0.0]]}), "was changed after it was written"),
@@ -284,7 +284,9 @@ def test_files_that_cannot_be_read(tmp_path):
         load_result(tmp_path)
 
 
-@pytest.mark.parametrize("changes", [{}, {"warnings": ()}, {"floor": 1e-6 * np.eye(6)}], ids=str)
+@pytest.mark.parametrize(
+    "changes", [{}, {"warnings": ()}, {"covariance_allowance": 1e-6 * np.eye(6)}], ids=str
+)
 def test_documents_follow_the_schema(changes, tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((ROOT / "docs" / "extrinsic.schema.json").read_text(encoding="utf-8"))
@@ -292,14 +294,60 @@ def test_documents_follow_the_schema(changes, tmp_path):
     path = save_result(result, tmp_path)
     for document in (json.loads(json_text(result.to_dict())), yaml.safe_load(path.read_text())):
         jsonschema.validate(document, schema)
-    assert document["observability"][2]["sigma_total"] is None
+    assert document["observability"][2]["sigma_measured"] is None
 
 
-def test_the_total_has_the_floor():
-    document = calibration(floor=1e-6 * np.eye(6)).to_dict()
+def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():
+    document = calibration(covariance_allowance=1e-6 * np.eye(6)).to_dict()
     for name in ("translation", "rpy_deg"):
-        alone, total = (
-            document["T_parent_child"][f"{each}_{name}"] for each in ("sigma", "sigma_total")
+        measured, whole = (
+            document["T_parent_child"][f"{kind}_{name}"] for kind in ("sigma_measured", "sigma")
         )
-        assert all(b is None if a is None else b > a for a, b in zip(alone, total, strict=True))
-    assert document["observability"][0]["sigma_total"] > document["observability"][0]["sigma"]
+        assert all(b is None if a is None else b > a for a, b in zip(measured, whole, strict=True))
+    for row in document["observability"]:
+        assert document["sigma"][row["name"]] == row["sigma"]
+        if row["sigma"] is not None:
+            parts = np.hypot(row["sigma_measured"], row["allowance"])
+            assert row["sigma"] == pytest.approx(parts, rel=1e-12)
+    parts = (document[f"covariance_{part}"]["matrix"] for part in ("measured", "allowance"))
+    finite = np.array(document["covariance"]["matrix"][0], dtype=float)
+    np.testing.assert_allclose(finite, np.sum([part[0] for part in parts], axis=0), rtol=1e-12)
+
+
+def of_version_1(document):
+    """A document as version 1 had it: sigma and covariance without the allowance."""
+    old = {**document, "version": 1, "covariance": document["covariance_measured"]}
+    old["floor"] = document["covariance_allowance"]
+    old["sigma_total"] = document["sigma"]
+    old["observability"] = [
+        {
+            "name": row["name"],
+            "verdict": row["verdict"],
+            "sigma": row["sigma_measured"],
+            "sigma_total": row["sigma"],
+            "frame": row["frame"],
+        }
+        for row in document["observability"]
+    ]
+    for name in ("covariance_measured", "covariance_allowance", "sigma"):
+        del old[name]
+    return old
+
+
+def test_a_document_of_version_1_is_read_with_its_covariance_as_the_measured_part():
+    scatter = AxisScatter(sigma=0.003, of_methods=0.004, of_halves=None)
+    written = calibration(covariance_allowance=1e-6 * np.eye(6))
+    old = of_version_1(written.to_dict()) | {"cross_check": {"x": plain(scatter)}}
+    read = Calibration.from_dict(old)
+    np.testing.assert_array_equal(read.covariance_measured, written.covariance_measured)
+    np.testing.assert_array_equal(read.covariance, written.covariance)
+    np.testing.assert_array_equal(read.sigmas, written.sigmas)
+    np.testing.assert_array_equal(read.allowance, written.allowance)
+    assert read.cross_check["x"].sigma == pytest.approx(np.hypot(0.003, 0.001))
+
+
+def test_a_document_whose_covariance_is_not_the_sum_of_its_parts_is_refused():
+    document = calibration().to_dict()
+    changed = document | {"covariance": {"matrix": (1e-4 * np.eye(6)).tolist()}}
+    with pytest.raises(InputError, match="covariance is not the sum of covariance_measured"):
+        Calibration.from_dict(changed)

@@ -40,7 +40,7 @@ def test_extrinsics_and_closure(rig, found):
     assert found.verdict is not hec.Verdict.DO_NOT_USE
     for sensor, calibration in enumerate(found.calibrations, start=1):
         error = se3.log(se3.inverse(rig.Xs[sensor]) @ calibration.T_parent_child)
-        assert error @ np.linalg.solve(calibration.covariance, error) < 18.5  # one in 200
+        assert error @ np.linalg.solve(calibration.covariance_measured, error) < 18.5  # one in 200
         assert (calibration.parent_frame, calibration.n_poses) == ("lidar", 500)
     chain = found.T("lidar", "front") @ found.T("front", "rear") @ found.T("rear", "lidar")
     np.testing.assert_allclose(chain, np.eye(4), atol=1e-12)
@@ -50,7 +50,7 @@ def test_extrinsics_and_closure(rig, found):
     assert closure.dof == 6
     error = se3.log(se3.inverse(rig.Xs[1]) @ rig.Xs[2] @ found.T("rear", "front"))
     between = se3.adjoint(found.T("front", "rear")) @ np.linalg.cholesky(
-        found.covariance("front", "rear")
+        found.covariance_measured("front", "rear")
     )
     assert (np.linalg.solve(between, error) ** 2).sum() < 18.5
     assert "front" in repr(found)
@@ -62,9 +62,9 @@ def test_two_good_sensors_do_not_suffer_from_a_bad_first_one():
     found = hec.calibrate_rig(trajectories_of(rig))
     direct = found.neighbours[0].T_parent_child
     apart = se3.log(se3.inverse(direct) @ found.T("front", "rear"))
-    sigmas = np.sqrt(np.diag(found.neighbours[0].covariance))
+    sigmas = np.sqrt(np.diag(found.neighbours[0].covariance_measured))
     assert (np.abs(apart) < 0.5 * sigmas).all()
-    own, with_first = (found.covariance(name, "rear") for name in ("front", "lidar"))
+    own, with_first = (found.covariance_measured(name, "rear") for name in ("front", "lidar"))
     assert np.trace(own) < 0.5 * np.trace(with_first)
 
 

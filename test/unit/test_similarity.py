@@ -78,7 +78,7 @@ def test_uncertainty_of_the_scale_enters_that_of_the_extrinsic():
     options = {"reference": "B10", "checks": False}
     estimated = calibrate(parent, child, scale="estimate", **options)
     given = calibrate(parent, child, scale=estimated.scale, **options)
-    assert np.trace(estimated.covariance) > np.trace(given.covariance)
+    assert np.trace(estimated.covariance_measured) > np.trace(given.covariance_measured)
 
 
 def test_a_scale_that_explains_nothing_is_refused():
@@ -195,7 +195,7 @@ class TestClockRate:
         assert abs(found.clock_rate.ppm - 75.0) < min(5.0, 5.0 * found.clock_rate.sigma_ppm)
         assert "ppm slow: solved with time_offset estimate" in found.warnings[0]
         away = se3.log(se3.inverse(plain.T_parent_child) @ found.T_parent_child)
-        assert np.abs(away / np.sqrt(np.diag(plain.covariance))).max() < 0.3
+        assert np.abs(away / np.sqrt(np.diag(plain.covariance_measured))).max() < 0.3
         again = type(found).from_dict(found.to_dict())
         assert again.clock_rate == found.clock_rate
 
@@ -216,7 +216,7 @@ class TestInTheEngine:
         given = calibrate(parent, child, time_offset=estimated.time_offset_s, **options)
         np.testing.assert_array_equal(given.T_parent_child, estimated.T_parent_child)
         assert given.time_offset_sigma_s == 0.0
-        assert np.linalg.eigvalsh(estimated.covariance - given.covariance)[-1] > 0
+        assert np.linalg.eigvalsh(estimated.covariance_measured - given.covariance_measured)[-1] > 0
 
     def test_long_sessions_settle_it_when_a_buffer_is_full(self):
         parent, child = drive(seconds=120, shift_s=0.2)

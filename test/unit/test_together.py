@@ -51,7 +51,7 @@ def test_more_recordings_know_more_and_the_interval_is_honest():
             joint = together(dict(list(recorded.items())[:count]))
             error = deviation(joint.T_parent_child, X)
             found.append(np.linalg.norm(error[:3]))
-            inside.extend(np.abs(error) < 1.645 * joint.sigmas)
+            inside.extend(np.abs(error) < 1.645 * joint.sigmas_measured)
         assert joint.together.kind == "agree"
     assert np.median(errors[6]) < 0.75 * np.median(errors[1])
     assert np.mean(inside) > 0.85
@@ -59,12 +59,12 @@ def test_more_recordings_know_more_and_the_interval_is_honest():
 
 def test_an_axis_that_one_recording_hides_comes_from_another():
     flat = result(shift("z", -0.4), hidden="z", status=SolveStatus.UNOBSERVABLE)
-    hidden = flat.covariance + 9.0 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
-    flat = dataclasses.replace(flat, covariance=hidden)
+    hidden = flat.covariance_measured + 9.0 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
+    flat = dataclasses.replace(flat, covariance_measured=hidden)
     joint = together(named(flat, flat, result()))
     assert joint.status is SolveStatus.OK
     assert deviation(joint.T_parent_child, X) == pytest.approx(np.zeros(6), abs=1e-3)
-    assert joint.sigmas[0] < joint.sigmas[2] < 0.03
+    assert joint.sigmas_measured[0] < joint.sigmas_measured[2] < 0.03
     both = together(named(flat, flat))
     assert both.unobservable() == ["z"]
     assert both.status is SolveStatus.UNOBSERVABLE
@@ -73,13 +73,13 @@ def test_an_axis_that_one_recording_hides_comes_from_another():
 def test_what_all_have_from_one_measurement_by_hand_is_no_better_together():
     axes = tuple(
         dataclasses.replace(dof, verdict=DofVerdict.PRIOR, sigma=0.1) if dof.name == "z" else dof
-        for dof in result().observability
+        for dof in result().observability_measured
     )
-    wide = result().covariance + 0.01 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
-    each = dataclasses.replace(result(), observability=axes, covariance=wide)
+    wide = result().covariance_measured + 0.01 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
+    each = dataclasses.replace(result(), observability_measured=axes, covariance_measured=wide)
     joint = together(named(each, each, each))
     assert joint.observability[2].verdict is DofVerdict.PRIOR
-    assert joint.sigmas[2] == pytest.approx(0.1, rel=0.05)
+    assert joint.sigmas_measured[2] == pytest.approx(0.1, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -241,10 +241,13 @@ def test_an_unknown_axis_is_neither_the_same_nor_moved():
 
 def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
     floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.2) ** 2)])
-    first, second = result(floor=floor), result(shift("yaw", np.radians(0.6)), floor=floor)
+    first, second = (
+        result(covariance_allowance=floor),
+        result(shift("yaw", np.radians(0.6)), covariance_allowance=floor),
+    )
     assert compare([second], Extrinsic(X, "drawing")).verdict == "same"
     assert compare([first, second]).verdict == "moved"
-    known = Extrinsic(X, "earlier result", first.covariance, is_calibration=True)
+    known = Extrinsic(X, "earlier result", first.covariance_measured, is_calibration=True)
     assert axes(compare([second], known).differences[0], "moved") == ["yaw"]
 
 
@@ -265,8 +268,8 @@ def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
     floor = np.diag(np.r_[np.full(3, 0.005**2), np.full(3, np.radians(0.15) ** 2)])
     for seed in range(5):
         first, second = (
-            result(sigmas=sigmas, seed=seed, floor=floor),
-            result(moved, sigmas=sigmas, seed=100 + seed, floor=floor),
+            result(sigmas=sigmas, seed=seed, covariance_allowance=floor),
+            result(moved, sigmas=sigmas, seed=100 + seed, covariance_allowance=floor),
         )
         assert AXES[axis + 3] in axes(compare([first, second]).differences[0], "moved")
         against = compare([second], Extrinsic(X, "drawing")).differences[0]

@@ -139,6 +139,6 @@ class TestShowing:
             dataclasses.replace(dof, sigma=np.inf) if dof.name == "z" else dof
             for dof in result.observability
         )
-        figure = hec.plot(dataclasses.replace(result, observability=hidden))
+        figure = hec.plot(dataclasses.replace(result, observability_measured=hidden))
         assert [len(panel.patches) for panel in figure.axes] == [1, 0, 0]
         assert "Unknown along z: the dashed line." in figure._supxlabel.get_text()

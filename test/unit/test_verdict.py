@@ -64,16 +64,16 @@ CASES = {
     "not_converged": dict(status=SolveStatus.NOT_CONVERGED),
     "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
     "error_finding": dict(findings=(FINDING,)),
-    "nothing_known": dict(observability=observed(np.inf, np.inf)),
+    "nothing_known": dict(observability_measured=observed(np.inf, np.inf)),
     "recordings_differ": dict(together=several("differ")),
-    "unobservable": dict(observability=observed(z=np.inf)),
+    "unobservable": dict(observability_measured=observed(z=np.inf)),
     "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
     "recordings": dict(together=several("one off")),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
     "outliers": dict(n_pairs=100, n_inliers=65),
-    "target": dict(observability=observed(x=0.04, yaw=0.02)),
-    "floor": dict(T_parent_child=np.eye(4), floor=FLOOR),
+    "target": dict(observability_measured=observed(x=0.04, yaw=0.02)),
+    "floor": dict(T_parent_child=np.eye(4), covariance_allowance=FLOOR),
 }
 
 
@@ -114,7 +114,7 @@ def test_sentences_name_axes_values_and_targets(rule, sentence):
 
 @pytest.mark.parametrize("more", [{}, {"roll": 0.02}])
 def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(more):
-    (reason,) = good(**CASES["floor"], observability=observed(x=0.04, **more)).reasons
+    (reason,) = good(**CASES["floor"], observability_measured=observed(x=0.04, **more)).reasons
     assert reason.rule == "target"
     begins = "record longer, with more " if more else "constant odometry errors alone leave x"
     assert reason.what_to_do.startswith(begins)
@@ -123,7 +123,7 @@ def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target
 
 
 def test_axes_that_cannot_be_determined_are_named_together():
-    result = good(observability=observed(z=np.inf, roll=np.inf, yaw=np.inf))
+    result = good(observability_measured=observed(z=np.inf, roll=np.inf, yaw=np.inf))
     sentence = "z and the rotations about x and z cannot be determined from this motion"
     assert result.reasons[0].sentence == sentence
 
@@ -158,11 +158,13 @@ def test_nothing_against_it_is_use():
         dict(cross_check=checked("x", 0.002, 9.0, "halves")),
         dict(cross_check=checked("x", 0.05, 2.9, "methods")),
         dict(cross_check=checked("x", 0.05, 2.9, "halves")),
-        dict(observability=observed(x=0.0199, yaw=0.0052)),
+        dict(observability_measured=observed(x=0.0199, yaw=0.0052)),
         dict(
-            observability=observed(x=0.04, yaw=0.02), target_translation=0.05, target_rotation=0.1
+            observability_measured=observed(x=0.04, yaw=0.02),
+            target_translation=0.05,
+            target_rotation=0.1,
         ),
-        dict(observability=observed(z=0.09), target_axes={"z": 0.1}),
+        dict(observability_measured=observed(z=0.09), target_axes={"z": 0.1}),
         dict(n_pairs=100, n_inliers=70),
     ],
 )
@@ -182,7 +184,7 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
     hidden = good(**CASES["unobservable"])
     assert hidden.headline == "USE WITH CARE: all but z; measure z by hand"
     assert repr(hidden).startswith(f"<Calibration: {hidden.headline}\n")
-    both = good(observability=observed(y=np.inf, z=np.inf))
+    both = good(observability_measured=observed(y=np.inf, z=np.inf))
     assert both.headline == "USE WITH CARE: all but y and z; measure them by hand"
     assert both.reasons[0].what_to_do == (
         "measure them by hand and give prior.y VALUE+/-SIGMA and prior.z VALUE+/-SIGMA"

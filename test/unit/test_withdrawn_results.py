@@ -45,7 +45,7 @@ def dofs(sigma_m=0.005, **verdicts):
 def result(sigma_m=0.005, **fields):
     """A result that is good on all axes, unless the fields say something else."""
     usual = {"status": SolveStatus.OK, "noise": None, "warnings": (), "findings": ()}
-    usual["observability"] = dofs(sigma_m)
+    usual["observability_measured"] = dofs(sigma_m)
     return dataclasses.replace(calibration(), **(usual | fields))
 
 
@@ -267,17 +267,17 @@ class TestOptions:
             (
                 {"prior_z": "0.3+/-0.01"},
                 result(
-                    observability=(
+                    observability_measured=(
                         *dofs()[:2],
                         DofObservability("z", DofVerdict.UNOBSERVABLE, np.inf),
                         *dofs()[3:],
                     )
                 ),
-                result(observability=dofs(z=DofVerdict.PRIOR)),
+                result(observability_measured=dofs(z=DofVerdict.PRIOR)),
             ),
             (
                 {"child_kind": "exact"},
-                result(0.008, floor=np.diag([0.05**2] * 3 + [1e-8] * 3)),
+                result(0.008, covariance_allowance=np.diag([0.05**2] * 3 + [1e-8] * 3)),
                 result(0.008),
             ),
         ],
