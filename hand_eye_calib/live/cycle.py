@@ -1,14 +1,14 @@
 """When the node solves and checks the streams, what came of it, and who waits for the answer."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
-from hand_eye_calib.checks.findings import Finding, Severity
+from hand_eye_calib.checks.findings import Finding, Severity, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.run import with_options
@@ -22,6 +22,7 @@ from hand_eye_calib.live.state import (
     Broadcast,
     ChecksState,
     ExtrinsicState,
+    InputState,
     Level,
     ProgressState,
     ResultState,
@@ -34,7 +35,7 @@ from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.results.context import Comparison
 from hand_eye_calib.results.records import AXES
 from hand_eye_calib.session.goal import Goal
-from hand_eye_calib.text import duration, parse_targets
+from hand_eye_calib.text import duration, listing, parse_targets
 
 # Takes whether a solve was good, and a line about it.
 OnSolved = Callable[[bool, str], None]
@@ -46,11 +47,17 @@ _CHECK_PERIOD_S = 30.0
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
 
 
+# Findings about the poses of one stream as they came in. Once poses are paired, and with that
+# interpolated, they do not show any more.
+_OF_RAW_POSES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
+
+
 class StreamChecks:
     """Keeps the findings of stream checks.
 
     Errors count at once; warnings, and what is merely possible, only if two checks in a row have
-    them: over a short recording, odometry may well be off by some per cent.
+    them: over a short recording, odometry may well be off by some per cent. An error of the poses
+    as they came in stays for the session, because its poses do.
     """
 
     def __init__(self, log: NodeLog) -> None:
@@ -63,6 +70,16 @@ class StreamChecks:
         self._checked_at_s = 0.0
         self._suspected: set[tuple[str, str]] = set()
         self._faults: dict[tuple[str, str], Finding] = {}
+        self._lasting: dict[tuple[str, str], Finding] = {}
+
+    def follow(self, config: CalibratorConfig) -> None:
+        """Forget lasting findings that the options answer."""
+        open_findings = {}
+        for key, finding in self._lasting.items():
+            (graded,) = answered([finding], config)
+            if graded.makes_unusable:
+                open_findings[key] = finding
+        self._lasting = open_findings
 
     def take(self, result: CheckResult) -> None:
         """Take what a check found; what is new, and what no longer holds, is logged."""
@@ -72,6 +89,11 @@ class StreamChecks:
             key: f for key, f in found.items() if f.makes_unusable or key in self._suspected
         }
         self._suspected = set(found)
+        for key, finding in self._faults.items():
+            if finding.makes_unusable and finding.code in _OF_RAW_POSES:
+                self._lasting[key] = finding
+        # Those of this check have the newest numbers.
+        self._faults = {**self._lasting, **self._faults}
         for key in self._faults.keys() - before.keys():
             self._log.warning(_in_parameters(self._faults[key]))
         for key in before.keys() - self._faults.keys():
@@ -81,6 +103,11 @@ class StreamChecks:
     def findings(self) -> tuple[Finding, ...]:
         """What speaks against calibrating with these streams, the gravest first."""
         return tuple(self._faults.values())
+
+    def _unseen(self) -> list[Finding]:
+        """Lasting findings that the last check does not have."""
+        keys = {(each.code, each.stream) for each in self._result.findings} if self._result else ()
+        return [finding for key, finding in self._lasting.items() if key not in keys]
 
     def faults(self) -> tuple[str, ...]:
         """The findings against calibrating, in a line each, with the parameters that help."""
@@ -94,7 +121,7 @@ class StreamChecks:
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
             return ChecksState(level=Level.WARN, text=text)
-        found = self._result.findings
+        found = gravest_first([*self._result.findings, *self._unseen()])
         return ChecksState(
             level=Level.WARN if self._faults else Level.OK,
             text="; ".join(self.faults()) or "both streams can be of one rigid body",
@@ -179,6 +206,7 @@ class SolveCycle:
         """
         self._certain, self._told = {}, ()
         self._is_unchecked, self._check_due_s = True, 0.0
+        self.checks.follow(config)
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
         others = before.given.difference(_TARGETS), config.given.difference(_TARGETS)
@@ -389,9 +417,15 @@ class SolveCycle:
         return "; ".join((text, *said, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
-        if calibration.measured != "poses" or calibration.findings == self.checks.findings:
-            return calibration  # of other streams it has its own
-        return replace(calibration, findings=self.checks.findings)
+        findings = self.checks.findings
+        if calibration.measured != "poses":  # it has its own
+            own = {(each.code, each.stream) for each in calibration.findings}
+            others = [each for each in findings if (each.code, each.stream) not in own]
+            lasting = [each for each in others if each.code in _OF_RAW_POSES]
+            findings = gravest_first([*calibration.findings, *lasting])
+        if calibration.findings == findings:
+            return calibration
+        return replace(calibration, findings=findings)
 
     def _report(self, failure: Failure) -> str:
         if failure.details:
@@ -453,10 +487,12 @@ class SolveCycle:
             return Level.WARN, failure.what
         return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
 
-    def progress_state(self, why_not_compared: str) -> ProgressState:
+    def progress_state(
+        self, why_not_compared: str, pause: tuple[Level, str] = (Level.OK, "")
+    ) -> ProgressState:
         """Each axis against its target, the seconds left, and what to do now; WARN while somebody
         should do something else than go on. ``why_not_compared`` with what is installed: empty if
-        that was not asked for.
+        that was not asked for. ``pause`` is why no poses come in, and how grave that is.
         """
         progress, result = self.goal.progress, self.result
         is_well = self.standing is Standing.CURRENT and not progress.is_faulty
@@ -464,12 +500,34 @@ class SolveCycle:
         comparison = result.comparison if result is not None else None
         if comparison is None and why_not_compared:
             comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
+        is_paused = bool(pause[1]) and not progress.done
+        level = Level.OK if may_go_on else Level.WARN
+        text = progress.sentence
+        if not progress.is_faulty:
+            text = self.problem or (pause[1] if is_paused else text)
         return ProgressState(
-            level=Level.OK if may_go_on else Level.WARN,
-            text=progress.sentence if progress.is_faulty else self.problem or progress.sentence,
+            level=max(level, pause[0]) if is_paused else level,
+            text=text,
+            is_paused=is_paused,
             progress=progress,
             comparison=comparison,
         )
+
+
+def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Level, str]:
+    """Why the session gets no poses, and whether a person should act; no text if it gets some."""
+    if not accepts_poses:
+        return Level.WARN, "Paused: not accepting poses; call ~/set_enabled to go on."
+    paused = {name: state for name, state in inputs.items() if state.is_paused}
+    if not paused:
+        return Level.OK, ""
+    level = max(state.level for state in paused.values())
+    longest_s = max(state.silent_s or 0.0 for state in paused.values())
+    streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
+    if len(paused) < len(inputs):
+        level = Level.WARN
+    remedy = "start its source again" if level > Level.OK else "go on driving, or save"
+    return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
 
 
 def is_refuted(result: Calibration) -> bool:

@@ -24,7 +24,7 @@ from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import REPORT_PERIOD_S, InputState, Level
-from hand_eye_calib.text import MUCH_NULL, share
+from hand_eye_calib.text import MUCH_NULL, listing, share
 
 # Share of lost messages from which on somebody should look.
 _MUCH_LOST = 0.01
@@ -45,6 +45,9 @@ NEAR_NS, _PERIODS, _LONGEST_PAUSE_NS = 1_000_000_000, 5, 60_000_000_000
 # A stream is silent after so long (s). After one has jumped back, the others' messages of before
 # are left out for as long.
 SILENT_AFTER_S = 2.0
+
+# A session is paused after so long (s), or so many periods of the stream, without a pose.
+PAUSED_AFTER_S, PAUSED_PERIODS = 5.0, 5
 
 Stamped = tuple[int, Any]
 
@@ -99,7 +102,7 @@ class StampGuard:
             self._begin()
         elif self.last_ns is not None:
             self._outdated_until_s = now_s + SILENT_AFTER_S
-            self._outdated_until_s += 2 * WITNESSES * self._period_ns() * 1e-9
+            self._outdated_until_s += 2 * WITNESSES * self.period_ns() * 1e-9
 
     def resume(self, last_ns: int | None) -> None:
         """Go on with a session whose newest stamp this is."""
@@ -107,14 +110,14 @@ class StampGuard:
         if last_ns is not None:
             self._recent_ns.append(last_ns)
 
-    def _period_ns(self) -> float:
+    def period_ns(self) -> float:
         """Median interval of the messages taken last."""
         intervals = [late - early for early, late in itertools.pairwise(sorted(self._recent_ns))]
         return statistics.median(intervals) if intervals else 0.0
 
     def _is_near(self, stamp_ns: int) -> bool:
         apart_ns = min((abs(stamp_ns - each) for each in self._recent_ns), default=math.inf)
-        return apart_ns <= NEAR_NS or apart_ns <= _PERIODS * self._period_ns()
+        return apart_ns <= NEAR_NS or apart_ns <= _PERIODS * self.period_ns()
 
     def _take(self, messages: list[Stamped]) -> list[Stamped]:
         stamps_ns = [stamp_ns for stamp_ns, _ in messages]
@@ -159,6 +162,8 @@ class PoseInput:
         Whether poses are taken.
     problem : str
         Why there is none; empty if that is not known.
+    publishers : tuple of str or None
+        Names of the nodes that publish on the topic, one for each publisher; None for transforms.
     """
 
     def __init__(
@@ -177,6 +182,8 @@ class PoseInput:
         self._arrived, self._lost, self._null = 0, 0, 0
         self._next_number: int | None = None
         self._arrived_s: float | None = None
+        self._taken_s: float | None = None
+        self.publishers: tuple[str, ...] | None = None
         self._bad, self._bad_at_s = "", -np.inf
         self._counts = deque([(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._last_stamp_ns: int | None = None
@@ -195,6 +202,7 @@ class PoseInput:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
         self._last_stamp_ns, self._longest_gap_ns = None, 0
+        self._taken_s = None
         self._is_new = because_of is None
         if because_of is None:
             self._guard.restart()
@@ -268,7 +276,9 @@ class PoseInput:
                 if not self._session.engines.add_pose(*fields):
                     which = with_stamp(stamp_ns)
                     self._log.debug(f"{self.topic}: message {which} is repeated or too late")
-                elif self._session.journal is not None:
+                    continue
+                self._taken_s = self._arrived_s
+                if self._session.journal is not None:
                     self._session.journal.poses.append(fields)
             except NoPoseError as error:
                 self.leave_out(with_stamp(stamp_ns), error)
@@ -283,6 +293,17 @@ class PoseInput:
     def is_silent(self, steady_s: float) -> bool:
         """Whether messages have come, but not lately."""
         return self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
+
+    def silent_s(self, steady_s: float) -> float | None:
+        """Seconds without a pose; None before the first of the session."""
+        return None if self._taken_s is None else steady_s - self._taken_s
+
+    def is_paused(self, steady_s: float) -> bool:
+        """Whether poses were taken, but none for long."""
+        silent_s = self.silent_s(steady_s)
+        if silent_s is None or not self.is_enabled:
+            return False
+        return silent_s > max(PAUSED_AFTER_S, PAUSED_PERIODS * self._guard.period_ns() * 1e-9)
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
         """What has come in; to be called once a second or oftener. ``may_rest`` if silence is
@@ -312,6 +333,9 @@ class PoseInput:
             refused=refused | dict(sorted(self._refused.items())),
             lost=None if self._next_number is None else self._lost,
             longest_gap_s=self._longest_gap_ns * 1e-9,
+            publishers=None if self.publishers is None else len(self.publishers),
+            is_paused=self.is_paused(steady_s),
+            silent_s=self.silent_s(steady_s),
         )
 
     def _advice(self, null_share: float, taken: StreamStatistics) -> str:
@@ -337,17 +361,44 @@ class PoseInput:
             return Level.WARN, ": ".join(filter(None, [text, self.problem]))
         if steady_s - self._bad_at_s < _REPORTS:
             return Level.ERROR, f"{self.topic}: {self._bad}"
-        if self.is_silent(steady_s):
-            text = f"{self.topic} has been silent for {steady_s - self._arrived_s:.0f} s"
+        if text := self._why_paused(steady_s):
             if not may_rest:
                 self._log.info(text, GOES_ON_S)
             return (Level.OK if may_rest else Level.WARN), text
+        if self.publishers is not None and len(self.publishers) > 1:
+            text = self._several()
+            self._log.warning(text)
+            return Level.WARN, text
         if lost_share < _MUCH_LOST:
             return Level.OK, f"{rate_hz:.1f} Hz"
         advice = "give the node more processor time, or publish at a lower rate"
         text = f"{lost_share:.1%} of the messages are lost: {advice}"
         self._log.warning(f"{self.topic}: {text}")
         return Level.WARN, f"{rate_hz:.1f} Hz; {text}"
+
+    def _why_paused(self, steady_s: float) -> str:
+        """Why no poses come in any more; empty if they do, or if that is not known yet."""
+        if self._taken_s is not None and not self.is_paused(steady_s):
+            return ""
+        arrived_s = math.inf if self._arrived_s is None else steady_s - self._arrived_s
+        if arrived_s > PAUSED_AFTER_S:
+            text = f"{self.topic} has been silent for {arrived_s:.0f} s"
+            return text if self.publishers != () else f"{text}: it has no publisher any more"
+        if self._taken_s is None:
+            return ""
+        without_s = steady_s - self._taken_s
+        return (
+            f"{self.topic} has messages, but no new pose for {without_s:.0f} s: their stamps stand "
+            "still or are too late, or their poses are null; see to its source"
+        )
+
+    def _several(self) -> str:
+        """That several publishers share the topic."""
+        names = listing(sorted(self.publishers or ()))
+        return (
+            f"{self.topic} has {len(self.publishers or ())} publishers, {names}: poses of several "
+            "sources mix; stop all but one, or give each its own topic, and reset"
+        )
 
 
 def repeated_stamps(stamp_ns: int) -> str:

@@ -22,9 +22,12 @@ from typing import Any
 
 from hand_eye_calib.alignment.time_offset import TimeOffset
 from hand_eye_calib.assessment.excitation import Excitation, excitation
-from hand_eye_calib.checks.check import CheckResult, can_check
+from hand_eye_calib.checks.check import MIN_DURATION_S, CheckResult, can_check
+from hand_eye_calib.checks.findings import answered, gravest_first
+from hand_eye_calib.checks.streams import check_positions, check_stream
 from hand_eye_calib.engine.calibrator import Calibrator
 from hand_eye_calib.engine.run import check, review, with_options
+from hand_eye_calib.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.live.state import GRACE_S
 from hand_eye_calib.option import Options
@@ -41,6 +44,9 @@ _NICENESS = 3
 
 # A job that has taken this long (s) hangs: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
+
+# Fewest poses of a stream, not paired yet, that are checked as they came in.
+_FEWEST_RAW = 200
 
 NO_MOTION = excitation(PosePairs.empty())
 
@@ -117,7 +123,36 @@ def answer(job: Job) -> Answer:
                     done = replace(done, calibration=run.calibration)
     except Exception as error:  # the node reports it
         done = replace(done, failure=done.failure or _failure(error))
+    if done.check is not None:
+        done = replace(done, check=with_raw_findings(done.check, as_came))
     return replace(done, seconds=time.monotonic() - start_s)
+
+
+def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
+    """Add the errors of the newest poses as they came in, if the older ones are paired.
+
+    A check of a session sees the pairs, of which one stream is interpolated: poses of two sources
+    that alternate do not show there. Of 232 windows of right recordings, none has such an error;
+    one in 15 has jumps enough for a warning, which is left to the check of the pairs.
+    """
+    if not len(snapshot.kept):
+        return result
+    config = snapshot.config
+    findings = [*result.findings]
+    for stream, trajectory in zip(STREAMS, snapshot.unpaired, strict=True):
+        if len(trajectory) < _FEWEST_RAW or trajectory.duration_s < MIN_DURATION_S / 2:
+            continue
+        if config.measured == "poses":
+            of_stream = check_stream(trajectory, stream, config.max_gap)
+        else:
+            # Without positions of both, those of the other are no measurements.
+            scale = 1.0 if config.measured == "positions" else 0.0
+            of_stream = check_positions(trajectory.scaled(scale), stream, config.max_gap)
+        seen = {(finding.code, finding.stream) for finding in findings}
+        for finding in answered(of_stream, config):
+            if finding.makes_unusable and (finding.code, finding.stream) not in seen:
+                findings.append(finding)
+    return replace(result, findings=gravest_first(findings))
 
 
 def _failure(error: Exception) -> Failure:

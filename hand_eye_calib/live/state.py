@@ -116,10 +116,12 @@ class ExtrinsicState(Part):
 @dataclass(frozen=True, kw_only=True)
 class ProgressState(Part):
     """How far the session is from its goal; the text says what to do now. Standard deviations are
-    along and about the axes of the parent sensor's frame. The comparison of the result with what is
-    installed is only a sentence while it cannot be made.
+    along and about the axes of the parent sensor's frame. The session is paused while poses do not
+    come in, before its goal. The comparison of the result with what is installed is only a sentence
+    while it cannot be made.
     """
 
+    is_paused: bool = False
     progress: Progress
     comparison: Comparison | None
 
@@ -127,7 +129,8 @@ class ProgressState(Part):
 @dataclass(frozen=True, kw_only=True)
 class InputState(Part):
     """What an input has delivered. ``lost`` messages were published and never arrived, None if the
-    middleware does not tell.
+    middleware does not tell. ``publishers`` of its topic are there, None for transforms. The input
+    is paused if it has delivered poses, but none for ``silent_s``.
     """
 
     topic: str
@@ -137,6 +140,9 @@ class InputState(Part):
     refused: Mapping[str, int]
     lost: int | None
     longest_gap_s: float
+    publishers: int | None = None
+    is_paused: bool = False
+    silent_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 from hand_eye_calib.config import NodeConfig, other_names
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.io.transforms import TfSource
-from hand_eye_calib.live.cycle import SolveCycle, priors_of
+from hand_eye_calib.live.cycle import SolveCycle, pause_of, priors_of
 from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.live.log import GOES_ON_S, NodeLog
@@ -215,16 +215,23 @@ class CalibratorNode(Node):
 
     def _state(self) -> NodeState:
         cycle, name, steady_s = self._cycle, self.get_fully_qualified_name(), time.monotonic()
-        # A robot that rests, once there is a result, has nothing more to show.
-        may_rest = all(each.is_silent(steady_s) for each in self._inputs[:2])
-        may_rest &= cycle.result is not None
-        inputs = {each.name: each.state(steady_s, may_rest) for each in self._inputs}
+        # A robot that rests, once there is a result, has nothing more to show. Who has no publisher
+        # any more does not rest, unless the goal is reached.
+        rests = cycle.published is not None
+        rests &= all(each.is_silent(steady_s) for each in self._inputs[:2])
+        is_done = cycle.goal.progress.done
+        inputs = {
+            each.name: each.state(steady_s, rests and (is_done or each.publishers != ()))
+            for each in self._inputs
+        }
         if self._mount is not None:
             return NodeState(node=name, mount=self._mount.state(), inputs=inputs)
         return NodeState(
             node=name,
             extrinsic=cycle.extrinsic_state(self._inputs[0].is_enabled, self._tf.state),
-            progress=cycle.progress_state(self._robot.why_not_compared),
+            progress=cycle.progress_state(
+                self._robot.why_not_compared, pause_of(inputs, self._inputs[0].is_enabled)
+            ),
             inputs=inputs,
             checks=cycle.checks.state(),
             journal=self._session.journal_state(self._options.node),

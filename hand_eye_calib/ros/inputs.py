@@ -61,6 +61,7 @@ class TopicInput(RosInput):
         self._relative_topic = f"{name}_odom"
         super().__init__(name, node.resolve_topic_name(self._relative_topic), parts)
         self._node, self._wanted_type, self._n_publishers = node, wanted_type, 0
+        self._type_name = ""
 
     def discover(self) -> None:
         """Subscribe as soon as the type is known; to be called often.
@@ -73,6 +74,11 @@ class TopicInput(RosInput):
         # Of the topic as resolved: rclpy's count does not follow remaps itself.
         publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
         self._n_publishers = len(publishers)
+        self.publishers = tuple(
+            f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+            for publisher in publishers
+            if self._type_name in ("", publisher.topic_type)
+        )
         self.problem = self._why_deaf(publishers) or counted(len(publishers), "publisher")
         is_wanted = self._wanted_type != "auto"
         offered = {each.topic_type for each in publishers}
@@ -123,6 +129,7 @@ class TopicInput(RosInput):
                 f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
             ) from error
         self._subscribed = [(subscription, callback)]
+        self._type_name = type_name
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
     def _receive(self, data: bytes, info: Mapping[str, int]) -> None:

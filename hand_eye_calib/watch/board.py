@@ -34,7 +34,7 @@ from hand_eye_calib.text import amount, capital, change, duration, fixed, two_di
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 MOVED = "MOUNT MOVED"
-CHANGE_MOTION = "CHANGE THE MOTION"
+CHANGE_MOTION, PAUSED = "CHANGE THE MOTION", "PAUSED"
 _ADVICE = "; check it, then recalibrate or acknowledge"
 
 # The answer to a button is shown for so long (s).
@@ -263,7 +263,7 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
         (Tone.BAD, "CHECK THE PRIOR", extrinsic if is_contradicted else None, Level.WARN),
         *((Tone.BAD, "BAD INPUT", each, Level.ERROR) for each in inputs),
         (Tone.BAD, "BROKEN", None if is_safe else state.journal, Level.ERROR),
-        *((Tone.ACT, "CHECK INPUT", each, Level.WARN) for each in inputs),
+        *((Tone.ACT, _word_of(each, at is not None), each, Level.WARN) for each in inputs),
         (Tone.ACT, "CHECK THE STREAMS", checks, Level.WARN),
         (Tone.ACT, "OLD RESULT", extrinsic if is_outdated else None, Level.WARN),
         (Tone.ACT, "NOT WATCHING", mount, Level.WARN),
@@ -283,11 +283,18 @@ def _headline(state: NodeState) -> tuple[Tone, str, str]:
     if at.progress.done:
         moved = _moved(at.comparison)
         return Tone.ACT if moved else Tone.GOOD, "DONE", _of_done(state, moved, sentence)
+    if at.is_paused:
+        return Tone.ACT if at.level >= Level.WARN else Tone.BUSY, PAUSED, sentence
     if _result_of(state) is None:
         return Tone.BUSY, "START", sentence
     if at.level >= Level.WARN:
         return Tone.ACT, CHANGE_MOTION, sentence
     return Tone.BUSY, "GO ON", sentence
+
+
+def _word_of(part: InputState, calibrates: bool) -> str:
+    """The word for an input that a person should look at."""
+    return PAUSED if calibrates and part.is_paused else "CHECK INPUT"
 
 
 def _of_done(state: NodeState, moved: str, sentence: str) -> str:

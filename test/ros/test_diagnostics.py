@@ -147,6 +147,34 @@ def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_n
     state(lambda each: disabled in each.extrinsic.text)
 
 
+def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_node, peer, state):
+    start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
+    publishers = peer.publishers()
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
+    peer.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
+    state(lambda each: each.extrinsic.result and not each.progress.is_paused)
+    second = peer.publisher(publishers[1].msg_type, "child_odom")
+    found = state(lambda each: each.inputs["child"].publishers == 2).inputs["child"]
+    assert found.level is Level.WARN
+    assert "/child_odom has 2 publishers, /peer and /peer: poses of several sources" in found.text
+    for publisher in (publishers[1], second):
+        peer.node.destroy_publisher(publisher)
+
+    later_ns = itertools.count(int(stamps_ns[-1]) + 10**8, 10**8)
+
+    def only_the_parent_goes_on(each):
+        made = message(publishers[0].msg_type, next(later_ns), Ts_pw_p[-1], "lidar")
+        publishers[0].publish(made)
+        return each.progress.is_paused
+
+    found = state(only_the_parent_goes_on, "the pause")
+    assert found.progress.level is Level.WARN
+    assert found.progress.text.startswith("Paused: no pose of child (/child_odom) for ")
+    gone = "it has no publisher any more"
+    found = state(lambda each: gone in each.inputs["child"].text, "the end of the publisher")
+    assert (found.inputs["child"].publishers, found.inputs["child"].level) == (0, Level.WARN)
+
+
 def test_too_little_driving_is_said_also_where_time_does_not_run(start_node, peer, state):
     start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())

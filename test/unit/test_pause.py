@@ -1,0 +1,185 @@
+"""Poses that stop coming: which stream, since when, and what a person sees."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from result_making import good_calibration, seen
+
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.io.transforms import PoseFields
+from hand_eye_calib.live import cycle as cycle_module
+from hand_eye_calib.live import input as module
+from hand_eye_calib.live.cycle import SolveCycle, pause_of
+from hand_eye_calib.live.input import PoseInput
+from hand_eye_calib.live.log import NodeLog
+from hand_eye_calib.live.session import LiveSession
+from hand_eye_calib.live.solving import Answer
+from hand_eye_calib.live.state import Broadcast, Level, NodeState
+from hand_eye_calib.watch.board import Board, Tone
+
+RATE_HZ = 10.0
+
+
+@pytest.fixture
+def node(monkeypatch):
+    """Both inputs of a session on a clock of its own, and the state that the node would publish."""
+    nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
+    monkeypatch.setattr(cycle_module, "SolvingProcess", lambda wake: nothing)
+    now = [1000.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
+    log = NodeLog(SimpleNamespace(**silent))
+    session = LiveSession(log, CalibratorConfig())
+    inputs = [
+        PoseInput(name, f"/{name}_odom", session, log, lambda each: None)
+        for name in ("parent", "child")
+    ]
+    for source in inputs:
+        source.publishers = ("/driver",)
+    targets = CalibratorConfig().targets
+    cycle = SolveCycle(session, log, print, lambda each: each, print, targets)
+    cycle.ask(lambda good, text: None)
+    return SimpleNamespace(now=now, inputs=inputs, cycle=cycle)
+
+
+def pose_at(stamp_ns):
+    return PoseFields(stamp_ns, "world", None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def run(node, seconds, senders=("parent", "child"), stamps_stand=False):
+    """Let time pass, with poses of the senders."""
+    for _ in range(round(seconds * RATE_HZ)):
+        node.now[0] += 1.0 / RATE_HZ
+        stamp_ns = round((100.0 if stamps_stand else node.now[0]) * 1e9)
+        pose = pose_at(stamp_ns)
+        for source in node.inputs:
+            if source.name in senders:
+                source.accept(stamp_ns, lambda pose=pose: pose)
+
+
+def state_of(node, may_rest=False):
+    inputs = {each.name: each.state(node.now[0], may_rest) for each in node.inputs}
+    pause = pause_of(inputs, node.inputs[0].is_enabled)
+    return NodeState(
+        node="/calibrator",
+        inputs=inputs,
+        extrinsic=node.cycle.extrinsic_state(True, (Broadcast.OFF, "")),
+        progress=node.cycle.progress_state("", pause),
+    )
+
+
+def view_of(state):
+    board = Board()
+    board.take(state, 0.0)
+    return board.view(0.5)
+
+
+def with_result(node, motion_s=20.0):
+    found = good_calibration(warnings=())
+    node.cycle.conclude(Answer(0, 0.1, seen(motion_s), found))
+
+
+def test_a_stream_that_stops_pauses_the_session_and_is_named(node):
+    run(node, 20.0)
+    with_result(node)
+    assert view_of(state_of(node)).word == "GO ON"
+    run(node, 4.5, senders=["parent"])
+    assert view_of(state_of(node)).word == "GO ON"
+    run(node, 2.5, senders=["parent"])
+    state, view = state_of(node), view_of(state_of(node))
+    assert (state.inputs["child"].level, state.inputs["parent"].level) == (Level.WARN, Level.OK)
+    assert state.inputs["child"].text == "/child_odom has been silent for 7 s"
+    assert (state.progress.level, state.progress.is_paused) == (Level.WARN, True)
+    assert state.progress.text == (
+        "Paused: no pose of child (/child_odom) for 7.0 s; start its source again."
+    )
+    assert (view.word, view.tone) == ("PAUSED", Tone.ACT)
+    assert "/child_odom" in view.sentence
+    run(node, 1.0)
+    assert view_of(state_of(node)).word == "GO ON"
+
+
+@pytest.mark.parametrize("stream", ["parent", "child"])
+def test_messages_that_give_no_pose_are_no_sign_of_life(node, stream):
+    run(node, 20.0)
+    with_result(node)
+    other = "child" if stream == "parent" else "parent"
+    last_ns = round(node.now[0] * 1e9)
+    for _ in range(80):
+        run(node, 0.1, senders=[other])
+        pose = pose_at(last_ns)
+        source = next(each for each in node.inputs if each.name == stream)
+        source.accept(last_ns, lambda pose=pose: pose)
+    state = state_of(node)
+    assert state.inputs[stream].level is Level.WARN
+    assert "has messages, but no new pose for 8 s: their stamps stand still" in (
+        state.inputs[stream].text
+    )
+    assert (state.progress.is_paused, view_of(state).word) == (True, "PAUSED")
+
+
+def test_a_publisher_that_has_gone_is_named_and_a_parked_robot_asks_for_nothing(node):
+    run(node, 20.0)
+    with_result(node)
+    run(node, 8.0, senders=[])
+    parked = state_of(node, may_rest=True)
+    assert {each.level for each in parked.inputs.values()} == {Level.OK}
+    assert (parked.progress.level, parked.progress.is_paused) == (Level.OK, True)
+    assert parked.progress.text == (
+        "Paused: no pose of parent (/parent_odom) and child (/child_odom) for 8.0 s; "
+        "go on driving, or save."
+    )
+    assert (view_of(parked).word, view_of(parked).tone) == ("PAUSED", Tone.BUSY)
+    node.inputs[1].publishers = ()
+    dead = state_of(node, may_rest=False)
+    assert dead.inputs["child"].text == (
+        "/child_odom has been silent for 8 s: it has no publisher any more"
+    )
+    assert (dead.progress.level, view_of(dead).tone) == (Level.WARN, Tone.ACT)
+
+
+def test_a_session_that_is_done_is_not_paused(node):
+    run(node, 20.0)
+    for motion_s in (40.0, 42.0, 44.0):
+        with_result(node, motion_s)
+    run(node, 8.0, senders=[])
+    state = state_of(node, may_rest=True)
+    assert (state.progress.is_paused, view_of(state).word) == (False, "DONE")
+
+
+def test_a_node_that_accepts_no_poses_is_paused(node):
+    run(node, 20.0)
+    with_result(node)
+    for source in node.inputs:
+        source.is_enabled = False
+    run(node, 8.0)
+    state = state_of(node)
+    assert {each.level for each in state.inputs.values()} == {Level.OK}
+    assert state.progress.text == "Paused: not accepting poses; call ~/set_enabled to go on."
+    assert (state.progress.level, view_of(state).word) == (Level.WARN, "PAUSED")
+
+
+def test_a_slow_stream_is_not_paused_between_its_poses(node):
+    for k in range(12):
+        node.now[0] += 4.0
+        stamp_ns = round((100.0 + 4.0 * k) * 1e9)
+        pose = pose_at(stamp_ns)
+        node.inputs[0].accept(stamp_ns, lambda pose=pose: pose)
+    assert node.inputs[0].silent_s(node.now[0]) == pytest.approx(0.0)
+    assert not node.inputs[0].is_paused(node.now[0] + 12.0)
+    assert node.inputs[0].is_paused(node.now[0] + 21.0)
+
+
+def test_two_publishers_on_one_topic_are_a_warning_with_their_names(node):
+    run(node, 20.0)
+    with_result(node)
+    node.inputs[1].publishers = ("/vio", "/bag")
+    state = state_of(node)
+    assert (state.inputs["child"].level, state.inputs["child"].publishers) == (Level.WARN, 2)
+    assert state.inputs["child"].text.startswith(
+        "/child_odom has 2 publishers, /bag and /vio: poses of several sources mix; stop all but"
+    )
+    view = view_of(state)
+    assert (view.word, view.tone) == ("CHECK INPUT", Tone.ACT)
+    assert np.all([line.tone is Tone.ACT for line in view.health if line.name == "child input"])
