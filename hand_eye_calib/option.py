@@ -14,6 +14,9 @@ OptionValue: TypeAlias = bool | int | float | str
 Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
+# Whole numbers are smaller: those of parameters of ROS have 64 bits.
+_LARGEST_INT = 1 << 63
+
 _GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
@@ -66,6 +69,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+def _of_python(value: object) -> object:
+    """Return the Python value of a scalar of NumPy, such as ``np.float64(0.1)``; others as is."""
+    is_scalar = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
+    return value.item() if is_scalar else value  # type: ignore[attr-defined]
+
+
 def check_value(field: OptionField, value: object) -> OptionValue:
     """Check a value of an option and give it the option's own type.
 
@@ -76,6 +85,9 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         says what is allowed.
     """
     meta, name, words = field.metadata, option_name(field), field.metadata["words"]
+    value = _of_python(value)
+    if type(value) is int and not -_LARGEST_INT < value < _LARGEST_INT:
+        raise ConfigError(f"{name}: the number is too large")
     kind: type = float if words else type(field.default)
     if isinstance(value, str) and (value in words or kind is str):
         if meta["choices"] is not None and value not in meta["choices"]:

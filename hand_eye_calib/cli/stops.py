@@ -62,7 +62,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         target = target_images.Target.parse(arguments.target)
         finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
         for image in with_progress(images, len(images), "finding the target"):
-            finder.look(target_images.image_in(image.read_bytes(), image))
+            finder.look(target_images.read_image(image))
         seen = finder.found()
         n_child = len(seen.images)
         note(str(seen))

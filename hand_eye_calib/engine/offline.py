@@ -2,6 +2,7 @@
 
 import inspect
 import textwrap
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Literal, TypeAlias
 
@@ -14,7 +15,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
-from hand_eye_calib.text import AXIS_UNITS, Prior
+from hand_eye_calib.text import AXIS_UNITS, Prior, shown_value
 from hand_eye_calib.upstairs import upstairs
 
 MethodName: TypeAlias = Literal[
@@ -105,7 +106,7 @@ def calibrate(
     first, second = parent, child
     if not (isinstance(first, Trajectory) and isinstance(second, Trajectory)):
         first, second = upstairs("io.trajectory_files.reading", "read_trajectories")(first, second)
-    values |= prior_fields(prior or {})
+    values |= prior_fields({} if prior is None else prior)
     named = [each for each in fields(CalibratorConfig) if each.name in values]
     given = {option_name(each): values[each.name] for each in named}
     found = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
@@ -137,6 +138,10 @@ def prior_fields(prior: Prior) -> dict[str, str]:
     ConfigError
         If an axis is unknown or its value is not a text or a pair of numbers.
     """
+    if not isinstance(prior, Mapping):
+        raise ConfigError(
+            f"prior must be a mapping such as {{'z': (1.85, 0.02)}}; got {shown_value(prior)}"
+        )
     fields = {}
     for axis, known in prior.items():
         if axis not in AXIS_UNITS:

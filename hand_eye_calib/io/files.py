@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.errors import InputError, printable
 
 # ---- all files
 
@@ -33,8 +33,15 @@ BLOCK_BYTES = 4 << 20
 
 #: Bytes of a YAML file.
 LARGEST_YAML = 1 << 20
+#: Whole numbers are smaller: they fit 64 bits, as in messages and files of other programs.
+LARGEST_INT = 1 << 63
 #: Levels of nesting.
 DEEPEST_YAML = 32
+
+# ---- .npz
+
+#: Bytes of all arrays of a file. The poses of 100,000 stops take 26 million.
+LARGEST_ARRAYS = 64 << 20
 
 # ---- trajectory files
 
@@ -93,8 +100,9 @@ def open_regular(path: str | Path) -> BufferedReader:
         file = open(  # noqa: SIM115
             path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)
         )
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
+    except (OSError, ValueError) as error:  # a ValueError for a path with a zero byte
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot read {printable(str(path))}: {reason}") from None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()

@@ -1,5 +1,6 @@
 """Poses of a camera from images of a target: a ChArUco board, or an AprilGrid as of Kalibr."""
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,10 +12,13 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.files import read_bytes
 from hand_eye_calib.io.yaml_files import read_yaml
 from hand_eye_calib.text import angle, length
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+# Largest image that is decoded: twice that of the largest camera sensors in industry, 65 million.
+_MOST_PIXELS = 130_000_000
 # How OpenCV turns images of ROS into grey ones; its names of Bayer patterns begin with another row.
 _TO_GREY = {
     **dict.fromkeys(("mono8", "8UC1"), ""),
@@ -123,18 +127,35 @@ def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The images of a folder in the order of their names, numbers by their value."""
-    found = [path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES]
-    numbers = re.compile(r"(\d+)")
-    return sorted(
-        found, key=lambda path: [int(x) if x.isdigit() else x for x in numbers.split(path.name)]
-    )
+    """Return the images of a folder in the order of their names, numbers by their value."""
+    images = [path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES]
+    return sorted(images, key=lambda path: _by_number(path.name))
+
+
+def _by_number(name: str) -> list[tuple[int, str]]:
+    """Return a key that sorts names with numbers by the value of these."""
+    parts = re.split("([0-9]+)", name)
+    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts]
+
+
+def read_image(path: Path) -> Any:
+    """Read an image file in grey.
+
+    Raises
+    ------
+    InputError
+        If it is no regular file, no image, or one of too many pixels.
+    """
+    return image_in(read_bytes(path), path)
 
 
 def image_in(data: Any, where: object) -> Any:
-    """The image in the bytes of an image file, in grey."""
+    """Return the image in the bytes of an image file, in grey; ``where`` is for messages."""
     cv2 = _opencv()
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        raise InputError(f"{where} has more than {_MOST_PIXELS:,} pixels, or is damaged") from None
     if image is None:
         raise InputError(f"{where} is not an image that can be read")
     return image
@@ -264,6 +285,8 @@ class TargetFinder:
 
 
 def _opencv() -> Any:
+    # A file of 1 MB may unpack to more memory than there is. OpenCV reads this when it is imported.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MOST_PIXELS))
     cv2 = required("cv2", "finding a target in images", "hand_eye_calib[camera]")
     if not hasattr(cv2.aruco, "CharucoDetector"):
         raise MissingDependencyError(

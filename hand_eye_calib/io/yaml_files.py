@@ -13,10 +13,18 @@ from typing import Any
 import yaml
 
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.files import DEEPEST_YAML, LARGEST_YAML, LONGEST_NAME, read_text
+from hand_eye_calib.io.files import (
+    DEEPEST_YAML,
+    LARGEST_INT,
+    LARGEST_YAML,
+    LONGEST_NAME,
+    read_text,
+)
 from hand_eye_calib.plain import plain
 from hand_eye_calib.text import shortened
 
+# Characters of a whole number: 64 binary digits, with signs between them.
+_LONGEST_INT = 100
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 # libyaml is several times as fast, and part of most builds.
@@ -46,6 +54,18 @@ class _Loader(_Base):
                 raise ValueError(f"the key {name[:40]!r} appears twice, line {line}")
             seen.add(name)
         return super().construct_mapping(node, deep)
+
+
+def _whole_number(loader: Any, node: Any) -> int:
+    """Return a whole number, of any base: ``0xff...`` of any length would be one, too."""
+    is_short = len(node.value) <= _LONGEST_INT
+    number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
+    if abs(number) >= LARGEST_INT:
+        raise ValueError(f"a whole number is too large, line {node.start_mark.line + 1}")
+    return number
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 
 
 def read_yaml(path: str | Path, expected: str = "YAML") -> Any:

@@ -18,6 +18,7 @@ from hand_eye_calib.engine import offline
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.io.results import load_result, save_result
 from hand_eye_calib.io.trajectory_files.table import write_trajectory
+from hand_eye_calib.io.yaml_files import read_yaml
 
 PARENT = motions.as_trajectory(motions.wandering_poses(30), sensor_frame="lidar")
 CHILD = motions.as_trajectory(
@@ -261,3 +262,14 @@ def test_saved_files_are_well_formed_for_any_name_of_a_frame(tmp_path, frame):
         content = (tmp_path / name).read_text()
         assert all(letter.isprintable() or letter == "\n" for letter in content)
     assert load_result(tmp_path).parent_frame == frame
+
+
+@pytest.mark.parametrize("number", ["0x" + "f" * 5000, "1" * 5000, "0b" + "1" * 5000, "9" * 20])
+def test_whole_numbers_of_yaml_are_of_64_bits(tmp_path, number):
+    path = tmp_path / "config.yaml"
+    path.write_text(f"# options\nmax_pairs: {number}\n")
+    with pytest.raises(
+        InputError, match="config.yaml is not YAML that can be read: .*line 2"
+    ) as caught:
+        read_yaml(path)
+    one_line(caught)

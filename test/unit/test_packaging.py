@@ -166,11 +166,24 @@ def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
     bounded = [Requirement(text) for text in requirements if ">=" in text]
     assert len(bounded) > 6
     for requirement in bounded:
-        bound = next(iter(requirement.specifier)).version
+        (bound,) = [each.version for each in requirement.specifier if each.operator == ">="]
         pin = pins[requirement.name]
         assert pin == bound or pin.startswith(bound + "."), (
             f"{requirement.name}: pinned {pin}, lower bound {bound}"
         )
+
+
+def test_libraries_that_the_package_runs_with_have_an_upper_bound(declared):
+    of_developers = {"test", "lint", "coverage"}
+    of_users = list(declared["install_requires"])
+    for extra, requirements in declared["extras_require"].items():
+        if extra not in of_developers:
+            of_users += requirements
+    assert len(of_users) > 15
+    for requirement in map(Requirement, of_users):
+        is_of_ros = requirement.name.startswith("ros-jazzy-")
+        has_bound = any(each.operator == "<" for each in requirement.specifier)
+        assert has_bound or is_of_ros, f"{requirement.name} has no upper bound"
 
 
 def test_pip_install_gives_the_commands(source, tmp_path):

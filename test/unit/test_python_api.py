@@ -208,3 +208,39 @@ class TestAnswerOfTheMethod:
         np.testing.assert_array_equal(loaded.T_method, result.T_method)
         del document["T_method"]
         assert hec.Calibration.from_dict(document).T_method is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("threshold", np.float32(0.5)),
+        ("threshold", np.float64(0.02)),
+        ("threshold", np.array(0.02)),
+        ("max_pairs", np.int64(40)),
+        ("min_pairs", np.uint8(3)),
+        ("time_offset", np.float64(0.0)),
+        ("method", np.str_("park")),
+    ],
+)
+def test_scalars_of_numpy_are_options_like_those_of_python(name, value):
+    config = CalibratorConfig(**{name: value})
+    assert getattr(config, name) == value.item()
+    assert type(getattr(config, name)).__module__ == "builtins"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**5000, -(10**400), 1 << 64, np.array([1.0, 2.0]), 1j],
+    ids=["huge", "negative", "65 bits", "array", "complex"],
+)
+@pytest.mark.parametrize("name", ["max_pairs", "threshold", "time_offset", "method"])
+def test_numbers_that_no_option_can_have_are_refused_in_one_line(name, value):
+    with pytest.raises(ConfigError, match=name) as caught:
+        CalibratorConfig(**{name: value})
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("prior", [float("nan"), 3, "z=1", [("z", 1)], {"z": 5}, {"z": (1, 2, 3)}])
+def test_a_prior_of_another_form_is_refused_with_an_example(prior):
+    with pytest.raises(ConfigError, match="prior"):
+        hec.calibrate(*streams(), prior=prior)

@@ -91,7 +91,7 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
         bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
         for bag, *_ in groups
     ]
-    stems = told_apart([str(Path(path).with_suffix("")) for path in paths])
+    stems = told_apart([str(_without_suffix(Path(path))) for path in paths])
     tasks: list[Task] = []
     names = {STATE, TABLE, INDEX, VEHICLES}
     for group, stem in zip(groups, stems, strict=True):
@@ -105,6 +105,11 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
             of = match[1].strip(".") if match else ""
         tasks.append(Task(name=name, bags=tuple(group), vehicle=of, **common))
     return tasks
+
+
+def _without_suffix(path: Path) -> Path:
+    """Return a path without the last suffix; the root of the file system has no name."""
+    return path.with_suffix("") if path.name else path
 
 
 def matching(pattern: str) -> list[str]:

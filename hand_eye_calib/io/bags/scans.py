@@ -27,6 +27,7 @@ from hand_eye_calib.errors import InputError, printable, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import PoseTable, Run, ns_of
 from hand_eye_calib.io.bags.sources import Reading
+from hand_eye_calib.io.npz import read_arrays
 
 # numpy's name of each datatype of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -130,7 +131,8 @@ class ScanReading(Reading):
         self._place = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
         self._kept: list[Any] = []
         # The errors are of many kinds: it is not there, cut off, or of an older version.
-        with suppress(Exception), np.load(self._place, allow_pickle=False) as kept:
+        with suppress(Exception):
+            kept = read_arrays(self._place)
             if np.array_equal(kept["bag_files"], self._state):
                 self._kept, self.topics = [kept[name] for name in _KEPT], ()
                 return

@@ -9,10 +9,11 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import reduce
+from itertools import chain, islice
 from operator import xor
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
 _GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
 # Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
+# Lines of a Motive file that may stand before the rows: it has 7 (format version 1.25).
+_MOTIVE_HEADER_LINES = 20
 _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
 
 # The names of the columns, the rows, and what a person should know.
@@ -58,17 +61,37 @@ def foreign_table(
         raise InputError(f"cannot read {path}: {read}")
     try:
         header, rows, notes = read(data, choice)
-        rows = [[*map(str, row)] for row in rows]
-        if not rows:
-            raise ValueError("no poses in it")
     except MissingDependencyError:
         raise
     except Exception as error:  # of many kinds, in a file that is not what it begins like
-        reason = shortened(" ".join(str(error).split()), LONGEST_NAME)
-        raise InputError(f"cannot read {path}: {reason or type(error).__name__}") from None
+        raise _unreadable(path, error) from None
     table = Table(path, (*header,), measures)
     table.guesses = [f"{path}: {note}" for note in notes]
-    return table.fill(enumerate(rows, 1), list)
+    return table.fill(enumerate(_text_rows(path, rows), 1), list)
+
+
+def _text_rows(path: str | Path, rows: Iterable[Sequence[Any]]) -> Iterator[list[str]]:
+    """Yield the cells of rows as text, one row at a time: a file may have millions of them.
+
+    Raises
+    ------
+    InputError
+        If there is no row, or one cannot be read.
+    """
+    is_empty = True
+    try:
+        for row in rows:
+            yield [str(cell) for cell in row]
+            is_empty = False
+    except Exception as error:  # of many kinds, in a file that is not what it begins like
+        raise _unreadable(path, error) from None
+    if is_empty:
+        raise _unreadable(path, ValueError("no poses in it"))
+
+
+def _unreadable(path: str | Path, error: Exception) -> InputError:
+    reason = shortened(" ".join(str(error).split()), LONGEST_NAME)
+    return InputError(f"cannot read {path}: {reason or type(error).__name__}")
 
 
 def _lines(data: bytes) -> list[str]:
@@ -217,7 +240,8 @@ def _of_images(names: Sequence[str], poses: FloatArray, *notes: str) -> _Rows:
 
 def _of_motive(data: bytes, choice: str | None) -> _Rows:
     """A take of OptiTrack's Motive with rigid bodies."""
-    lines = [*csv.reader(_lines(data))]
+    all_lines = csv.reader(_lines(data))
+    lines = [*islice(all_lines, _MOTIVE_HEADER_LINES)]
     top = next((row for row, cells in enumerate(lines) if "Time (Seconds)" in cells), 0)
     kinds = next((row for row in range(1, top) if "Rigid Body" in lines[row]), None)
     if kinds is None:
@@ -234,7 +258,8 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     about = dict(zip(lines[0][::2], lines[0][1::2], strict=False))
     units = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
     places = [lines[top].index("Time (Seconds)"), *(found[body][name] for name in _POSE)]
-    rows = [[row[k] for k in places] for row in lines[top + 1 :] if len(row) > max(places)]
+    table = chain(lines[top + 1 :], all_lines)
+    rows = ([row[place] for place in places] for row in table if len(row) > max(places))
     unit = units[about.get("Length Units", "Meters")]
     header = ("t [s]", *(f"{axis} [{unit}]" for axis in POSITION), *QUATERNION)
     return header, filter(all, rows), [f"poses of rigid body {body}"]
@@ -242,8 +267,9 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
 
 def _of_vicon(data: bytes, choice: str | None) -> _Rows:
     """Segments of Vicon Nexus or Tracker, whose rotations are rotation vectors."""
-    lines = [*csv.reader(_lines(data))]
-    rate_hz, names, columns, units = float(lines[1][0]), lines[2], lines[3], lines[4]
+    all_lines = csv.reader(_lines(data))
+    _, (rate, *_), names, columns, units = islice(all_lines, 5)
+    rate_hz = float(rate)
     if "RX" not in columns:
         raise ValueError("Vicon without segments: export Segments or Objects (global), not markers")
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
@@ -251,7 +277,7 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
     at, place = starts[body], columns.index("TX", starts[body])
     rows = (
         [int(cells[0]) / rate_hz, *cells[at : place + 3]]
-        for cells in lines[5:]
+        for cells in all_lines
         if len(cells) >= place + 3 and all(cells[at : place + 3])
     )
     kind, turns = "rotation vectors", [f"{name} [{units[at]}]" for name in ROTATION_VECTOR]
@@ -272,6 +298,10 @@ def _of_pcd(data: bytes, _: str | None) -> _Rows:
     names, sizes = about["FIELDS"], zip(about["TYPE"], about["SIZE"], strict=True)
     if form == b"ascii":
         return names, map(str.split, _lines(body)), ()
+    if form != b"binary":
+        raise ValueError(
+            "its points are compressed; unpack them: pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1"
+        )
     kinds = zip(names, [f"<{kind.lower()}{size}" for kind, size in sizes], strict=True)
     return names, np.frombuffer(body, [*kinds], int(about["POINTS"][0])).tolist(), ()
 
