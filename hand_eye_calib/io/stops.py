@@ -7,7 +7,6 @@ Read are the samples of MoveIt's calibration (YAML of ``effector_wrt_world``,
 """
 
 import re
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of, pose_stack
+from hand_eye_calib.io.npz import read_arrays
 from hand_eye_calib.io.yaml_files import read_yaml
 
 # Names of both poses of a sample, the robot's first.
@@ -90,7 +90,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     (40, 4, 4)
     """
     is_npz = Path(path).suffix == ".npz"
-    document: Any = _arrays(path) if is_npz else read_yaml(path, _EXPECTED)
+    document: Any = read_arrays(path) if is_npz else read_yaml(path, _EXPECTED)
     if isinstance(document, Mapping):
         with located(path):
             if samples := _of_opencv(document):
@@ -116,15 +116,6 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
             poses.append([pose_of(value) for value in _pair(sample)])
     robot, tracking = np.swapaxes(poses, 0, 1)
     return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
-
-
-def _arrays(path: str | Path) -> dict[str, FloatArray]:
-    """The arrays of an .npz by their names."""
-    try:
-        with np.load(path, allow_pickle=False) as stacks:
-            return {name: stacks[name] for name in stacks}
-    except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
 
 
 def _rows_of_stacks(

@@ -11,6 +11,7 @@ import json
 import os
 import re
 import resource
+import sqlite3
 import subprocess
 import sys
 
@@ -328,3 +329,18 @@ def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
     path.write_bytes(zstd.compress(bytes(300 * MIB)))
     with pytest.raises(InputError, match="unpacks to more than 256 times .* not believable"):
         PoseBag(path)
+
+
+@pytest.mark.parametrize("time", ["1e300", "-1e300", "9.3e18", "'text'"])
+def test_a_time_that_is_none_costs_its_message_or_gives_one_line(tmp_path, capsys, time):
+    write_bag(tmp_path / "bag", STREAMS, storage="sqlite3")
+    with sqlite3.connect(bag_making.storage_file(tmp_path / "bag")) as database:
+        database.execute(f"UPDATE messages SET timestamp = {time} WHERE id = 41")
+    code = main(["calibrate", str(tmp_path / "bag"), *TOPICS, "--method", "dnlo"])
+    notes = capsys.readouterr().err
+    if time == "'text'":
+        assert code == 1
+        assert "damaged" in notes
+    else:
+        assert code in (0, 3)
+        assert "1 poses were left out: their stamps jump" in notes

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 import struct
+import tracemalloc
 from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
@@ -390,3 +391,21 @@ def test_of_several_bodies_one_is_named(tmp_path):
         read_trajectory_file(tmp_path / "vicon.csv", AUTO)
     found = read_trajectory_file(tmp_path / "vicon.csv", AUTO, columns="cart:cart").trajectory
     np.testing.assert_allclose(found.poses[:, :3, 3], 2 * P, atol=1e-9)
+
+
+def test_a_take_of_many_markers_needs_memory_for_its_poses_alone(tmp_path):
+    """A take of OptiTrack has hundreds of columns of which seven are read."""
+    lines = of_motive().splitlines()
+    markers = ",".join(["0.123456"] * 300)
+    path = tmp_path / "take.csv"
+    path.write_text("\n".join([*lines, *(f"{lines[-1]},{markers}" for _ in range(3_000))]))
+    size = path.stat().st_size
+    tracemalloc.start()
+    try:
+        trajectory = hec.read_trajectory(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert size > 5_000_000
+    assert len(trajectory) == N
+    assert peak < 6 * size

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
@@ -318,7 +319,17 @@ class PoseBag:
             for kind in {id(each): each for each, _, _ in block}.values():
                 data = [data for each, _, data in block if each is kind]
                 bag_ns = [bag_ns for each, bag_ns, _ in block if each is kind]
-                yield Run(kind, data, np.array(bag_ns))
+                yield Run(kind, data, _bag_times(bag_ns))
+
+
+def _bag_times(bag_ns: Sequence[int]) -> IntArray:
+    """Return times as int64 (N,); a damaged bag may have times beyond, which get its limits."""
+    try:
+        return np.array(bag_ns, dtype=np.int64)
+    except OverflowError:
+        limits = np.iinfo(np.int64)
+        inside = [min(max(time_ns, limits.min), limits.max) for time_ns in bag_ns]
+        return np.array(inside, dtype=np.int64)
 
 
 def _parent_first(topic: str) -> tuple[int, str]:
