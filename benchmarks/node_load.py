@@ -311,7 +311,8 @@ def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
     ]
     if may_lose:
         rows = [(what, value, "", True) for what, value, _, _ in rows]
-    return rows + [
+    return [
+        *rows,
         ("messages lost, as reported", str(reported), "within 2 %", is_reported),
         ("callback p50 / p99 / p99.9 / max (ms)", callbacks, "", True),
         ("CPU (cores)", f"{seen['cpu']:.2f}", "", True),

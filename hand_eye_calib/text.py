@@ -3,9 +3,9 @@ and as they type them. Every place that prints or reads a quantity takes it from
 """
 
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import PurePath
 from typing import TypeAlias
 
@@ -130,14 +130,21 @@ def listing(words: Sequence[str]) -> str:
 
 
 def told_apart(paths: Sequence[str]) -> list[str]:
-    """Paths without the beginning and the end that all share: monday and tuesday of a/monday/bag
-    and a/tuesday/bag.
+    """Return paths without the beginning and the end that all share.
+
+    Of a/monday/bag and a/tuesday/bag these are monday and tuesday.
     """
-    whole = [PurePath(path).parts for path in paths]
-    first = len(os.path.commonprefix(whole))
-    parts = [each[first:] or each[-1:] for each in whole]
-    shared = len(os.path.commonprefix([each[::-1] for each in parts]))
-    return ["/".join(each[: len(each) - shared] or each[-1:]) for each in parts]
+    names = [PurePath(path).parts for path in paths]
+    first = _n_shared(names)
+    rest = [parts[first:] or parts[-1:] for parts in names]
+    last = _n_shared([parts[::-1] for parts in rest])
+    return ["/".join(parts[: len(parts) - last] or parts[-1:]) for parts in rest]
+
+
+def _n_shared(paths: Sequence[Sequence[str]]) -> int:
+    """Return how many names all paths begin with."""
+    levels = zip(*paths, strict=False)
+    return sum(1 for _ in takewhile(lambda names: len(set(names)) == 1, levels))
 
 
 def counted(count: int, noun: str) -> str:

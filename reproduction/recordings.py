@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ class Recording:
                 between(self.parent, first - _MARGIN_NS, last + _MARGIN_NS),
                 between(self.child, first, last, child_ns),
             )
-            for first, last in zip(edges_ns[:-1], edges_ns[1:], strict=True)
+            for first, last in pairwise(edges_ns)
         ]
 
 

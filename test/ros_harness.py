@@ -77,7 +77,7 @@ def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS, sigma_rad=5e-5)
     be one stream computed from the other.
     """
     s = np.arange(n_poses) * period_ns * 1e-9
-    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + [0.0, 1.0, 0.0]) * [0.5, 0.4, 0.8]
+    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [0.5, 0.4, 0.8]
     places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
@@ -116,9 +116,15 @@ def matrix(transform):
 # looked for the file of each module, too, as rclpy does with the first line of a log.
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
-    ["pytest", "ros_harness", "hand_eye_calib.cli.calibrator", "hand_eye_calib.ros.node"]
-    + ["hand_eye_calib.ros.calibrator_node", "rosidl_generator_py"]
-    + ["type_description_interfaces.msg"]
+    [
+        "pytest",
+        "ros_harness",
+        "hand_eye_calib.cli.calibrator",
+        "hand_eye_calib.ros.node",
+        "hand_eye_calib.ros.calibrator_node",
+        "rosidl_generator_py",
+        "type_description_interfaces.msg",
+    ]
 )
 inspect.getmodule(inspect.currentframe())
 

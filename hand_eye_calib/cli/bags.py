@@ -23,7 +23,7 @@ from hand_eye_calib.option import Options
 _LONGEST_PAUSE_S, _LONGEST_OVERLAP_S = 60.0, 1.0
 
 
-class SeveralRecordings(InputError):
+class SeveralRecordingsError(InputError):
     """Bags that are not parts of one recording; ``groups`` are the bags of each."""
 
     def __init__(self, reason: str, groups: list[list[Path]]) -> None:
@@ -34,13 +34,16 @@ class SeveralRecordings(InputError):
 def read_recording(
     paths: Sequence[Path], wanted: Mapping[str, str], options: Mapping[str, Any]
 ) -> Recording:
-    """The recording of a journal, of a bag or of the parts of one, with SeveralRecordings if they
-    are not; journals are recordings of their own. Sources must be wanted by name if a bag leaves a
-    choice; the options are those that somebody gave.
+    """Read the recording of a journal, of a bag or of the parts of one.
+
+    Sources must be wanted by name if a bag leaves a choice; the options are those that somebody
+    gave. Journals are recordings of their own; SeveralRecordingsError if the bags are such, too.
     """
     journal = next(filter(None, map(journal_in, paths)), None)
     if journal and len(paths) > 1:
-        raise SeveralRecordings(f"{journal} is a session of its own", [[path] for path in paths])
+        raise SeveralRecordingsError(
+            f"{journal} is a session of its own", [[path] for path in paths]
+        )
     if journal is None:
         return _read_bags(paths, wanted, CalibratorConfig.from_options(dict(options)))
     if wanted:
@@ -127,8 +130,9 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]
 
 
 def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> None:
-    """Raise SeveralRecordings for bags that are not parts of one recording: parts have different
-    topics, or follow each other at once.
+    """Raise SeveralRecordingsError for bags that are not parts of one recording.
+
+    Parts have different topics, or follow each other at once.
     """
     groups: list[list[_Part]] = []
     reason = ""
@@ -142,7 +146,7 @@ def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> Non
         else:
             groups.append([part])
     if len(groups) > 1:
-        raise SeveralRecordings(reason, [[part.path for part in group] for group in groups])
+        raise SeveralRecordingsError(reason, [[part.path for part in group] for group in groups])
 
 
 class _Part(NamedTuple):

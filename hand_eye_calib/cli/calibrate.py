@@ -191,7 +191,7 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
         try:
             recording = bags.read_recording(paths, options.sources_from(arguments), given)
-        except bags.SeveralRecordings as several:
+        except bags.SeveralRecordingsError as several:
             from hand_eye_calib.cli.batch.run import run_together
 
             note(f"{several.reason}; they give one result, as recordings of one rig")

@@ -51,7 +51,7 @@ class Run:
 
     calibration: Calibration
     snapshot: Snapshot
-    check: checking.CheckResult = checking.CheckResult(())
+    check: checking.CheckResult = field(default_factory=lambda: checking.CheckResult(()))
     options: Options = field(default_factory=dict)
     told: tuple[str, ...] = ()
 

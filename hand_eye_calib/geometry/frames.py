@@ -73,7 +73,9 @@ def pose_of(*values: Any) -> FloatArray:
         If it is none.
     """
     parts = [numbers_of(value) for value in values]
-    sizes, flat, T = tuple(map(len, parts)), np.array(sum(parts, [])), np.eye(4)
+    sizes = tuple(map(len, parts))
+    flat = np.array([number for part in parts for number in part])
+    T = np.eye(4)
     if not np.isfinite(flat).all():
         raise InputError("a number is not finite")
     if sizes in ((16,), (12,)):

@@ -23,7 +23,7 @@ _SINGULAR_COSINE = 1e-7
 def skew(vectors: ArrayLike) -> FloatArray:
     """Matrices S (..., 3, 3) of vectors (..., 3), with ``S @ v == cross(vector, v)``."""
     vectors = np.asarray(vectors, dtype=float)
-    matrices: FloatArray = np.zeros(vectors.shape + (3,))
+    matrices: FloatArray = np.zeros((*vectors.shape, 3))
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
     matrices[..., 1, 0], matrices[..., 2, 0], matrices[..., 2, 1] = z, -y, x
@@ -53,7 +53,7 @@ def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Fl
     """Transforms (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3), m."""
     rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    transforms = np.zeros(shape + (4, 4))
+    transforms = np.zeros((*shape, 4, 4))
     transforms[..., :3, :3] = rotation
     transforms[..., :3, 3] = translation
     transforms[..., 3, 3] = 1.0
@@ -84,7 +84,7 @@ def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
     rotations = np.asarray(transforms, dtype=float)[..., :3, :3]
     quats = _scaled_quats(rotations.reshape(-1, 3, 3))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    return quats.reshape(rotations.shape[:-2] + (4,))
+    return quats.reshape((*rotations.shape[:-2], 4))
 
 
 def to_rows(transforms: ArrayLike) -> FloatArray:
@@ -280,7 +280,7 @@ def adjoint(transforms: ArrayLike) -> FloatArray:
     """
     transforms = np.asarray(transforms, dtype=float)
     rotation = transforms[..., :3, :3]
-    matrices = np.zeros(transforms.shape[:-2] + (6, 6))
+    matrices = np.zeros((*transforms.shape[:-2], 6, 6))
     matrices[..., :3, :3] = rotation
     matrices[..., 3:, 3:] = rotation
     matrices[..., :3, 3:] = skew(transforms[..., :3, 3]) @ rotation

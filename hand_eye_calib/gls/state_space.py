@@ -18,6 +18,7 @@ whitened columns ``Y = L^-1 U' W Z``.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -285,7 +286,7 @@ class Posterior:
         ends = np.linspace(0, n, min(TUNING.n_parts, n) + 1).astype(int).tolist()
         known = np.zeros((size + n_columns, size + n_columns))
         totals = [np.zeros((n_columns, n_columns))]
-        for start, end in zip(ends[:-1], ends[1:], strict=True):
+        for start, end in pairwise(ends):
             form = self._form_of_part(start, end)
             # States at the start, at the end, columns; what is known of the start so far is added.
             here = np.r_[np.arange(size), np.arange(2 * size, len(form))]

@@ -8,7 +8,7 @@ twice, aliases, and documents that are too large or too deep; all in one line.
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -36,11 +36,11 @@ class _Loader(_Base):
     """YAML's safe loader for the values of JSON alone."""
 
     # Without dates, 2024-13-45 is a text like any other.
-    yaml_implicit_resolvers = {
+    yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
         for first, resolvers in _Base.yaml_implicit_resolvers.items()
     }
-    yaml_constructors = {
+    yaml_constructors: ClassVar = {
         tag: construct
         for tag, construct in _Base.yaml_constructors.items()
         if tag is None or tag.rpartition(":")[2] in _TAGS

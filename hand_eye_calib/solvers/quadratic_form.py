@@ -129,7 +129,7 @@ def monomials(T_parent_child: FloatArray) -> FloatArray:
     """Products ``x_i x_j`` (..., 91) of two variables of transforms (..., 4, 4), doubled off the
     diagonal, which map condensed forms to costs.
     """
-    entries = T_parent_child.reshape(T_parent_child.shape[:-2] + (16,))
+    entries = T_parent_child.reshape((*T_parent_child.shape[:-2], 16))
     first = entries.take(_X_IN_T[_ROWS], axis=-1)
     return first * (entries.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY)
 

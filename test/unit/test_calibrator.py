@@ -289,5 +289,5 @@ def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
     assert check(sound).findings == ()
     assert len(sound.unpaired[0]) < 150 < 250 < len(sound.streams[0])
     late = play(by_stamp(parent, reordered(child)), max_pairs=max_pairs, time_offset=0.5).snapshot()
-    assert [finding.code for finding in check(late).findings][0] == "quaternion_order"
+    assert check(late).findings[0].code == "quaternion_order"
     assert late.streams[1].stamps_ns[0] in child.stamps_ns

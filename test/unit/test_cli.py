@@ -131,7 +131,7 @@ def test_json_is_one_document_on_stdout(run, new_bag):
 def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path):
     first, second = drive()
     write_bag(tmp_path / "named", {"/a": (second, ODOMETRY), "/base_link/odom": (first, ODOMETRY)})
-    code, out, err = run("check", tmp_path / "named")
+    code, out, _err = run("check", tmp_path / "named")
     assert code == 0
     assert "parent is /base_link/odom\nchild is /a\n" in out
 

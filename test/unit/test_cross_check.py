@@ -57,7 +57,7 @@ def moved(calibration, metres):
 
 
 def test_answers_to_good_data_agree_and_few_or_odd_ones_do_not_count(answers):
-    calibration, others, halves = answers
+    calibration, others, _halves = answers
     found = compare_answers(*answers)
     assert contradictions(*answers) == []
     assert (column(found, "of_methods") < 4 * column(found, "sigma")).all()

@@ -134,7 +134,7 @@ def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cyc
         code="inverse", severity=Severity.ERROR, what="inverse poses", advice="invert"
     )
     found = CheckResult(findings=(finding,))
-    good, text = answered(cycle, 46.0, check=found)
+    _good, text = answered(cycle, 46.0, check=found)
     assert cycle.result.verdict is Verdict.DO_NOT_USE
     assert text.startswith("DO NOT USE: ")
     assert not cycle.goal.progress.done

@@ -139,7 +139,7 @@ def of_lio_sam():
 def of_rows(header, *values, separator=","):
     """Numbers below a header, each value (N, ...) one or several columns."""
     columns = [np.reshape(each, (N, -1)).tolist() for each in values]
-    rows = (sum(row, []) for row in zip(*columns, strict=True))
+    rows = ([cell for part in row for cell in part] for row in zip(*columns, strict=True))
     return header + joined(rows, separator)
 
 

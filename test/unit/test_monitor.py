@@ -16,7 +16,7 @@ SECOND_NS = 1_000_000_000
 def motion(duration_s, seed=0, flat=False, sigma=(0.003, 0.002), start_s=0.0, rate_hz=10.0):
     """Pose pairs with white errors, that turn about all axes or about z only."""
     s = start_s + np.arange(round(duration_s * rate_hz)) / rate_hz
-    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + [0.0, 1.0, 0.0]) * [0.5, 0.4, 0.8]
+    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [0.5, 0.4, 0.8]
     turns *= [0, 0, 1] if flat else [1, 1, 1]
     places = np.stack([s, 2.0 * np.sin(0.5 * s), np.zeros_like(s)], axis=1)
     Ts = se3.from_rotation_translation(se3.rotation_exp(turns), places)

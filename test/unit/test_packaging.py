@@ -51,8 +51,11 @@ DECLARED_AS = {
     **{name: ("ros-jazzy-rclpy", name) for name in ("rclpy", "rcl_interfaces")},
     **{
         name: ("ros-jazzy-common-interfaces", name)
-        for name in ("builtin_interfaces", "std_srvs")
-        + tuple(f"{kind}_msgs" for kind in ("diagnostic", "geometry", "nav", "sensor", "std"))
+        for name in (
+            "builtin_interfaces",
+            "std_srvs",
+            *tuple(f"{kind}_msgs" for kind in ("diagnostic", "geometry", "nav", "sensor", "std")),
+        )
     },
     # tf2_msgs is not among the wheels; publish_tf alone needs it.
     **{name: (None, name) for name in ("ament_index_python", "launch", "launch_ros", "tf2_msgs")},
@@ -117,8 +120,8 @@ def third_party_imports(folder, calls=r"import_module|required\("):
 
 def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
     keys = {element.text for element in MANIFEST.iter("exec_depend")}
-    requirements = declared["install_requires"] + sum(declared["extras_require"].values(), [])
-    requirements = {Requirement(requirement).name for requirement in requirements}
+    requirements = [declared["install_requires"], *declared["extras_require"].values()]
+    requirements = {Requirement(text).name for texts in requirements for text in texts}
     imported = third_party_imports(ROOT / PACKAGE) | third_party_imports(ROOT / "launch")
     assert {"numpy", "scipy", "rclpy"} <= imported
     for name in imported:

@@ -201,7 +201,7 @@ def partial():
 
 @pytest.mark.parametrize("name", ["positions", "rates"])
 def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, name):
-    calibration, text, page = partial[name]
+    _calibration, _text, page = partial[name]
     shown = [*FIGURES]
     shown = [each for each in shown if name != "rates" or each not in ("views", "trajectories")]
     assert [attributes["id"] for attributes in page.all("figure")] == [
@@ -318,7 +318,7 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     to_parent = se3.from_rotation_translation(np.eye(3), np.array([0.5, 0.0, 0.0]))
     installed = Extrinsic(to_parent @ calibration.T_parent_child, "robot.urdf <b>")
     compared = with_comparison(calibration, installed)
-    text, page = page_of(snapshot, compared)
+    _text, page = page_of(snapshot, compared)
     assert "installed" in [attributes["aria-labelledby"] for attributes in page.all("section")]
     shown = page.text[page.text.index("axis of lidar difference") : page.text.rindex("Evidence")]
     (difference,) = hec.compare([calibration], installed).differences

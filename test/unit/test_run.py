@@ -104,7 +104,7 @@ def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
 
 
 def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(streams):
-    parent, child, expected = streams
+    parent, child, _expected = streams
     as_it_is = hec.calibrate(parent, written_otherwise(child, REPAIRS[0]), child_invert="none")
     assert as_it_is.verdict is Verdict.DO_NOT_USE
     assert as_it_is.reasons[0].options == {"child_invert": "poses"}

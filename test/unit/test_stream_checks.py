@@ -115,8 +115,8 @@ class TestTwoSensorsInOneStream:
 
 def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     seconds = np.arange(400) * 0.05
-    turns = np.sin(np.outer(seconds, [0.7, 0.9, 0.1]) + [0.0, 1.0, 0.0]) * [0.3, 0.2, 1.2]
-    places = np.outer(seconds, [0.05, 0.07, 0.8]) + [0.0, 0.0, np.pi / 2]
+    turns = np.sin(np.outer(seconds, [0.7, 0.9, 0.1]) + np.array([0.0, 1.0, 0.0])) * [0.3, 0.2, 1.2]
+    places = np.outer(seconds, [0.05, 0.07, 0.8]) + np.array([0.0, 0.0, np.pi / 2])
     places = np.sin(places) * [20.0, 20.0, 0.5]
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     noisy = motions.disturbed(motions.child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-3, 1e-3)

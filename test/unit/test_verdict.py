@@ -194,7 +194,7 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
 def test_a_file_keeps_what_the_verdict_comes_from():
     result = good(**CASES["error_finding"] | CASES["target"])
     document = result.to_dict()
-    assert list(document)[0] == "verdict"
+    assert next(iter(document)) == "verdict"
     assert document["verdict"] == "DO_NOT_USE"
     assert Calibration.from_dict(document).reasons == result.reasons
     assert document["reasons"][0] == {

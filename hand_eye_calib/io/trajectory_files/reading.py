@@ -262,8 +262,9 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
     if len(paths) < len(sources):
         return [read_trajectory(each, AUTO) for each in sources]
     readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])
-    for text in (text for _, *texts in readings for text in sum(texts, [])):
-        warnings.warn(text, UserWarning, stacklevel=3)
+    for reading in readings:
+        for text in (*reading.repairs, *reading.guesses):
+            warnings.warn(text, UserWarning, stacklevel=3)
     return [reading.trajectory for reading in readings]
 
 
