@@ -4,7 +4,6 @@ little of the motion unexplained and yet spoil the extrinsic.
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import starmap
 from typing import TypeAlias
 
 import numpy as np
@@ -13,14 +12,11 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.checks.hypotheses import MIN_PAIRS, StreamPair
 from hand_eye_calib.checks.response import Regression, delays, response
-from hand_eye_calib.checks.streams import USUAL
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between, pairs_over
+from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.solvers.all_pairs import align_rotation_vectors
-from hand_eye_calib.stats import median, quantile
+from hand_eye_calib.stats import median
 from hand_eye_calib.text import angle, length, listing
 
 #: X (4, 4) and its standard deviations (6,), (rho, phi).
@@ -65,24 +61,6 @@ _MOST, _SOME = 0.3, 0.1
 _SHORT_S, _MOST_SHORT = 1.0, 6000
 _DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
-
-# Orientations agree better than those of two sensors (in all recordings, 1.3 times) to this angle
-# (rad) and share of the rotation, and as copies do to a hundredth of it: rounding to five digits.
-_ALIKE = np.radians(0.08), 0.005
-
-# Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
-# upper half of their spectra both have so many times more than what remains, in positions or
-# orientations; sensors that shake together at most 1.2 and 16 times more. They are white (the
-# quarters of that half differ by less than the first), or what remains is not: it falls as motion
-# does, more steeply than errors that add up. Times when both accelerate so many times more than
-# usual are left out: an impulse is white as well. So is motion that intervals are too long for:
-# noise of orientations is a small share of the squared rotation.
-_FLAT, _ABRUPT, _LITTLE_NOISE = 1.75, 4.0, 1e-3
-_SHARED = np.array([3.0, 30.0])
-
-# Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
-# compared: a hundredth of them, at least and at most so many.
-_NEAREST = (40, 300)
 
 
 def check_agreement(
@@ -290,83 +268,3 @@ def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Susp
                 shift_m = max(displaced_m, min(smoothing_s * speed, LIMITS["smoothed"][-1]))
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": displaced_m}
                 yield fast.share(*groups), graded("smoothed", stream, shift_m, **values)
-
-
-def check_independent(given: StreamPair, aligned: StreamPair) -> list[Finding]:
-    """Find out whether one of two streams was computed from the other.
-
-    Two sensors differ by their noise, whatever the extrinsic is. Poses that were computed from
-    others agree with them to the rounding of their numbers, on the transform that was used; with
-    noise of their own, or where they follow the other's for a while, better than two sensors do.
-    Orientations alone show it: they follow from the other stream's if the poses do.
-
-    Parameters
-    ----------
-    given, aligned : StreamPair
-        Sound streams with their stamps as they are, and on one clock.
-    """
-    # Programs interpolate at the stamps of the new stream.
-    pairs = [(each.child, each.parent) for each in (given, aligned)]
-    pairs += [both[::-1] for both in pairs]
-    left_rad, halves = np.inf, list[tuple[Trajectory, Trajectory]]()
-    for slow, fast in pairs:
-        first_ns, last_ns = fast.stamps_ns[[0, -1]]
-        rows = np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
-        halves.append((slow[rows[len(rows) // 2 :][: _NEAREST[1]]], fast))
-        # Motions between stamps at which the other one is nearest.
-        after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
-        around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[rows]).min(axis=0)
-        nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
-        rows = rows[around <= nearest.max(initial=0)]
-        slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
-        between, start = fast.at(slow.stamps_ns, straight=True), np.arange(len(slow) - 1)
-        left_rad = min(left_rad, _left(pairs_between(between, slow.poses, start, start + 1)))
-    if left_rad < 0.01 * _ALIKE[0]:
-        return [finding("not_independent", are="are not independent", residual_rad=left_rad)]
-    # Circumstantial: sensors may be precise, or shake together.
-    motions = [pairs_over(aligned.synchronised, s, _MOST_SHORT) for s in (0.0, _SHORT_S)]
-    left_rad = min(left_rad, *map(_left, motions))
-    more = max(_ALIKE[0] / left_rad, *starmap(_shared_noise, halves))
-    more_than_usual = f"have {more:.1f} times as much in common as two sensors may have"
-    doubt = finding("not_independent", "both", Severity.WARNING, are=more_than_usual, more=more)
-    return [doubt] if more > 1.0 else []
-
-
-def _left(motions: MotionPairs) -> float:
-    """Angle (rad) that remains between the rotations of both; infinite unless a small share."""
-    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
-    motions, angles = motions[angles < _MAX_ROTATION], angles[angles < _MAX_ROTATION]
-    if len(motions) < MIN_PAIRS:
-        return np.inf
-    X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
-    left_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
-    return left_rad if left_rad < _ALIKE[1] * quantile(angles, USUAL) else np.inf
-
-
-def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
-    """How many times more noise a part of one stream has in common with the other than two sensors
-    have; 0 if it is motion that makes them rough, or a pose is missing.
-    """
-    intervals_ns = np.diff(slow.stamps_ns)
-    if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
-        return 0.0
-    both = slow.poses, fast.at(slow.stamps_ns, straight=True)
-    steps = (se3.log(se3.inverse(Ts[:-1]) @ Ts[1:]) for Ts in both)
-    a, b = (np.diff(each, 2, axis=0).reshape(-1, 2, 3) for each in steps)
-    b = b @ se3.nearest_rotation(b[:, 1].T @ a[:, 1])
-    left, arms = b - a, se3.skew(a[:, 1])
-    left[:, 0] -= arms @ np.linalg.lstsq(arms.reshape(-1, 3), left[:, 0].ravel(), rcond=None)[0]
-    sizes = np.linalg.norm([a, b], axis=3)
-    usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
-    is_calm = (sizes <= usual).any(axis=0).all(axis=1)[:, None, None]
-    spectra = (np.abs(np.fft.rfft(is_calm * [a, b, left], axis=1)) ** 2).sum(axis=3)
-    # Of poses, as differences raise it.
-    spectra /= (2.0 * np.sin(np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])))[:, None] ** 6
-    half = np.stack([each.mean(axis=1) for each in np.array_split(spectra, 4, axis=1)[2:]])
-    is_white = (half.max(axis=0) < _FLAT * half.min(axis=0))[:2].all()
-    turned = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
-    is_noise = half[1, :2, 1].max() < _LITTLE_NOISE * turned
-    common = (half[:, :2].min(axis=1) / np.maximum(half[:, 2], 1e-300)).min(axis=0)
-    follows = half[0, 2, 1] > _FLAT**2 * half[1, 2, 1]
-    found = common**0.5 / _SHARED * [is_white, is_white or follows]
-    return float(is_noise * found.max())

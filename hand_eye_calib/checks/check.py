@@ -21,7 +21,7 @@ from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import Correlation, TimeOffset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
-from hand_eye_calib.checks import agreement, hypotheses
+from hand_eye_calib.checks import agreement, hypotheses, independence
 from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.checks.hypotheses import Explanation, StreamPair
@@ -80,6 +80,7 @@ def check_streams(
     max_gap_s: float = CalibratorConfig.max_gap,
     correlate: Callable[[], Correlation] | None = None,
     known: Known | None = None,
+    are_exact: bool = False,
 ) -> CheckResult:
     """Check two streams.
 
@@ -94,6 +95,8 @@ def check_streams(
         Correlates the angular rates of the streams as they are, which is not always needed.
     known : ((4, 4) array, (6,) array), optional
         An extrinsic of these streams, and its standard deviations.
+    are_exact : bool
+        The user called both streams exact: that they do not drift apart is no reason for doubt.
     """
     findings = check_stream(parent, "parent", max_gap_s)
     findings += check_stream(child, "child", max_gap_s)
@@ -136,7 +139,9 @@ def check_streams(
     sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
-        findings += _check_agreeing(right, given, fit, known, time_offset_s + offset.seconds)
+        findings += _check_agreeing(
+            right, given, fit, known, time_offset_s + offset.seconds, are_exact
+        )
     return CheckResult(gravest_first(findings), explanation.fit, offset)
 
 
@@ -235,18 +240,26 @@ def _check_sizes(
 
 
 def _check_agreeing(
-    right: StreamPair, given: StreamPair, fit: SimilarityFit, known: Known | None, offset_s: float
+    right: StreamPair,
+    given: StreamPair,
+    fit: SimilarityFit,
+    known: Known | None,
+    offset_s: float,
+    are_exact: bool,
 ) -> list[Finding]:
     """What else there is to say of streams that agree as they are, on one clock, and of the same
     streams as they were given.
     """
     of_fit = fit.T_parent_child, fit.sigmas[:6]
-    best = min(filter(None, (of_fit, known)), key=lambda each: each[1][:3].max())
-    if copied := agreement.check_independent(given, right):
+    best = min(filter(None, (of_fit, known)), key=lambda extrinsic: extrinsic[1][:3].max())
+    if copied := independence.check_copies(given, right, are_exact):
         return [*copied, *agreement.check_same(*best)]
     pose_pairs = right.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
-    return agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
+    findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
+    if findings or are_exact:
+        return findings
+    return independence.check_fusion(pose_pairs, best[0])
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:

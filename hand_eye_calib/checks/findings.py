@@ -91,9 +91,11 @@ _ROWS = {
     ),
     "too_short": _Row("{text}", "record longer"),
     "not_independent": _Row(
-        "The two streams {are}: one seems to be computed from the other. This result only repeats "
-        "the transform that was used for it.",
-        "give the poses that each sensor measured by itself",
+        "{evidence}. Was one computed from the other (TF, fusion)? Then this result only returns "
+        "the old transform",
+        "give the poses that each sensor measured by itself; if both are exact (motion capture, "
+        "surveyed, simulated), give parent_kind exact and child_kind exact",
+        severity=_WARNING,
     ),
     "rate_unit": _Row(
         "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "

@@ -314,6 +314,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> checkin
         max_gap_s=snapshot.max_gap_s,
         correlate=lambda: snapshot.correlation,
         known=known,
+        are_exact=snapshot.config.parent_kind == snapshot.config.child_kind == "exact",
     )
     obsolete = set()
     if len(snapshot.kept):
