@@ -23,12 +23,12 @@ from hand_eye_calib.text import angle, length, listing
 Known: TypeAlias = tuple[FloatArray, FloatArray]
 
 # The share of the squared residuals that something explains, and its finding if it is significant.
-_Suspect: TypeAlias = tuple[float, Finding | None]
+Suspect: TypeAlias = tuple[float, Finding | None]
 
 _STREAMS = ("child", "parent")
 
 # How many times a fault of the response must exceed what noise of its columns may make of it.
-_BIASES = 2.0
+BIASES = 2.0
 
 # An odometry may drift along one axis by this share of the distance: on a flat floor that alone
 # is its motion along z, and the other stream knows nothing of it.
@@ -36,7 +36,7 @@ _DRIFT = 0.02
 
 # Two frames are one if they are this close (m, rad), within so many standard deviations; that of
 # the rotation must not be larger than the third.
-_SAME_M, _SAME_RAD, _MAX_SIGMA_RAD = 0.005, float(np.radians(0.3)), float(np.radians(0.5))
+_SAME_M, SAME_RAD, MAX_SIGMA_RAD = 0.005, float(np.radians(0.3)), float(np.radians(0.5))
 _WITHIN = 3.0
 
 # Upper bounds of the lever arm (m; two standard deviations above its length). Hardly two sensors
@@ -50,6 +50,9 @@ _LITTLE = 0.1
 # Rotation vectors near half a turn may point either way.
 _MAX_ROTATION = 2.8
 
+# Smallest factor of a coordinate whose inverse is stated: less is noise.
+_LEAST_FACTOR = 1e-3
+
 # A coordinate explains why streams disagree if it takes away this share of the squared residuals;
 # with less than the second it may be jumps of a clean recording, and is no error.
 _MOST, _SOME = 0.3, 0.1
@@ -58,7 +61,7 @@ _MOST, _SOME = 0.3, 0.1
 # streams are as they should be are off by some milliseconds: a delay counts from the second line on
 # (s), and is an error from so many times that; the offset of the clocks is shown by so much of the
 # evidence. Smallest smoothing (s^2); that of interpolation is a share of the squared interval.
-_SHORT_S, _MOST_SHORT = 1.0, 6000
+SHORT_S, MOST_SHORT = 1.0, 6000
 _DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
 _SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
 
@@ -92,21 +95,21 @@ def check_agreement(
     speed = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
     tried: dict[str, Callable[[], Finding | None]] = {
         "drift": lambda: _world_drift(slow, pose_pairs, speed),
-        "gain": lambda: _rotation_gain(slow, axes),
+        "gain": lambda: rotation_gain(slow, axes),
         **{f"turned_{each}": partial(_turned, slow, each) for each in (*_STREAMS, "both")},
-        **{f"axes_{each}": partial(_axis_gain, slow, each) for each in _STREAMS},
+        **{f"axes_{each}": partial(axis_gain, slow, each) for each in _STREAMS},
     }
     if change:
-        tried["moved"] = lambda: _moved_mount(change, int(pose_pairs.stamps_ns[0]))
+        tried["moved"] = lambda: moved_mount(change, int(pose_pairs.stamps_ns[0]))
     most = max(tried, key=slow.share)
     # Streams that are turned explain about the same: one of them may be significant.
     alike = [each for each in tried if each[:6] == most[:6] == "turned"] or [most]
-    suspects: list[_Suspect] = [(slow.share(each), tried[each]()) for each in alike]
-    motions = pairs_over(pose_pairs, _SHORT_S, _MOST_SHORT)
+    suspects: list[Suspect] = [(slow.share(each), tried[each]()) for each in alike]
+    motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
     if fast := delays(pose_pairs, motions, X):
-        suspects += _delays(fast, pose_pairs, speed, offset_s)
+        suspects += delay_suspects(fast, pose_pairs, speed, offset_s)
         interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
-        suspects += _smoothing(fast, _OF_INTERVAL * interval_s**2, speed)
+        suspects += smoothing_suspects(fast, interval_s, speed)
     found = [(share, each) for share, each in suspects if each and share > 0.0]
     return [max(found, key=lambda each: each[0])[1]] if found else []
 
@@ -117,7 +120,7 @@ def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Findi
     slow, _ = response(pose_pairs, motions, X)
     stream = max(_STREAMS, key=lambda each: slow.share(f"axes_{each}"))
     is_most = slow.share(f"axes_{stream}") > _MOST
-    return [*filter(None, [_axis_gain(slow, stream)])] if is_most else []
+    return [*filter(None, [axis_gain(slow, stream)])] if is_most else []
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
@@ -125,10 +128,10 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     distance_m, sigma_m = float(np.linalg.norm(T_parent_child[:3, 3])), float(sigmas[:3].max())
     upper_m = distance_m + 2 * sigma_m
     angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
-    is_parallel = angle_rad < max(_SAME_RAD, _WITHIN * sigmas[3:].max())
+    is_parallel = angle_rad < max(SAME_RAD, _WITHIN * sigmas[3:].max())
     may_be_zero = distance_m < _WITHIN * sigma_m
     near_m = _PARALLEL_M if is_parallel or may_be_zero else _NEARLY_M
-    if upper_m > near_m or sigmas[3:].max() > _MAX_SIGMA_RAD:
+    if upper_m > near_m or sigmas[3:].max() > MAX_SIGMA_RAD:
         return []
     if is_parallel:
         key, size = "same_frame", f"{length(distance_m)} and {angle(angle_rad)}"
@@ -140,17 +143,18 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     return [finding(key, "both", severity, size=size, translation_m=distance_m)]
 
 
-def _rotation_gain(slow: Regression, axes: FloatArray) -> Finding | None:
-    """A gain of the child's rotations about an axis."""
+def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> Finding | None:
+    """A gain of the child's rotations about an axis; ``inverse`` if the parent's are fitted."""
     (gains, sigmas), biases = slow.fit("gain"), slow.biases("gain")
     most_sigmas, least, *_ = LIMITS["rotation_gain"]
-    limits = np.maximum(most_sigmas * sigmas, _BIASES * biases)
+    limits = np.maximum(most_sigmas * sigmas, BIASES * biases)
     ratios = np.abs(gains) / np.maximum(limits, least)
     ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
         return None
-    axis, gain = ", ".join(f"{component:.2f}" for component in axes[:, k]), gains[k]
+    axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
+    gain = 1.0 / (1.0 + gains[k]) - 1.0 if inverse else gains[k]
     values = {"axis": axis, "gain": 1.0 + gain, "sigma": sigmas[k]}
     return graded("rotation_gain", "child", gain, **values)
 
@@ -159,7 +163,7 @@ def _turned(slow: Regression, stream: str) -> Finding | None:
     """Positions of a stream that are turned against its orientations."""
     turns, sigmas = slow.fit(f"turned_{stream}")
     sizes, (most_sigmas, least, *_) = np.abs(turns), LIMITS["worlds_turned"]
-    limits = np.hypot(most_sigmas * sigmas, _BIASES * slow.biases(f"turned_{stream}"))
+    limits = np.hypot(most_sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}"))
     if (sizes < limits).all() or sizes.max() < least:
         return None
     turned_rad = float(np.linalg.norm(sizes))
@@ -183,20 +187,26 @@ def _odd_one(values: FloatArray, sigmas: FloatArray) -> tuple[int, float, float]
     return best
 
 
-def _axis_gain(slow: Regression, stream: str) -> Finding | None:
-    """A coordinate of a stream that has another scale than the others."""
-    group = f"axes_{stream}"
+def axis_gain(slow: Regression, columns_of: str, stream: str = "") -> Finding | None:
+    """A coordinate of a stream that has another scale than the others.
+
+    The finding names the stream that the columns are of, or ``stream``, which then has the
+    inverse factor.
+    """
+    group = f"axes_{columns_of}"
+    is_inverse = stream not in ("", columns_of)
     k, off, sigma = _odd_one(*slow.fit(group))
     of_noise = slow.biases(group)[k]
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
-    if abs(off) < _BIASES * (of_noise + of_drift):
+    if abs(off) < BIASES * (of_noise + of_drift):
         return None
     size = off if slow.share(group) > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
-    values = {"axis": "xyz"[k], "factor": 1.0 + off, "sigma": sigma}
-    return graded("axis_scale", stream, size, sigma, **values)
+    factor = 1.0 / max(1.0 + off, _LEAST_FACTOR) if is_inverse else 1.0 + off
+    values = {"axis": "xyz"[k], "factor": factor, "sigma": sigma}
+    return graded("axis_scale", stream or columns_of, size, sigma, **values)
 
 
-def _moved_mount(change: MountChange, start_ns: int) -> Finding | None:
+def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     """A mount that has moved."""
     sigmas = np.sqrt(np.diag(change.covariance))
     known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
@@ -222,9 +232,9 @@ def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Findi
     return graded("world_drift", "both", share, **values, percent=100 * share)
 
 
-def _delays(
+def delay_suspects(
     fast: Regression, pairs: PosePairs, speed: float, offset_s: float
-) -> Iterator[_Suspect]:
+) -> Iterator[Suspect]:
     """Positions that are late, or early, against orientations of their stream: all, or those along
     one axis of its world. Less evidence does for positions that do not share the offset of clocks.
     """
@@ -254,10 +264,11 @@ def _delays(
                 yield share, graded("late", stream, shift_m, sigma_m, **values)
 
 
-def _smoothing(fast: Regression, more_s2: float, speed: float) -> Iterator[_Suspect]:
+def smoothing_suspects(fast: Regression, interval_s: float, speed: float) -> Iterator[Suspect]:
     """Smoothing of one part of the poses: an error by what it displaces, a warning by what its time
-    is at this speed.
+    is at this speed. Poses are ``interval_s`` apart.
     """
+    more_s2 = _OF_INTERVAL * interval_s**2
     for part, least_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
             groups = f"{part}_{stream}", f"late_{stream}"

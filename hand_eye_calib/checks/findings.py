@@ -192,6 +192,40 @@ _ROWS = {
         "such as positions that were fused from the other sensor, or computed for another point of "
         "the robot than the sensor",
     ),
+    "no_lever_arm": _Row(
+        "the positions are those of the other sensor: the lever arm is zero ({size})",
+        "give the positions of the antenna or prism itself; if it is there, say so by priors, such "
+        "as prior.x 0+/-0.01",
+        "such as positions of a fused pose, or of the other topic of one receiver",
+        code="same_position",
+    ),
+    "parallel_axes": _Row(
+        "the rotation between the sensors is zero ({size}): both streams seem to be of one sensor",
+        "give the rates of the child sensor itself; if the axes are parallel, say so by priors, "
+        "such as prior.yaw 0+/-1deg",
+        "such as the rates of the parent's own gyroscope",
+        code="same_frame",
+    ),
+    "interpolated": _Row(
+        "{share:.0%} of {whose} positions lie on straight lines between their neighbours: they are "
+        "interpolated between few measured ones",
+        "give the positions as they were measured",
+    ),
+    "mirrored_positions": _Row(
+        "{whose} positions are in left-handed axes",
+        "correct the sign of one coordinate, or the order of two (REP 103: x east, y north, z up)",
+        code="left_handed",
+    ),
+    "mirrored_rates": _Row(
+        "{whose} rates are about left-handed axes",
+        "correct the sign of one axis, or the order of two",
+        code="left_handed",
+    ),
+    "misaligned": _Row(
+        "two axes of {whose} rates are not perpendicular, by {degrees:.2f} deg",
+        "calibrate the axes of the gyroscope first",
+        "a misaligned axis of a gyroscope",
+    ),
     "rotation_gain": _Row(
         "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
         "the parent sensor's frame",
@@ -332,6 +366,9 @@ LIMITS = {
     "late": (4.5, 0.008, 0.008, 0.05),
     "smoothed": (8.0, 0.008, 0.008, 0.02),
     "rotation_gain": (6.0, 0.003, 0.003, 0.03),  # of the factor, less 1
+    # Symmetric part of the matrix between the rates (rad): the rotation is off by as much. An error
+    # from 3.3 times the common-mode floor of 0.15 deg on.
+    "misaligned": (6.0, 0.004, 0.004, 0.0087),
     "turns": (0.0, 0.4, 0.4, 0.4),  # logarithm of a factor that noise does not cause
     "axis_scale": (6.0, 0.015, 0.015, 0.05),  # of the factor, less 1
     "worlds_turned": (6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),  # rad

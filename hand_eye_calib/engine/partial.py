@@ -16,7 +16,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment import covariance
 from hand_eye_calib.assessment.prior import fuse
 from hand_eye_calib.checks.check import in_other_units
-from hand_eye_calib.checks.findings import Finding, Severity, finding
+from hand_eye_calib.checks.findings import Finding, Severity, finding, graded
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine import estimation
 from hand_eye_calib.errors import InputError
@@ -24,6 +24,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls import increments
 from hand_eye_calib.gls import positions as of_positions
+from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.results.context import RateBias
@@ -39,6 +40,14 @@ _SPAN, _TURNING = 10, 0.75
 
 # Rates in degrees instead of radians are off by that factor, within this share of it.
 _UNIT_WITHIN = 0.2
+
+# A scale mends a path if it leaves less than this share of what remains without it.
+_MENDED_PATH = 0.5
+
+# A scale between the streams must exceed so many of its standard deviations, and the data must
+# know it better than the expectation of the model (share of the information).
+_EXPECTED_SCALE = TUNING.of_positions[3]
+_SCALE_SIGMAS, _SHOWN_SCALE, _LEAST_SCALE = 5.0, 0.5, 1e-3
 
 # Where the frame of an odometry is, and where an antenna or a prism measures, is known to this (m)
 # along each axis.
@@ -72,7 +81,8 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
     assessment = covariance.assess_lever_arm(poses, solution, T, solution.covariance)
     fused = fuse(assessment, config.prior())
-    findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child)
+    is_scale_given = "scale" in config.given
+    findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child, is_scale_given)
     scale = solution.scale if is_child else 1.0 / solution.scale
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
@@ -123,27 +133,46 @@ def _of_path(
     poses: FloatArray,
     positions: FloatArray,
     is_child: bool,
+    is_scale_given: bool,
 ) -> tuple[Finding, ...]:
     """A finding if the path of the positions is not that of the odometry, or in other units."""
     share = of_positions.unexplained_share(poses, positions, solution.lever_arm, solution.scale)
     if share < _SUSPECT_PATH:
-        return ()
+        return () if is_scale_given else _of_scale(solution, _EXPECTED_SCALE, is_child)
     axes = fused.observability[:3]
     is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
-    severity = Severity.ERROR
-    if is_known and share < _UNRELATED_PATH:
-        severity = Severity.WARNING
-    else:
-        with contextlib.suppress(np.linalg.LinAlgError):
-            scaled = of_positions.solve(stamps_ns, poses, positions, True)
-            left = of_positions.unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
-            scale = scaled.scale if is_child else 1.0 / scaled.scale
-            found = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
-            if left < _UNRELATED_PATH and found:
-                return (found,)
+    is_near = is_known and share < _UNRELATED_PATH
+    with contextlib.suppress(np.linalg.LinAlgError):
+        scaled = of_positions.solve(stamps_ns, poses, positions, True)
+        left = of_positions.unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
+        scale = scaled.scale if is_child else 1.0 / scaled.scale
+        unit = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
+        if unit and not is_near and left < _UNRELATED_PATH:
+            return (unit,)
+        if not is_scale_given and left < min(_SUSPECT_PATH, _MENDED_PATH * share):
+            return _of_scale(scaled, TUNING.any_scale, is_child)
     share = min(share, 1.0)
+    severity = Severity.WARNING if is_near else Severity.ERROR
     text = f"{share:.0%} of the motion of the positions is not that of the odometry"
     return (finding("unrelated", severity=severity, share=share, text=text),)
+
+
+def _of_scale(
+    solution: of_positions.LeverArmSolution, expected: float, is_child: bool
+) -> tuple[Finding, ...]:
+    """A finding if one stream's lengths differ from the other's by more than an odometry may have.
+
+    The model expects a scale near 1 within ``expected``. That expectation is taken out.
+    """
+    shown = 1.0 - (solution.scale_sigma / expected) ** 2
+    if shown < _SHOWN_SCALE:
+        return ()
+    excess, sigma = (solution.scale - 1.0) / shown, solution.scale_sigma / shown**0.5
+    scale = 1.0 + excess if is_child else 1.0 / max(1.0 + excess, _LEAST_SCALE)
+    if abs(excess) < _SCALE_SIGMAS * sigma:
+        return ()
+    differs = graded("scale", "child", scale - 1.0, scale=scale, sigma=sigma * scale**2)
+    return (differs,) if differs else ()
 
 
 def estimate_rotation(

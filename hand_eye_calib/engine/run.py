@@ -12,6 +12,7 @@ import numpy as np
 
 from hand_eye_calib.alignment.time_offset import TimeOffset, correlate_rates, refine_time_offset
 from hand_eye_calib.checks import check as checking
+from hand_eye_calib.checks import parts
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.config import METHODS, CalibratorConfig
 from hand_eye_calib.engine.snapshot import MOST_MOVED_S, STREAMS, UNASKED_S, Snapshot
@@ -37,6 +38,10 @@ _MOST_MOVED_POSITIONS_S = 0.05
 # Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
 # model holds, and less if there is no noise.
 _MAX_MISFIT = 2.0
+
+# Share of the squared residuals of positions that belong to another path which a fault must explain
+# to be named.
+_NAMES_UNRELATED = 0.6
 
 # Smaller time offsets (s) of streams that are no poses are found by every solve.
 _FOUND_BY_SOLVE_S = 0.25
@@ -343,6 +348,10 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
             sigma_s = max(parent.interval_s, child.interval_s) / 5
             offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
             found += checking.check_offset(offset, known_s)
+    codes = {each.code for each in found}
+    if calibration and len(hidden) < 3 and "time_offset" not in codes:
+        least = _NAMES_UNRELATED if "unrelated" in codes else 0.0
+        found += parts.check_solved(parent, child, calibration, snapshot.config, least)
     if hidden and not any(each.makes_unusable for each in found):
         found.append(checking.unseen(hidden))
     return [each for index, each in enumerate(found) if each not in found[:index]]

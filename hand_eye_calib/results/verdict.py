@@ -98,7 +98,9 @@ CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
 FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
 
 # Rules that state a limit of the recording; the others are signs that something is wrong.
-_KINDS = dict.fromkeys(("nothing_known", "unobservable", "target", "floor"), "physics")
+_KINDS = dict.fromkeys(
+    ("nothing_known", "unobservable", "target", "floor", "part_of_poses"), "physics"
+)
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
 # Other answers, and what to do if they disagree.
@@ -144,6 +146,8 @@ class Judged(Result):
             it = hidden if len(gravest[0].axes) == 1 else "them"
             also = "".join(f"; {each.sentence}" for each in gravest[1:2])
             return f"{decided}: all but {hidden}; measure {it} by hand{also}"
+        if [reason.rule for reason in gravest] == ["part_of_poses"]:
+            return f"{decided}: {what_is_known(self)}; {gravest[0].sentence}"
         note = "" if any(reason.kind == "suspicion" for reason in self.reasons) else _NO_FAULT
         more = len(gravest) - 1
         rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
@@ -310,6 +314,26 @@ def _recordings(kinds: Sequence[str], result: Result) -> Iterator[_Found]:
         yield result.together.sentence, _OF_RECORDINGS[result.together.kind], (), {}
 
 
+# What the checks of streams that are no poses cannot see, and what to do.
+_UNSEEN = {
+    "positions": (
+        "delays and smoothing of positions cannot be seen",
+        "compare with a tape measure, or with a recording at another speed",
+    ),
+    "rotations": (
+        "smoothing and slow drift of rotations alone cannot be seen",
+        "compare with another recording",
+    ),
+}
+
+
+def _part_of_poses(result: Result) -> Iterator[_Found]:
+    """Streams that are no poses, which have few checks."""
+    if result.measured in _UNSEEN:
+        sentence, advice = _UNSEEN[result.measured]
+        yield sentence, advice, (), {}
+
+
 class _Axis(NamedTuple):
     """An axis within reach of the streams, its standard deviation without and with the floor."""
 
@@ -402,5 +426,11 @@ RULES = (
         _CARE,
         "an axis is worse than its target only together with the allowance for constant errors",
         _floor,
+    ),
+    Rule(
+        "part_of_poses",
+        _CARE,
+        "a stream has only positions, rotations or rates, which have few checks",
+        _part_of_poses,
     ),
 )

@@ -74,7 +74,8 @@ class TestRates:
         assert np.isinf(result.sigmas_measured[:3]).all()
         assert result.covariance_measured[0, 0] > 1.0
         assert usable_numbers(result)["x"] == "MEASURE_X_BY_HAND"
-        assert result.verdict is hec.Verdict.USE
+        assert [reason.rule for reason in result.reasons] == ["part_of_poses"]
+        assert result.verdict is hec.Verdict.USE_WITH_CARE
         assert "out of reach" in result.headline
 
     def test_the_other_way_round_it_is_the_inverse(self, streams, result):
@@ -288,8 +289,9 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
     assert "/imu has messages of type" in capsys.readouterr().err
     with_itself = ["--parent-topic", "/imu", "--child-topic", "/imu_again", "--child-frame", "b"]
-    assert main(["check", parts[1], *with_itself, "--json"]) == 0
+    assert main(["check", parts[1], *with_itself, "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
+    assert [each["code"] for each in document["findings"]] == ["same_frame"]
     assert document["streams"]["child"]["path_m"] is None
     found = hec.read_trajectory(parts[1], topic="/imu")
     assert (found.measures, len(found)) == ("rates", len(stamps_ns))

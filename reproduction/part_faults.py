@@ -1,0 +1,309 @@
+"""Positions alone and rates alone with faults made on purpose, on simulated machines.
+
+``python -m reproduction.part_faults positions --seeds 3`` prints a row for each fault: verdicts,
+findings, and results beyond 3.3 standard deviations (with the allowance) that may be used.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+import hand_eye_calib as hec
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.cli.main import exit_code_of
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.results.records import Severity
+from reproduction.coverage import motions
+from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
+from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
+from reproduction.writing import markdown_table, study_parser
+
+# Paths and rates are made at this rate (Hz) before a sensor takes its samples.
+_FINE_HZ = 200.0
+
+# A result is wrong if an axis is farther off than so many of its standard deviations.
+FAR_SIGMAS = 3.3
+
+# Targets of the study, so that verdicts do not depend on them: m, rad.
+WIDE: Mapping[str, Any] = {"target_translation": 0.3, "target_rotation": 0.0175}
+
+_WHEELS = SensorErrors(white=sigmas(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05))
+
+
+class Platform(NamedTuple):
+    """A motion, the odometry with its rate (Hz), the duration (s); the size of the lever arm (m),
+    the noise of positions (m) and their rate (Hz).
+    """
+
+    motion: Callable[[np.random.Generator, float], motions.Motion]
+    odometry: SensorErrors
+    rate_hz: float
+    duration_s: float
+    lever_m: float
+    noise_m: float
+    positions_hz: float
+
+
+PLATFORMS = {
+    "car": Platform(motions.car, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 10.0),
+    "excavator": Platform(motions.excavator, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 5.0),
+    "hand": Platform(motions.hand_held, VIO, 30.0, 90.0, 0.3, 0.003, 20.0),
+    "drone": Platform(motions.drone, VIO, 20.0, 120.0, 0.3, 0.01, 10.0),
+    "drone_slam": Platform(motions.drone, slam(10.0, 0.05, 0.1), 20.0, 120.0, 0.5, 0.005, 20.0),
+    "agv": Platform(motions.agv, _WHEELS, 10.0, 240.0, 0.8, 0.005, 10.0),
+}
+
+# A consumer gyroscope: bias (rad/s), noise of a sample (rad/s), walk of the bias (rad/s per root
+# s), and by how much its stamps are late (s).
+_BIAS, _RATE_NOISE, _BIAS_WALK, _LATE_S = 0.01, np.radians(0.1), np.radians(0.002), 0.005
+
+# The rotation of the child's rates turns by this (rad) when the mount moves.
+_TURNED = np.radians(2.0) * np.array([0.6, 0.48, 0.64])
+
+
+# By this (m) a lever arm in the TF tree is wrong.
+_WRONG_BY_M = np.array([0.3, -0.2, 0.4])
+
+
+class Recording(NamedTuple):
+    """Streams, and the lever arm (3,) or the rotation (3, 3) between them."""
+
+    parent: Trajectory
+    child: Trajectory
+    truth: FloatArray
+
+
+_Random: TypeAlias = np.random.Generator
+
+
+def _low_passed(values: FloatArray, tau_s: float) -> FloatArray:
+    step_s = 1.0 / _FINE_HZ
+    share = step_s / (tau_s + step_s)
+    start = ((1.0 - share) * values[0])[None]
+    return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=0, zi=start)[0])
+
+
+def _heights(values: FloatArray, heights: FloatArray) -> FloatArray:
+    return np.column_stack([values[:, :2], heights])
+
+
+def _later(values: FloatArray, delay_s: float) -> FloatArray:
+    times_s = np.arange(len(values)) / _FINE_HZ
+    return np.interp(times_s - delay_s, times_s, values)
+
+
+# What a fault makes of the path (N, 3) of an antenna at the fine rate.
+_OF_PATH: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    "clean": lambda path: path,
+    "delayed 150 ms": lambda path: path,
+    "low-passed 200 ms": lambda path: _low_passed(path, 0.2),
+    "smoothed 250 ms": lambda path: gaussian_filter1d(path, 0.25 * _FINE_HZ, 0, mode="nearest"),
+    "1 Hz interpolated": lambda path: path,
+    "constant height": lambda path: path,
+    "barometric height": lambda path: _heights(path, _low_passed(path[:, 2:], 1.0)[:, 0]),
+    "height in feet": lambda path: path * [1.0, 1.0, 3.28084],
+    "height 300 ms late": lambda path: _heights(path, _later(path[:, 2], 0.3)),
+    "Web Mercator": lambda path: path / np.cos(np.radians(51.0)),
+    "UTM": lambda path: path * 0.9996,
+    "scale 1.05": lambda path: path * 1.05,
+    "steps of 10 cm": lambda path: path,
+}
+
+# What a fault makes of measured positions (N, 3), at so many a second.
+_OF_POSITIONS: Mapping[str, Callable[[FloatArray, float, _Random], FloatArray]] = {
+    "1 Hz interpolated": lambda positions, hz, _: _interpolated(positions, round(hz)),
+    "constant height": lambda positions, hz, _: positions * [1.0, 1.0, 0.0],
+    "barometric height": lambda positions, hz, random: _heights(
+        positions,
+        positions[:, 2]
+        + 0.3 * np.cumsum(random.standard_normal(len(positions))) / (60 * hz) ** 0.5,
+    ),
+    "steps of 10 cm": lambda positions, hz, _: np.round(positions / 0.1) * 0.1,
+}
+
+# Positions that were computed from the poses of the other sensor.
+_COPIES: Mapping[str, Callable[[Trajectory, FloatArray, _Random], Trajectory]] = {
+    "copied": lambda parent, lever_arm, _: parent,
+    "copied with noise": lambda parent, lever_arm, random: replace(
+        parent,
+        poses=parent.poses
+        @ se3.from_rotation_translation(
+            np.eye(3), 0.003 * random.standard_normal((len(parent), 3))
+        ),
+    ),
+    "copied, resampled": lambda parent, lever_arm, _: _resampled(parent, 7.0),
+    "copied, world turned": lambda parent, lever_arm, _: replace(
+        parent, poses=se3.exp(np.array([3.0, 4.0, 1.0, 0.1, 0.2, 2.0])) @ parent.poses
+    ),
+    "computed with a wrong lever arm": lambda parent, lever_arm, _: replace(
+        parent,
+        poses=parent.poses @ se3.from_rotation_translation(np.eye(3), lever_arm + _WRONG_BY_M),
+    ),
+}
+
+OF_POSITIONS = (*_OF_PATH, *_COPIES)
+
+
+def _interpolated(positions: FloatArray, stride: int) -> FloatArray:
+    rows = np.arange(len(positions))
+    columns = [np.interp(rows, rows[::stride], column[::stride]) for column in positions.T]
+    return np.column_stack(columns)
+
+
+def _resampled(stream: Trajectory, rate_hz: float) -> Trajectory:
+    step_ns = round(1e9 / rate_hz)
+    wanted_ns = np.arange(stream.stamps_ns[0] + step_ns // 3, stream.stamps_ns[-1], step_ns)
+    return Trajectory(wanted_ns, stream.at(wanted_ns))
+
+
+def positions(platform: str, fault: str, seed: int) -> Recording:
+    """Poses of an odometry, and positions of an antenna with a fault of :data:`OF_POSITIONS`."""
+    kind = PLATFORMS[platform]
+    seeds = (seed, sorted(PLATFORMS).index(platform), 77)
+    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
+    motion = kind.motion(motion_rng, kind.duration_s)
+    lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
+    parent = _odometry(kind, motion, odometry_rng)
+    if fault in _COPIES:
+        copy = _COPIES[fault](parent, lever_arm, random)
+        child = Trajectory.from_positions(copy.stamps_ns, copy.poses[:, :3, 3], "antenna", "map")
+        return Recording(parent, child, lever_arm)
+    fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
+    Ts = motion.at(fine_s)
+    world = se3.rotation_exp(np.array([0.0, 0.0, mount_rng.uniform(-np.pi, np.pi)]))
+    path = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ world
+    stride = round(_FINE_HZ / kind.positions_hz)
+    taken = np.arange(stride // 4, len(fine_s), stride)
+    measured = _OF_PATH[fault](path)[taken]
+    measured = measured + kind.noise_m * random.standard_normal(measured.shape)
+    if fault in _OF_POSITIONS:
+        measured = _OF_POSITIONS[fault](measured, kind.positions_hz, random)
+    late_s = 0.15 if fault == "delayed 150 ms" else 0.0
+    stamps = stamps_ns(fine_s[taken] + late_s)
+    return Recording(
+        parent, Trajectory.from_positions(stamps, measured, "antenna", "map"), lever_arm
+    )
+
+
+def _odometry(kind: Platform, motion: motions.Motion, random: _Random) -> Trajectory:
+    times_s: FloatArray = np.arange(round(kind.duration_s * kind.rate_hz)) / kind.rate_hz
+    drawn = draw(
+        kind.odometry, motion.at(times_s), motion.twists(times_s), 1 / kind.rate_hz, random
+    )
+    return Trajectory(stamps_ns(times_s), drawn.poses, "lidar", "odom")
+
+
+def _misaligned(rates: FloatArray) -> FloatArray:
+    matrix = np.eye(3)
+    matrix[0] = np.cos(np.radians(3.0)), np.sin(np.radians(3.0)), 0.0
+    return rates @ matrix.T
+
+
+def _moved(rates: FloatArray) -> FloatArray:
+    half = len(rates) // 2
+    return np.concatenate([rates[:half], rates[half:] @ se3.rotation_exp(_TURNED)])
+
+
+# What a fault makes of the rates (N, 3) of a gyroscope.
+_OF_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    "clean": lambda rates: rates,
+    "own rates": lambda rates: rates,
+    "axis misaligned 3 deg": _misaligned,
+    "gain of an axis 1.03": lambda rates: rates * [1.03, 1.0, 1.0],
+    "delayed 150 ms": lambda rates: rates,
+    "mount moved 2 deg": _moved,
+    "two axes swapped": lambda rates: rates[:, [1, 0, 2]],
+    "sign of an axis": lambda rates: rates * [-1.0, 1.0, 1.0],
+    "bias walks": lambda rates: rates,
+    "low-passed 100 ms": lambda rates: _low_passed(rates, 0.1),
+}
+
+OF_RATES = tuple(_OF_RATES)
+
+
+def rates(platform: str, fault: str, seed: int) -> Recording:
+    """Poses of an odometry, and rates of a gyroscope with a fault of :data:`OF_RATES`."""
+    kind = PLATFORMS[platform]
+    seeds = (seed, sorted(PLATFORMS).index(platform), 78)
+    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
+    motion = kind.motion(motion_rng, kind.duration_s)
+    rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
+    parent = _odometry(kind, motion, odometry_rng)
+    fine_s = np.arange(round(kind.duration_s * _FINE_HZ)) / _FINE_HZ
+    own = motion.twists(fine_s)[:, 3:]
+    measured = _OF_RATES[fault](own if fault == "own rates" else own @ rotation)
+    measured = measured + _BIAS * random.standard_normal(3)
+    measured += _RATE_NOISE * random.standard_normal(measured.shape)
+    walk = _BIAS_WALK * (30.0 if fault == "bias walks" else 1.0)
+    steps = random.standard_normal(measured.shape) / np.sqrt(_FINE_HZ)
+    measured += walk * np.cumsum(steps, axis=0)
+    late_s = 0.15 if fault == "delayed 150 ms" else _LATE_S
+    child = Trajectory.from_rates(stamps_ns(fine_s - late_s), measured, "imu")
+    return Recording(parent, child, rotation)
+
+
+KINDS = {"positions": (positions, OF_POSITIONS), "rates": (rates, OF_RATES)}
+
+
+def distance(kind: str, result: Calibration, truth: FloatArray) -> float:
+    """Largest error of a known axis over its standard deviation with the allowance."""
+    if kind == "positions":
+        errors, part = result.T_parent_child[:3, 3] - truth, slice(0, 3)
+    else:
+        errors = se3.rotation_log(truth @ result.T_parent_child[:3, :3].T)
+        part = slice(3, 6)
+    totals = result.sigmas[part]
+    known = np.isfinite(totals)
+    return float(np.abs(errors[known] / totals[known]).max(initial=0.0))
+
+
+def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
+    """Rows of the table of a kind, one for each fault."""
+    make, faults = KINDS[kind]
+    for fault in faults:
+        verdicts, codes, distances, far = Counter[str](), Counter[str](), [], 0
+        for platform in PLATFORMS:
+            for seed in seeds:
+                recording = make(platform, fault, seed)
+                result = hec.calibrate(recording.parent, recording.child, **WIDE)
+                verdicts[result.verdict.value] += 1
+                serious = [one for one in result.findings if one.severity is not Severity.NOTE]
+                codes.update({one.code for one in serious})
+                if result.verdict is not hec.Verdict.DO_NOT_USE:
+                    distances.append(distance(kind, result, recording.truth))
+                    far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
+        yield {
+            "Fault": fault,
+            "Verdicts": ", ".join(f"{name} {count}" for name, count in verdicts.most_common()),
+            "Findings": ", ".join(f"{name} {count}" for name, count in codes.most_common()),
+            "USE beyond 3.3 sigma": far,
+            "Largest z that is not DO NOT USE": f"{max(distances, default=0.0):.1f}",
+        }
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table; returns the exit code."""
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    print(markdown_table(rows(arguments.kind, seeds)))
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study; returns the exit code."""
+    parser = study_parser("reproduction.part_faults", __doc__)
+    parser.add_argument("kind", choices=tuple(KINDS))
+    parser.add_argument("--seeds", type=int, default=2, help="recordings of a kind. Default: 2")
+    parser.add_argument("--first-seed", type=int, default=100, help="Default: 100")
+    return exit_code_of(lambda: run(parser.parse_args(argv)))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,139 @@
+"""Checks of streams that have only positions, rotations or rates: faults made on purpose."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+import hand_eye_calib as hec
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
+from reproduction import part_faults
+
+SEED = 31
+
+
+@cache
+def solved(kind, fault, platform):
+    make, _ = part_faults.KINDS[kind]
+    recording = make(platform, fault, SEED)
+    return hec.calibrate(recording.parent, recording.child, **part_faults.WIDE)
+
+
+def codes(result, severity="error"):
+    return [each.code for each in result.findings if each.severity.value == severity]
+
+
+# Kind, fault, and the finding that names it.
+NAMED = [
+    ("positions", "copied", "same_position"),
+    ("positions", "copied with noise", "same_position"),
+    ("positions", "copied, resampled", "same_position"),
+    ("positions", "copied, world turned", "same_position"),
+    ("positions", "computed with a wrong lever arm", "not_independent"),
+    ("positions", "1 Hz interpolated", "interpolated"),
+    ("positions", "Web Mercator", "scale"),
+    ("positions", "scale 1.05", "scale"),
+    ("positions", "height in feet", "axis_scale"),
+    ("rates", "own rates", "same_frame"),
+    ("rates", "axis misaligned 3 deg", "misaligned"),
+    ("rates", "mount moved 2 deg", "mount_moved"),
+]
+
+
+@pytest.mark.parametrize(("kind", "fault", "code"), NAMED)
+def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(kind, fault, code):
+    result = solved(kind, fault, "drone")
+    assert code in codes(result)
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+
+
+@pytest.mark.parametrize(
+    ("fault", "platform", "code"),
+    [
+        ("smoothed 250 ms", "car", "smoothed_positions"),
+        ("low-passed 200 ms", "hand", "smoothed_positions"),
+        ("constant height", "hand", "axis_scale"),
+        ("height 300 ms late", "hand", "axis_lag"),
+    ],
+)
+def test_a_fault_that_a_lively_motion_shows_is_named(fault, platform, code):
+    assert code in codes(solved("positions", fault, platform))
+
+
+@pytest.mark.parametrize("fault", ["two axes swapped", "sign of an axis"])
+def test_rates_about_left_handed_axes_are_named(fault):
+    assert "left_handed" in codes(solved("rates", fault, "drone"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "platform"),
+    [("positions", "drone"), ("positions", "excavator"), ("rates", "drone"), ("rates", "hand")],
+)
+def test_clean_streams_have_no_finding_and_say_what_cannot_be_seen(kind, platform):
+    result = solved(kind, "clean", platform)
+    assert codes(result) == []
+    assert codes(result, "warning") == []
+    assert "part_of_poses" in [reason.rule for reason in result.reasons]
+    assert result.verdict is hec.Verdict.USE_WITH_CARE
+    assert "cannot be seen" in result.headline
+
+
+@pytest.mark.parametrize("stream", ["parent", "child"])
+def test_a_fault_names_the_stream_that_has_positions(stream):
+    recording = part_faults.positions("drone", "height in feet", SEED)
+    streams = (recording.parent, recording.child)
+    result = hec.calibrate(*(streams if stream == "child" else streams[::-1]), **part_faults.WIDE)
+    (found,) = [each for each in result.findings if each.code == "axis_scale"]
+    assert found.stream == stream
+    assert f"the {stream} stream's z coordinates" in found.what
+
+
+@pytest.mark.parametrize("scale", ["none", 1.0 / 1.05])
+def test_a_scale_that_was_given_is_no_error(scale):
+    recording = part_faults.positions("drone", "scale 1.05", SEED)
+    result = hec.calibrate(recording.parent, recording.child, scale=scale, **part_faults.WIDE)
+    assert "scale" not in codes(result)
+
+
+@pytest.mark.parametrize("scale", ["estimate", "auto"])
+def test_a_scale_that_was_asked_for_is_obeyed(scale):
+    recording = part_faults.positions("drone", "scale 1.05", SEED)
+    result = hec.calibrate(recording.parent, recording.child, scale=scale, **part_faults.WIDE)
+    assert abs(result.scale - 1.0 / 1.05) < 4.0 * result.scale_sigma < 0.01
+    assert "scale" not in codes(result)
+
+
+def test_auto_leaves_a_scale_that_is_one():
+    recording = part_faults.positions("drone", "clean", SEED)
+    result = hec.calibrate(recording.parent, recording.child, scale="auto", **part_faults.WIDE)
+    assert result.scale == pytest.approx(1.0, abs=0.005)
+
+
+def test_parallel_axes_and_an_antenna_at_the_origin_may_be_said_by_priors():
+    rates = part_faults.rates("drone", "own rates", SEED)
+    known = {axis: (0.0, np.radians(2.0)) for axis in ("roll", "pitch", "yaw")}
+    result = hec.calibrate(rates.parent, rates.child, prior=known, **part_faults.WIDE)
+    assert codes(result) == []
+    positions = part_faults.positions("drone", "copied with noise", SEED)
+    here = dict.fromkeys("xyz", (0.0, 0.02))
+    result = hec.calibrate(positions.parent, positions.child, prior=here, **part_faults.WIDE)
+    assert "same_position" not in codes(result)
+
+
+def test_orientations_alone_of_the_parent_itself_are_named():
+    recording = part_faults.rates("drone", "clean", SEED)
+    own = dataclasses.replace(recording.parent, measures="rotations", sensor_frame="imu")
+    result = hec.calibrate(recording.parent, own, **part_faults.WIDE)
+    assert codes(result) == ["same_frame"]
+
+
+def test_positions_of_a_short_recording_do_not_end_in_a_traceback():
+    stamps_ns = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(40)
+    turns = np.random.default_rng(0).standard_normal((40, 6)) * 0.3
+    poses = se3.exp(turns)
+    parent = Trajectory(stamps_ns, poses, "lidar")
+    child = Trajectory.from_positions(stamps_ns, poses[:, :3, :3] @ [0.3, 0.1, 0.2], "antenna")
+    result = hec.calibrate(parent, child)
+    assert result.verdict is not hec.Verdict.USE
