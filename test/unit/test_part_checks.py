@@ -52,7 +52,6 @@ def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(kind, faul
 @pytest.mark.parametrize(
     ("fault", "platform", "code"),
     [
-        ("smoothed 250 ms", "car", "smoothed_positions"),
         ("low-passed 200 ms", "hand", "smoothed_positions"),
         ("constant height", "hand", "axis_scale"),
         ("height 300 ms late", "hand", "axis_lag"),
