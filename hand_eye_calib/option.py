@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, Self, TypeAlias
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.text import shown_value
+from hand_eye_calib.text import frame_name, shown_value
 
 OptionValue: TypeAlias = bool | int | float | str
 #: Values of options by their public names: the dataclass that takes them checks their types.
@@ -97,7 +97,7 @@ def check_value(field: OptionField, value: object) -> OptionValue:
             )
         if meta["parse"] is not None and value:
             meta["parse"](name, value)
-        return value
+        return frame_name(value) if name.endswith("_frame") else value
     if words and isinstance(value, str):
         with contextlib.suppress(ValueError):
             value = float(value)

@@ -266,6 +266,11 @@ def parse_reference(name: str, text: str) -> tuple[str, int]:
     return text[0], int(text[1:] or 1)
 
 
+def frame_name(name: str) -> str:
+    """Return the name of a frame as tf2 takes it: without the leading slash of ROS 1."""
+    return name.lstrip("/")
+
+
 def split_frames(name: str, text: str) -> tuple[str, str]:
     """The fixed frame and the sensor's frame of ``WORLD:SENSOR``, the value of an option.
 
@@ -274,7 +279,7 @@ def split_frames(name: str, text: str) -> tuple[str, str]:
     ConfigError
         If these are not two different frames.
     """
-    frames = [frame.strip().lstrip("/") for frame in text.split(":")]
+    frames = [frame_name(frame.strip()) for frame in text.split(":")]
     if len(frames) != 2 or not all(frames) or frames[0] == frames[1]:
         raise ConfigError(
             f"{name} must be two frames as WORLD:SENSOR, such as odom:lidar; "

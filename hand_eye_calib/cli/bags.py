@@ -59,7 +59,8 @@ def select(
 ) -> tuple[dict[str, Source], dict[str, str]]:
     """The sources of "parent" and "child" in a bag, and what each measures."""
     given = {stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted}
-    chosen = bag.select(given.get("parent"), given.get("child"))
+    frames = {stream: getattr(config, f"{stream}_frame") for stream in STREAMS}
+    chosen = bag.select(given.get("parent"), given.get("child"), frames)
     if len(given) < len(STREAMS):
         parent, child = chosen
         note(
@@ -107,7 +108,7 @@ def _read_bags(
         _feed(calibrator, poses, sources)
         for stream, source in sources.items():
             if not calibrator.frame(stream):
-                calibrator.set_frame(stream, str(source).strip("/"))
+                calibrator.set_frame(stream, str(source))
         note(*bag.warnings)
         inputs = {"bag": str(bag), **calibrator.inputs(sources)}
         return Recording(calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings))
@@ -117,6 +118,10 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]
     """Give every pose to the engine. The first message that cannot be used is an InputError with
     topic and stamp.
     """
+    for stream in STREAMS:
+        worlds = poses.world_frames[poses.streams == stream]
+        if len(worlds):
+            calibrator.set_world(stream, worlds[0])
     columns = (poses.streams, poses.sensor_frames, poses.stamps_ns, poses.poses)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     for stream, frame, stamp_ns, pose in rows:

@@ -30,7 +30,7 @@ from hand_eye_calib.results.document import (
 )
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown
-from hand_eye_calib.text import listing
+from hand_eye_calib.text import frame_name, listing
 
 if TYPE_CHECKING:
     from hand_eye_calib.engine.snapshot import Snapshot
@@ -83,7 +83,8 @@ def _with_robot(
     """The result with its comparison with what is installed, and its pose in the base frame, if
     they were asked for.
     """
-    installed, base = arguments.installed, arguments.base_frame
+    installed = arguments.installed
+    base = frame_name(arguments.base_frame or "")
     from hand_eye_calib.io.installed import frames_of_bag, open_installed, read_urdf
     from hand_eye_calib.session.together import with_comparison
 

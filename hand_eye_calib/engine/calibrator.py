@@ -24,6 +24,7 @@ from hand_eye_calib.geometry.trajectory import REACH, Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs, slower_stream
 from hand_eye_calib.plain import Document
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import frame_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +76,8 @@ _WIDTH = 7
 
 
 class _PoseBuffer:
-    """Poses of one sensor, in order of their stamps; the name of its frame, empty until it is
-    known; and its statistics.
+    """Poses of one sensor, in order of their stamps; the names of its frame and of its world,
+    empty until they are known; and its statistics.
     """
 
     def __init__(self) -> None:
@@ -85,6 +86,7 @@ class _PoseBuffer:
         self._poses = array("d")  # x y z qx qy qz qw
         self._dropped_until_ns = -(2**63)
         self.frame = ""
+        self.world = ""
         self.statistics = StreamStatistics()
 
     def __len__(self) -> int:
@@ -198,8 +200,12 @@ class Calibrator:
         InputError
             If the name is empty, or another than before.
         """
+        sensor_frame = frame_name(sensor_frame)
         known = self._buffers[stream].frame
-        if getattr(self.config, f"{stream}_frame") or (sensor_frame and sensor_frame == known):
+        if getattr(self.config, f"{stream}_frame"):
+            self._buffers[stream].frame = known or sensor_frame
+            return
+        if sensor_frame and sensor_frame == known:
             return
         if not sensor_frame:
             raise InputError(
@@ -211,6 +217,15 @@ class Calibrator:
                 "one stream must be one sensor"
             )
         self._buffers[stream].frame = sensor_frame
+
+    def world(self, stream: str) -> str:
+        """Name of the frame in which a stream's poses are; empty if it is not known."""
+        return self._buffers[stream].world
+
+    def set_world(self, stream: str, world_frame: str) -> None:
+        """Set the name of the frame in which a stream's poses are; the first one stays."""
+        buffer = self._buffers[stream]
+        buffer.world = buffer.world or frame_name(world_frame)
 
     def add_pose(
         self,
@@ -258,17 +273,15 @@ class Calibrator:
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
         parent, child = self._buffers["parent"], self._buffers["child"]
-        frames = parent.frame, child.frame
-        parent_frame, child_frame, warnings = snapshots.name_frames(self.config, *frames)
+        config = self.config
         return Snapshot(
-            config=self.config,
+            config=config,
             kept=self._kept,
             buffered_parent=parent.trajectory(),
             buffered_child=child.trajectory(),
             paired_at=self._paired_at,
-            parent_frame=parent_frame,
-            child_frame=child_frame,
-            warnings=warnings,
+            parent_names=snapshots.names_of(config, "parent", parent.frame, parent.world),
+            child_names=snapshots.names_of(config, "child", child.frame, child.world),
             time_offset=self._time_offset,
         )
 
@@ -357,6 +370,11 @@ class Calibrators(dict[str, Calibrator]):
         """Set the name of a stream's sensor frame; see :meth:`Calibrator.set_frame`."""
         for own_stream, each in self.takers(stream):
             each.set_frame(own_stream, sensor_frame)
+
+    def set_world(self, stream: str, world_frame: str) -> None:
+        """Set the name of a stream's fixed frame; see :meth:`Calibrator.set_world`."""
+        for own_stream, calibrator in self.takers(stream):
+            calibrator.set_world(own_stream, world_frame)
 
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]

@@ -16,9 +16,11 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import cross_checked, solve_poses
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.frames import StreamFrames
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs, select_keyframes, synchronise
 from hand_eye_calib.results.calibration import Calibration
+from hand_eye_calib.text import frame_name
 
 STREAMS = ("parent", "child")
 
@@ -52,7 +54,8 @@ class Snapshot:
         Poses that are not paired yet, as they came in.
     paired_at : {"parent", "child"} or None
         Stream whose stamps the pairs have; the slower one if None.
-    parent_frame, child_frame : str
+    parent_names, child_names : StreamFrames
+        Names of the frames of each stream.
     warnings : tuple of str
     time_offset : TimeOffset or None
         The offset of the kept pairs if it was estimated.
@@ -63,10 +66,70 @@ class Snapshot:
     buffered_parent: Trajectory
     buffered_child: Trajectory
     paired_at: str | None = None
-    parent_frame: str
-    child_frame: str
+    parent_names: StreamFrames = field(default_factory=StreamFrames)
+    child_names: StreamFrames = field(default_factory=StreamFrames)
     warnings: tuple[str, ...] = ()
     time_offset: TimeOffset | None = None
+
+    @property
+    def parent_frame(self) -> str:
+        """Name of the parent sensor's frame, as the options read its poses."""
+        return self._frame("parent")
+
+    @property
+    def child_frame(self) -> str:
+        """Name of the child sensor's frame, as the options read its poses."""
+        return self._frame("child")
+
+    def _frame(self, stream: str) -> str:
+        """Name of a stream's sensor frame; a default if it is not known."""
+        names, other = self._names(stream)
+        name = names.name
+        if getattr(self.config, f"{stream}_invert") == "poses" and names.inverse_name != other.name:
+            name = names.inverse_name
+        return name or f"{stream}_sensor"
+
+    def _names(self, stream: str) -> tuple[StreamFrames, StreamFrames]:
+        """Names of the frames of a stream, and those of the other stream."""
+        both = self.parent_names, self.child_names
+        return both if stream == "parent" else both[::-1]
+
+    @property
+    def frame_warnings(self) -> tuple[str, ...]:
+        """Warnings about sensor frames: without a name, or with that of the inverse poses."""
+        warnings = []
+        for stream, frame in zip(STREAMS, (self.parent_frame, self.child_frame), strict=True):
+            names, _ = self._names(stream)
+            if frame == f"{stream}_sensor":
+                warnings.append(
+                    f"the {stream} stream does not name its sensor's frame; it is called '{frame}' "
+                    f"here (name it with {stream}_frame)"
+                )
+            elif frame != names.name:
+                observed = names.name or "what it observes"
+                text = f"the {stream} is {frame}: inverted, the poses are those of {frame} in "
+                text += observed
+                if names.option:
+                    text += f", which {stream}_frame names"
+                warnings.append(text)
+        return tuple(warnings)
+
+    def _check_frames(self) -> None:
+        """Raise InputError if the names of the frames contradict each other."""
+        for stream in STREAMS:
+            names, other = self._names(stream)
+            if names.option not in ("", names.sensor) and names.option == other.sensor:
+                raise InputError(
+                    f"{stream}_frame is {names.option}, but that is the frame of the other stream: "
+                    f"the parent stream is of {self.parent_names.sensor or 'a sensor without name'}"
+                    f", the child stream of {self.child_names.sensor or 'a sensor without name'}; "
+                    "exchange the two streams, or the two names"
+                )
+        if self.parent_frame == self.child_frame:
+            raise InputError(
+                f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
+                "nothing to calibrate between; give parent_frame and child_frame"
+            )
 
     @property
     def unpaired(self) -> tuple[Trajectory, Trajectory]:
@@ -136,13 +199,9 @@ class Snapshot:
         NotEnoughDataError
             If fewer than ``min_pairs`` poses can be paired; the message says what is missing.
         InputError
-            If both streams have the same sensor frame.
+            If both streams have the same sensor frame, or an option gives one of them the other's.
         """
-        if self.parent_frame == self.child_frame:
-            raise InputError(
-                f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
-                "nothing to calibrate between; give parent_frame and child_frame"
-            )
+        self._check_frames()
         resolved, pairs = self.resolved, self.pose_pairs
         config = resolved.config
         if len(pairs) < config.min_pairs:
@@ -159,7 +218,7 @@ class Snapshot:
             result,
             parent_frame=self.parent_frame,
             child_frame=self.child_frame,
-            warnings=self.warnings + result.warnings,
+            warnings=self.frame_warnings + self.warnings + result.warnings,
         )
 
     def _estimate_part(self, cross_check: bool) -> Calibration:
@@ -246,34 +305,23 @@ def whole_snapshot(
         "child_measures": child.measures,
     }
     config = CalibratorConfig.from_options(of_streams | dict(options))
-    frames = parent.sensor_frame, child.sensor_frame
-    parent_frame, child_frame, warnings = name_frames(config, *frames)
+    warnings: tuple[str, ...] = ()
     if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
-        warnings += (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
+        warnings = (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
     return Snapshot(
         config=config,
         buffered_parent=parent,
         buffered_child=child,
-        parent_frame=parent_frame,
-        child_frame=child_frame,
+        parent_names=names_of(config, "parent", parent.sensor_frame, parent.world_frame),
+        child_names=names_of(config, "child", child.sensor_frame, child.world_frame),
         warnings=warnings,
     )
 
 
-def name_frames(
-    config: CalibratorConfig, parent: str, child: str
-) -> tuple[str, str, tuple[str, ...]]:
-    """Names of the parent's and the child's sensor frame, and a warning for each without a name.
-    Those of the options override those that the streams give, which are empty if unknown.
-    """
-    parent, child = config.parent_frame or parent, config.child_frame or child
-    warnings = tuple(
-        f"the {stream} stream does not name its sensor's frame; it is called '{stream}_sensor' "
-        f"here (name it with {stream}_frame)"
-        for stream, name in zip(STREAMS, (parent, child), strict=True)
-        if not name
-    )
-    return parent or "parent_sensor", child or "child_sensor", warnings
+def names_of(config: CalibratorConfig, stream: str, sensor: str, world: str) -> StreamFrames:
+    """Names of the frames of a stream, from its messages and the options."""
+    option = getattr(config, f"{stream}_frame")
+    return StreamFrames(frame_name(sensor), frame_name(world), frame_name(option))
 
 
 def estimated_time_offset(

@@ -3,6 +3,7 @@ what these state of the pose of a sensor.
 """
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,12 +15,20 @@ from hand_eye_calib.arrays import BoolArray, FloatArray
 from hand_eye_calib.errors import InputError, NoPoseError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import FARTHEST_M, QUATERNION_NORM_TOLERANCE, far_position
+from hand_eye_calib.text import frame_name
 
 # A matrix whose rotation is further than this from one is none.
 _ROTATION_WITHIN = 1e-2
 
 # The last row of a matrix is 0 0 0 1 within this.
 LAST_ROW_WITHIN = 1e-6
+
+# Words in the name of a frame that say that it stands still: a map, the start of an odometry.
+_WORLDS = {"map", "odom", "odometry", "world", "earth", "ecef", "enu", "ned", "utm", "global"}
+_WORLDS |= {"origin", "init", "mocap", "vicon", "optitrack", "inertial"}
+# Words that say that it is something that a camera observes.
+_TARGETS = {"aruco", "marker", "tag", "apriltag", "charuco", "target", "board", "chessboard"}
+_TARGETS |= {"checkerboard", "pattern", "fiducial", "aprilgrid"}
 
 # Edges that are listed in a message.
 _MOST_LISTED = 50
@@ -223,6 +232,48 @@ def numbers_of(value: Any) -> list[float]:
         return []
 
 
+def words_of(name: str) -> set[str]:
+    """Return the words in the name of a frame or topic, in lower case."""
+    return {*re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())}
+
+
+@dataclass(frozen=True)
+class StreamFrames:
+    """Names of the frames of a stream of poses; empty if they are not known.
+
+    Attributes
+    ----------
+    sensor, world : str
+        Of the sensor, and of the fixed frame in which its poses are, as the messages give them.
+    option : str
+        Of the sensor, as the user gave it.
+    """
+
+    sensor: str = ""
+    world: str = ""
+    option: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of the sensor's frame."""
+        return self.option or self.sensor
+
+    @property
+    def inverse_name(self) -> str:
+        """Name of the sensor's frame if the poses have to be inverted.
+
+        Transforms camera -> marker of a fixed marker are inverse poses of the camera: the frames
+        change their roles. A publisher that writes inverse poses below the frames odom -> base_link
+        means base_link: a frame that is called a world is no sensor.
+        """
+        is_named_otherwise = self.option not in ("", self.sensor)
+        if not self.world or is_named_otherwise:
+            return self.name
+        is_world = bool(words_of(self.world) & _WORLDS)
+        is_target = bool(words_of(self.sensor) & _TARGETS)
+        return self.name if is_world and not is_target else self.world
+
+
 @dataclass(frozen=True)
 class Extrinsic:
     """Pose of the child sensor in the parent sensor's frame, as stated by a source.
@@ -281,6 +332,8 @@ class FrameTree:
         InputError
             If the frame has another parent already.
         """
+        parent = frame_name(parent)
+        frame = frame_name(frame)
         edge = self.edges.setdefault(frame, Edge(parent))
         if edge.parent != parent:
             raise InputError(
@@ -320,7 +373,8 @@ class FrameTree:
         InputError
             If one of both is not there, or they are not connected.
         """
-        up, down = self.above(frame), self.above(of)
+        up = self.above(frame_name(frame))
+        down = self.above(frame_name(of))
         if up[-1] != down[-1]:
             raise InputError(f"frames {frame!r} and {of!r} are not connected; {self.listing()}")
         shared = {*up} & {*down}

@@ -22,7 +22,7 @@ from hand_eye_calib.io.yaml_files import read_yaml
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.exports import arranged, formats
 from hand_eye_calib.results.records import AXES, ROTATIONS, TRANSLATIONS
-from hand_eye_calib.text import parse_pose
+from hand_eye_calib.text import frame_name, parse_pose
 
 # Results say what they are.
 _FORMAT = "hand_eye_calib/extrinsic"
@@ -90,7 +90,8 @@ def frames_of_bag(path: str | Path) -> FrameTree:
 
 
 def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
-    found, wanted = (result.parent_frame, result.child_frame), (parent_frame, child_frame)
+    found = frame_name(result.parent_frame), frame_name(result.child_frame)
+    wanted = frame_name(parent_frame), frame_name(child_frame)
     if found == wanted[::-1]:
         result = result.inverse()
     elif found != wanted:
@@ -111,7 +112,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
     """
     nodes, frames = [*_nodes(document, ())], FrameTree("the file")
     for parent, child, *pose in filter(None, (_named(*each) for each in nodes)):
-        frames.add(str(parent).lstrip("/"), str(child).lstrip("/"), pose_of(*pose))
+        frames.add(str(parent), str(child), pose_of(*pose))
     if frames.edges:
         return frames.pose(parent_frame, child_frame)
     for layouts in formats().values():
@@ -170,7 +171,7 @@ def _of_sensors(
     found = []
     for above, node in nodes:
         if values := _at(node, keys):
-            beside = frames & {str(each).strip("/") for each in node.values()}
+            beside = frames & {frame_name(str(value)) for value in node.values()}
             found.append((beside or frames & {*above}, values))
     if len(found) > 1:
         found = [each for each in found if each[0]]

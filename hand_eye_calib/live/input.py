@@ -176,6 +176,7 @@ class PoseInput:
     ) -> None:
         self.name, self.topic = name, topic
         self.is_enabled, self.problem, self._sensor_frame = True, "", ""
+        self._world_frame = ""
         self._guard, self._refused = StampGuard(), Counter[str]()
         self._session, self._log, self._on_jump_back = session, log, on_jump_back
         self._wanted = "auto"
@@ -201,6 +202,7 @@ class PoseInput:
     def restart(self, because_of: "PoseInput | None") -> None:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
+        self._world_frame = ""
         self._last_stamp_ns, self._longest_gap_ns = None, 0
         self._taken_s = None
         self._is_new = because_of is None
@@ -272,6 +274,9 @@ class PoseInput:
                 if pose.sensor_frame not in (None, self._sensor_frame):
                     self._session.engines.set_frame(self.name, pose.sensor_frame)
                     self._sensor_frame = pose.sensor_frame
+                if pose.world_frame != self._world_frame:
+                    self._session.engines.set_world(self.name, pose.world_frame)
+                    self._world_frame = pose.world_frame
                 fields = self.name, stamp_ns, pose.position, pose.quat_xyzw
                 if not self._session.engines.add_pose(*fields):
                     which = with_stamp(stamp_ns)

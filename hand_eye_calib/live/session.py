@@ -29,6 +29,8 @@ def give(journal: Journal, directory: Path, engines: Calibrators) -> None:
         for stream, about in journal.about.items():
             if about.get("frame"):
                 engines.set_frame(stream, about["frame"])
+            if about.get("world"):
+                engines.set_world(stream, about["world"])
         columns = (journal.streams, journal.stamps_ns, journal.poses)
         for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
             if engines.takers(stream):
@@ -206,7 +208,11 @@ class LiveSession:
         for stream in ("parent", *self.engines):
             own_stream, engine = self.engines.takers(stream)[0]
             origin = self._origins.get(stream, LocalOrigin()).geodetic
-            known = {"frame": engine.frame(own_stream), "origin": [*(origin or ())]}
+            known: Document = {
+                "frame": engine.frame(own_stream),
+                "world": engine.world(own_stream),
+                "origin": [*(origin or ())],
+            }
             known = {name: each for name, each in known.items() if each}
             about[stream] = {"topic": self.topics.get(stream, ""), **of_all, **known}
         return about

@@ -12,11 +12,20 @@ from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.results import records
+from hand_eye_calib.text import frame_name
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from hand_eye_calib.results.context import Comparison, Progress, RateBias, Together
+
+_FRAMES = (
+    "parent_frame",
+    "child_frame",
+    "parent_world_frame",
+    "child_world_frame",
+    "base_frame",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +178,12 @@ class Result:
     comparison: "Comparison | None" = None
     goal: "Progress | None" = None
     together: "Together | None" = None
+
+    def __post_init__(self) -> None:
+        for name in _FRAMES:  # tf2 refuses the leading slash of ROS 1
+            frame = getattr(self, name)
+            if isinstance(frame, str):  # a file that was changed may have anything
+                object.__setattr__(self, name, frame_name(frame))
 
     @property
     def rotation(self) -> "Rotation":

@@ -114,16 +114,22 @@ class Robot:
     def __init__(self, log: NodeLog, options: NodeConfig, frames: FrameTree) -> None:
         self._log, self._frames = log, frames
         self._source, self._base_frame = options.installed, options.base_frame
+        # What is installed between the two frames that were asked for last.
         self._installed: Extrinsic | None = None
+        self._installed_for = ("", "")
         self.problem = ""
         of_tree = partial(stated, frames.pose, STATIC_TOPIC)
         self._read = of_tree if self._source in ("", TF) else open_installed(self._source)
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
         """What is installed; None if nothing was given, or it is not known (yet)."""
+        frames = parent_frame, child_frame
+        if frames != self._installed_for:  # inverted poses exchange the frames of their stream
+            self._installed = None
         if self._installed is None and self._source:
             try:
                 self._installed = self._read(parent_frame, child_frame)
+                self._installed_for = frames
                 self.problem = ""
                 self._log.info(f"installed is what {self._installed.origin} says")
             except HandEyeCalibError as error:

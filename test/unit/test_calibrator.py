@@ -126,7 +126,7 @@ class TestRefusals:
         named.set_frame("child", "base_link")
         snapshot = named.snapshot()
         assert (snapshot.parent_frame, snapshot.child_frame) == ("parent_sensor", "camera")
-        assert "parent stream does not name" in snapshot.warnings[0]
+        assert "parent stream does not name" in snapshot.frame_warnings[0]
 
 
 @pytest.mark.parametrize(

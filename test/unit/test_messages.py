@@ -52,8 +52,9 @@ def encoded(encoding, message_type, pose):
 def assert_unpacked(columns, drawn, message_type):
     has_frame = MESSAGE_TYPES[message_type].has_child_frame
     assert columns.stamps_ns.tolist() == [stamp_ns for stamp_ns, _, _, _ in drawn]
-    assert columns.world_frames.tolist() == [printable(world) for _, world, _, _ in drawn]
-    sensors = [printable(sensor) if has_frame else None for _, _, sensor, _ in drawn]
+    worlds = [printable(world.lstrip("/")) for _, world, _, _ in drawn]
+    assert columns.world_frames.tolist() == worlds
+    sensors = [printable(sensor.lstrip("/")) if has_frame else None for _, _, sensor, _ in drawn]
     assert columns.sensor_frames.tolist() == sensors
     np.testing.assert_array_equal(columns.poses, [values for _, _, _, values in drawn])
 

@@ -37,6 +37,7 @@ from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.geodetic import LocalOrigin
 from hand_eye_calib.io.trajectory_files.table import TWIST
 from hand_eye_calib.io.transforms import PoseFields
+from hand_eye_calib.text import frame_name
 
 # What unpacking bytes that are not a message of its type may raise.
 MALFORMED = (struct.error, ValueError)
@@ -76,7 +77,9 @@ class Cursor:
         return int(seconds * NS_PER_S + nanoseconds)
 
     def name(self) -> str:
-        """Read a string; in CDR it ends in a zero byte. Control characters are escaped."""
+        """Read the name of a frame; in CDR it ends in a zero byte. Control characters are escaped,
+        and the leading slash of ROS 1 is left out.
+        """
         (length,) = self.read("I")
         start, self.position = self.position, self.position + length
         if self.position > len(self._data):
@@ -84,7 +87,7 @@ class Cursor:
         if length > LONGEST_NAME:
             raise ValueError(f"the name of a frame has {length} bytes, more than {LONGEST_NAME}")
         end = self.position - (not self._is_ros1)
-        return printable(str(self._data[start : max(end, start)], "utf-8"))
+        return printable(frame_name(str(self._data[start : max(end, start)], "utf-8")))
 
 
 def _pose(cursor: Cursor) -> Sequence[float]:
@@ -323,8 +326,8 @@ def transform_of(message: Any) -> PoseFields:
         stamp, parent = message.header.stamp, message.header.frame_id
     else:
         stamp, parent = message.timestamp, message.parent_frame_id
-    names = (each[:LONGEST_NAME].lstrip("/") for each in (parent, message.child_frame_id))
-    parent, frame = map(printable, names)
+    parent = printable(frame_name(parent[:LONGEST_NAME]))
+    frame = printable(frame_name(message.child_frame_id[:LONGEST_NAME]))
     pose = message.transform if is_ros else message
     row = pose_row(pose.translation, pose.rotation)
     return PoseFields(ns_of(stamp) or 0, parent, frame, row[:3], row[3:])

@@ -1,6 +1,5 @@
 """Reading the poses of two streams from bags."""
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -17,7 +16,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags import messages, sources
+from hand_eye_calib.io.bags import messages, roles, sources
 from hand_eye_calib.io.bags.messages import PoseTable, Run
 from hand_eye_calib.io.bags.scans import ScanReading
 from hand_eye_calib.io.bags.sources import Reading, Source
@@ -29,8 +28,6 @@ from hand_eye_calib.io.transforms import TfSource, TfStream
 # A topic with fewer poses is not one of the two sensors: goals and initial poses are published
 # once.
 _FEWEST_POSES = 3
-# Words of a topic's name that say which stream it is, the likeliest parent first.
-_WORDS = ("parent", "base", "lidar", "", "child")
 
 
 class TopicInfo(NamedTuple):
@@ -159,12 +156,16 @@ class PoseBag:
             )
 
     def select(
-        self, parent: Source | None = None, child: Source | None = None
+        self,
+        parent: Source | None = None,
+        child: Source | None = None,
+        frames: Mapping[str, str] | None = None,
     ) -> tuple[Source, Source]:
         """Choose the sources of the parent's and the child's poses; an InputError if one that is
         named cannot be used, both are the same, or there is a choice to make. With neither named,
         the bag has exactly two topics of poses, or of paths if there are no others; the parent is
-        the one whose name has the word parent, base or lidar, or the first by name.
+        the one whose name has the word parent, base or lidar, or the first by name. If ``frames``
+        name the sensors of "parent" or "child", the topics are chosen by these names.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
@@ -186,8 +187,24 @@ class PoseBag:
                 f"odom:lidar. {self._listing()}"
                 + (f". Transforms are {', '.join(found)[:LONGEST_NAME]}" if found else "")
             )
-        chosen = sorted((topic.name for topic in choices[0]), key=_parent_first) if wanted else []
+        chosen = [topic.name for topic in choices[0]] if wanted else []
+        if wanted == 2:
+            is_named = any((frames or {}).values())
+            sensors = {topic: self.sensor_frame(topic) for topic in chosen if is_named}
+            chosen = roles.parent_and_child(chosen, frames or {}, sensors)
         return parent or chosen.pop(0), child or chosen.pop(0)
+
+    def sensor_frame(self, topic: str) -> str:
+        """Frame of the sensor of a topic of poses, as its first message names it; empty if none."""
+        run = next(self._runs([topic]), None)
+        kind = self.topics[topic].type
+        if run is None or kind not in messages.POSE_TYPES:
+            return ""
+        try:
+            table = messages.unpack_poses(run.messages[:1], kind, run.kind.is_ros1)
+        except messages.MALFORMED as error:
+            raise run.unreadable(error) from error
+        return table.sensor_frames[0] or ""
 
     def _parts_of(self, topic: str) -> list[str]:
         """The topics of positions and of orientations of ``/fix+/imu``; otherwise the topic."""
@@ -330,10 +347,3 @@ def _bag_times(bag_ns: Sequence[int]) -> IntArray:
         limits = np.iinfo(np.int64)
         inside = [min(max(time_ns, limits.min), limits.max) for time_ns in bag_ns]
         return np.array(inside, dtype=np.int64)
-
-
-def _parent_first(topic: str) -> tuple[int, str]:
-    """Sorts the likelier parent first: by name, then alphabetically."""
-    words = {*re.split(r"[/_]+", topic.lower()), ""}
-    word = "child" if "child" in words else next(each for each in _WORDS if each in words)
-    return _WORDS.index(word), topic

@@ -28,6 +28,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.messages import PoseTable, Run, ns_of
 from hand_eye_calib.io.bags.sources import Reading
 from hand_eye_calib.io.npz import read_arrays
+from hand_eye_calib.text import frame_name
 
 # numpy's name of each datatype of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -114,7 +115,10 @@ def scan_of(message: Any) -> Scan:
     # Times may be relative to the stamp of the header, or absolute.
     middle_ns, header_ns = round(float(middle) * unit_ns), ns_of(message.header.stamp) or 0
     stamp_ns = middle_ns + header_ns * (middle_ns <= TUNING.longest_ns)
-    times_s, frame = (times - middle) * unit_ns * 1e-9, printable(message.header.frame_id)
+    times_s, frame = (
+        (times - middle) * unit_ns * 1e-9,
+        printable(frame_name(message.header.frame_id)),
+    )
     return Scan(points, rings, times_s, stamp_ns, frame)
 
 

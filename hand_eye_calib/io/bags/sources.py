@@ -25,7 +25,7 @@ from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_o
 from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
 from hand_eye_calib.io.trajectory_files.table import TWIST, Table
 from hand_eye_calib.io.transforms import TfSource, TfStream
-from hand_eye_calib.text import without_poses
+from hand_eye_calib.text import frame_name, without_poses
 
 Source = str | TfSource
 # A delay against the bag's time (s) is of a wrong stamp if it is so much farther from both
@@ -231,7 +231,7 @@ class PathReading(Reading):
                 f"the poses of path {self.topics[0]} have no stamps: all are zero; use the "
                 "odometry that the path was made from"
             )
-        frame = printable(path.header.frame_id)
+        frame = printable(frame_name(path.header.frame_id))
         poses = np.reshape(rows, (-1, 7))
         is_null = are_null(poses)
         self._note_null(int(is_null.sum()), len(poses))
@@ -254,7 +254,7 @@ class ImageReading(Reading):
             if is_seen:
                 self._stamps_ns.append(messages.ns_of(message.header.stamp) or 0)
                 self._bag_ns.append(bag_ns)
-                self._frame = printable(message.header.frame_id)
+                self._frame = printable(frame_name(message.header.frame_id))
 
     def table(self) -> messages.PoseTable:
         found = self._finder.found()
