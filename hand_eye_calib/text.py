@@ -118,7 +118,7 @@ MUCH_NULL = 0.1
 def without_poses(n_null: int, n_all: int) -> str:
     """How many poses of a stream were left out because they are null, and what to do if many."""
     counts = f"{n_null:,} of {n_all:,} poses ({share(n_null / n_all)}) were left out"
-    text = f"{counts}: their quaternion is 0, or a value is not finite"
+    text = f"{counts}: their quaternion is 0, or a value is not finite or absent"
     if n_null > MUCH_NULL * n_all:
         text += ". So many: does the source lose track? Record again where it does not"
     return text

@@ -72,7 +72,8 @@ def _opened(
     if not is_bag:
         options.refuse_stamps(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
-        return names, *reading.read_files(arguments, paths, given)
+        files = reading.read_files(arguments, paths, given)
+        return names, files.trajectories, [*files.repairs, *files.warnings]
     from hand_eye_calib.cli import bags
     from hand_eye_calib.config import CalibratorConfig
     from hand_eye_calib.io.bags.reader import PoseBag

@@ -6,6 +6,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from hand_eye_calib.cli.options import FILE_OPTIONS, STREAMS, flag, note, waiting_for, with_progress
 from hand_eye_calib.engine.run import run
@@ -74,8 +75,9 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
 
 def read_pair(arguments: Namespace, options: Options) -> Recording:
     """The recording of the trajectory files of parent and child."""
-    (parent, child), repairs = read_files(arguments, arguments.paths, options)
-    note(*repairs)
+    files = read_files(arguments, arguments.paths, options)
+    parent, child = files.trajectories
+    note(*files.repairs)
     inputs: Document = {}
     for path, stream, poses in zip(arguments.paths, STREAMS, (parent, child), strict=True):
         first_ns, last_ns = poses.stamps_ns[[0, -1]].tolist()
@@ -83,15 +85,24 @@ def read_pair(arguments: Namespace, options: Options) -> Recording:
         inputs[stream] |= {"first_stamp_ns": first_ns, "last_stamp_ns": last_ns}
     times = {arguments.times, arguments.parent_times, arguments.child_times} - {None}
     snapshot = whole_snapshot(parent, child, options)
-    return Recording(snapshot, inputs, [*map(Path, arguments.paths), *times])
+    read = [*map(Path, arguments.paths), *times]
+    return Recording(snapshot, inputs, read, tuple(files.warnings))
 
 
-def read_files(
-    arguments: Namespace, paths: Sequence[Path | str], options: Options
-) -> tuple[list[Trajectory], list[str]]:
-    """The trajectories of files, and what was wrong with their stamps; a note says what was
-    guessed. How each is read is among the arguments: of two, its own options go before those for
-    both. ``options`` say what the sensors measure.
+class FilesRead(NamedTuple):
+    """The trajectories of files, what was wrong with the files and was repaired, and what a result
+    has to be warned of.
+    """
+
+    trajectories: list[Trajectory]
+    repairs: list[str]
+    warnings: list[str]
+
+
+def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Options) -> FilesRead:
+    """The trajectories of files; a note says what was guessed. How each is read is among the
+    arguments: of two, its own options go before those for both. ``options`` say what the sensors
+    measure.
     """
     from hand_eye_calib.io.trajectory_files.reading import FileOptions, read_trajectory_files
 
@@ -114,6 +125,14 @@ def read_files(
             named_as = rf"`{stream}_\1`" if stream else r"`\1`"
             text = text.replace(str(path), path.name)
             note(re.sub(f"`({'|'.join(FILE_OPTIONS)})`", named_as, text))
-    return [each.trajectory for each in readings], [
-        text for reading in readings for text in reading.repairs
-    ]
+    return FilesRead(
+        [reading.trajectory for reading in readings],
+        _with_short_names(files, [reading.repairs for reading in readings]),
+        _with_short_names(files, [reading.warnings for reading in readings]),
+    )
+
+
+def _with_short_names(files: Sequence[tuple[Path, Any]], texts: Sequence[list[str]]) -> list[str]:
+    """Texts of files with their names in place of their paths."""
+    both = zip(files, texts, strict=True)
+    return [text.replace(str(path), path.name) for (path, _), of_file in both for text in of_file]

@@ -57,7 +57,8 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     else:
         refuse_stamps(arguments)
         names = [*map(str, arguments.paths)]
-        trajectories, notes = read_files(arguments, arguments.paths, {})
+        trajectories, repairs, doubts = read_files(arguments, arguments.paths, {})
+        notes = [*repairs, *doubts]
         inputs = {"files": names}
     note(*notes)
     frames = [each.sensor_frame or name for each, name in zip(trajectories, names, strict=True)]

@@ -48,7 +48,9 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     of_poses = [parent_path] if arguments.target else arguments.paths
     if arguments.pair_by == "time":
         arguments.pair_by = "row"
-    (parent, *others), _ = read_files(arguments, of_poses, options)
+    files = read_files(arguments, of_poses, options)
+    note(*files.repairs, *files.warnings)
+    parent, *others = files.trajectories
     n_child = len(others[0]) if others else len(images)
     if len(parent) != n_child:
         raise InputError(

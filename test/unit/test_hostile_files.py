@@ -192,7 +192,7 @@ def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
         ("csv", "{t},{x},0,0,0,0,0,1"),
     ],
 )
-@pytest.mark.parametrize("value", ["1e154", "-1e200", "1.7e308", "1e11", "1e999", "nan", "0x10"])
+@pytest.mark.parametrize("value", ["1e154", "-1e200", "1.7e308", "1e11", "0x10"])
 def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     lines = ["t,x,y,z,qx,qy,qz,qw"] if format == "csv" else []
     of_one = {True: "1", False: "0.7071067811865476"}["{x}" in row or format == "kitti"]

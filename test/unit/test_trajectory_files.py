@@ -94,7 +94,7 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),
         ([f"13173756256617361230 {POSE}"], "line 1: .* 1.31738e.19 is too large for ns; name its"),
         ([f"{t} {POSE}" for t in (0, 33, 66)], "is unclear; read as s, the poses are 33 s apart"),
-        ([f"0 {POSE}", "1 nan 2 3 0 0 0 1"], "line 2: found a value that is not finite"),
+        (["0 nan 2 3 0 0 0 1"], "no poses in it: all 1 rows are empty, zero or not finite, the f"),
         (["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"], "line 3: found a quaternion of length 1.1, ex"),
         ([f"5 {POSE}", "#", f"5.0 {POSE}"], "line 3: timestamps must increase, found 5.0+ after"),
     ],
@@ -172,7 +172,8 @@ def test_without_a_header_the_columns_must_be_named(file):
         ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", NO_QUATERNION),
         ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations show no pose.; na"),
         ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
-        (f"t,time,{XYZW[2:]}", "columns t, time could all be t; name them with `columns`"),
+        (f"t,time,{XYZW[2:]}", "line 1: names 9 columns, but the rows have 8 cells; give each"),
+        ("t,time,x,y,z,qx,qy,qz", "columns t, time could all be t; name them|no column for qw"),
     ],
 )
 def test_columns_that_are_missing_or_not_clear(file, header, message):

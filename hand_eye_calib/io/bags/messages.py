@@ -35,7 +35,7 @@ from hand_eye_calib.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.io.bags.storage import MessageKind
 from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.trajectory_files.table import TWIST
+from hand_eye_calib.io.trajectory_files.columns import TWIST
 from hand_eye_calib.io.transforms import PoseFields
 from hand_eye_calib.text import frame_name
 

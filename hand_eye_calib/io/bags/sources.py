@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import replace
 from decimal import Decimal
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,10 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import are_null
 from hand_eye_calib.io.bags import messages
 from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
-from hand_eye_calib.io.trajectory_files.poses import poses_of, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import TWIST, Table
+from hand_eye_calib.io.trajectory_files.columns import TWIST
+from hand_eye_calib.io.trajectory_files.poses import poses_of
+from hand_eye_calib.io.trajectory_files.stamps import stamps_in_ns
+from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.io.transforms import TfSource, TfStream
 from hand_eye_calib.text import frame_name, without_poses
 
@@ -32,9 +33,6 @@ Source = str | TfSource
 # neighbours than these are from each other and than the usual step: computers delay for less.
 _JUMP_S = 0.5
 _NOTHING = messages.PoseTable.of([], np.empty((0, 7)))
-_NOT_FINITE = {"nan", "inf", "-inf"}
-_QUAT = {"qx", "qy", "qz", "qw"}
-_ZEROS = {"0", "0.0", "-0.0"}
 # Share of stamps that are 0, or repeated, from which on they are of no use.
 _MOSTLY = 0.5
 
@@ -281,23 +279,15 @@ class FieldReading(Reading):
         self._paths = [path.split(".") for _, path in pairs]
         of_table = "twists" if {*TWIST} <= {*self._names} else "auto"
         self._table = Table(topic, self._names, of_table)
-        self._bag_ns, self._n_left_out = list[int](), 0
+        self._bag_ns: list[int] = []
         self.measures = "poses" if of_table == "twists" else self._table.measures
         if self.measures == "rates":
             raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
 
     def take(self, run: messages.Run) -> None:
         rows = [[self._cell(each, path) for path in self._paths] for each in run.decoded()]
-        # As of an estimator that has not started.
-        is_known = [_NOT_FINITE.isdisjoint(row) and not self._is_null(row) for row in rows]
-        self._n_left_out += is_known.count(False)
-        self._table.fill(enumerate(compress(rows, is_known), len(self._bag_ns) + 1), list)
-        self._bag_ns += run.bag_ns[is_known].tolist()
-
-    def _is_null(self, row: list[str]) -> bool:
-        """Return whether the quaternion of a row is zero."""
-        quaternion = [cell for name, cell in zip(self._names, row, strict=True) if name in _QUAT]
-        return len(quaternion) == len(_QUAT) and {*quaternion} <= _ZEROS
+        self._table.fill(enumerate(rows, len(self._bag_ns) + 1), list)
+        self._bag_ns += run.bag_ns.tolist()
 
     def _cell(self, value: Any, path: list[str]) -> str:
         """A value of a message, stamps in seconds with all their digits."""
@@ -317,12 +307,13 @@ class FieldReading(Reading):
             topic = self.topics[0]
             raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
         stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
-        self._note_null(self._n_left_out, self._n_left_out + len(stamps_ns))
+        self._note_null(table.n_left_out, table.n_rows)
         if table.measures == "twists":
             poses = _integrated(stamps_ns, table.values())
         else:
             poses = np.column_stack(poses_of(table))
-        found = messages.PoseTable.of(stamps_ns, poses).recorded(self.stream, self._bag_ns)
+        bag_ns = np.asarray(self._bag_ns)[table.rows]
+        found = messages.PoseTable.of(stamps_ns, poses).recorded(self.stream, bag_ns)
         return self._stamped(found)
 
 

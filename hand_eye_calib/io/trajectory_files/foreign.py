@@ -26,19 +26,18 @@ from hand_eye_calib.errors import InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.files import LONGEST_NAME
-from hand_eye_calib.io.trajectory_files.table import (
+from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
     QUATERNION,
     ROTATION_VECTOR,
-    Table,
-    columns_of_array,
 )
+from hand_eye_calib.io.trajectory_files.stamps import GPS_TIME
+from hand_eye_calib.io.trajectory_files.table import Table, columns_of_array
 from hand_eye_calib.text import shortened
 
 _POSE = (*POSITION, *QUATERNION)
 _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
-_GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
 # Of axes forward, right, down those forward, left, up; of OpenGL's camera that of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 # Lines of a Motive file that may stand before the rows: it has 7 (format version 1.25).
@@ -150,7 +149,7 @@ def _of_rtklib(data: bytes, _: str | None) -> _Rows:
             day = cells[0].replace("/", "-")
             stamp = f"{day}T{cells[1]}Z" if "-" in day else _of_week(*cells[:2])
             rows.append((stamp, *cells[2:5]))
-    return _PLACE, rows, () if re.search(rb"(?m)^%\s+(UTC|JST)\b", data) else [_GPS_TIME]
+    return _PLACE, rows, () if re.search(rb"(?m)^%\s+(UTC|JST)\b", data) else [GPS_TIME]
 
 
 def _of_novatel(data: bytes, _: str | None) -> _Rows:
@@ -167,7 +166,7 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
             rows.append((_of_week(*about[week : week + 2]), *cells[2:4], height, *turn))
     if not rows:
         raise ValueError("a log of NovAtel without INSPVA or INSPVAX: log one of them")
-    return (*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [_GPS_TIME]
+    return (*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [GPS_TIME]
 
 
 def _of_week(week: str, second: str) -> str:
@@ -262,7 +261,7 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     rows = ([row[place] for place in places] for row in table if len(row) > max(places))
     unit = units[about.get("Length Units", "Meters")]
     header = ("t [s]", *(f"{axis} [{unit}]" for axis in POSITION), *QUATERNION)
-    return header, filter(all, rows), [f"poses of rigid body {body}"]
+    return header, rows, [f"poses of rigid body {body}"]
 
 
 def _of_vicon(data: bytes, choice: str | None) -> _Rows:
@@ -396,7 +395,7 @@ PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\AULog\x01\x12\x35": _of_ulog,
     rb"\A(\{|\[\s*[\[{\"\d-])": _of_json,
     rb"\$[A-Z]{2}(GGA|RMC),": _of_nmea,
-    rb"\A\d{9,10},\d{1,9},[^,\n]*[A-Za-z/][^,\n]*,": _of_echo,
+    rb"\A\d{9,10},\d{1,9},(?=[^,\n]*[A-Za-z/])[^,\n]*,": _of_echo,
     rb"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)": _of_rtklib,
     # As of Emlid, without a header; metres have fewer digits.
     rb"\A\d{4}/\d\d/\d\d +\S+( +-?\d+\.\d{9,}){2} ": _of_rtklib,

@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.config import STAMP_UNITS
+from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import (
@@ -23,23 +22,17 @@ from hand_eye_calib.geometry.trajectory import (
     far_position,
     scatter_of_direction,
 )
-from hand_eye_calib.io.trajectory_files.table import (
-    DIGITS,
+from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     QUATERNION,
     RATES,
     ROTATION_VECTOR,
     SCALAR_FIRST,
     UNNAMED,
-    Table,
     is_brief,
-    seconds,
 )
-from hand_eye_calib.stats import median
+from hand_eye_calib.io.trajectory_files.table import Table
 
-# Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
-# mistaken.
-_LONGEST_INTERVAL_S = 10
 # Units of lengths, angles and rates in m, rad and rad/s. Without a name it is the first, or the
 # second if a value is larger than the limit: a turn with room for rounding, and 2,000 deg/s, which
 # no gyroscope exceeds.
@@ -53,66 +46,6 @@ _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
 # The inverse rotation in roll, pitch and yaw, as pyboreas has it.
 _INVERSE = "that of the world in the sensor's frame"
-
-# ---- stamps
-
-
-def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
-    """Stamps (N,) in nanoseconds, in the unit that is given, that the format has, or that their
-    size tells; an InputError if there are none, they are too large, or their unit is not clear.
-    """
-    if not table.stamps:
-        raise InputError(
-            f"{table.path}: the poses have no stamps; name their column t, give `times`, or pair "
-            "poses by row with `pair_by`"
-        )
-    unit = stamp_unit or table.units["t"]
-    sizes = np.abs(np.array(table.stamps, dtype=float))
-    by_size = (each for each, digits in DIGITS.items() if sizes.max() >= 10.0**digits)
-    recognised = unit or next(by_size, "s")
-    factor = STAMP_UNITS[recognised]
-    table.refuse(
-        np.asarray(sizes * factor >= float(np.iinfo(np.int64).max)),
-        lambda index: (
-            f"the timestamp {table.stamps[index]:.6g} is too large for {recognised}; name its unit "
-            "with `stamp_unit`"
-        ),
-    )
-    rounded = (int((stamp * factor).to_integral_value()) for stamp in table.stamps)
-    stamps_ns = np.fromiter(rounded, dtype=np.int64, count=len(table.stamps))
-    # Stamps with a fraction are in seconds.
-    if not unit and not any(stamp % 1 for stamp in table.stamps):
-        intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
-        if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
-            raise InputError(
-                f"{table.path}: the unit of the timestamps is unclear; read as {recognised}, the "
-                f"poses are {median(intervals_s):.4g} s apart; name it with `stamp_unit`: s, ms, "
-                "us or ns"
-            )
-    return stamps_ns
-
-
-def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Indices of poses in the order of time, each stamp once, and what was repaired for that; an
-    InputError if it must not be repaired.
-    """
-    wrong = np.r_[False, stamps_ns[1:] <= stamps_ns[:-1]]
-    if not repair:
-        table.refuse(
-            wrong,
-            lambda index: (
-                f"timestamps must increase, found {seconds(stamps_ns[index])} after "
-                f"{seconds(stamps_ns[index - 1])}; {int(wrong.sum())} such lines; sort the lines "
-                "and drop repeated timestamps, or have that done with `repair`"
-            ),
-        )
-    keep = np.unique(stamps_ns, return_index=True)[1]
-    backward, n_dropped = int((np.diff(stamps_ns) < 0).sum()), len(stamps_ns) - len(keep)
-    went_back = f"stamps went back at {backward} of {len(stamps_ns)} poses, which were sorted"
-    dropped = f"dropped {n_dropped} whose stamp was there already"
-    said = "; ".join([went_back] * (backward > 0) + [dropped] * (n_dropped > 0))
-    return keep, [f"{table.path}: {said}"]
-
 
 # ---- poses and rates
 

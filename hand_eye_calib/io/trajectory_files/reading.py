@@ -2,16 +2,14 @@
 (``foreign.py``), bags, and numbers in memory.
 """
 
-import csv
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,33 +17,39 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory, TrajectoryLike
-from hand_eye_calib.io.files import LONGEST_LINE, decoded, read_bytes, read_text
-from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
-from hand_eye_calib.io.trajectory_files.poses import in_order, poses_of, stamps_in_ns
-from hand_eye_calib.io.trajectory_files.table import (
-    DIGITS,
+from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.io.files import LONGEST_LINE, LONGEST_NAME, decoded, read_bytes, read_text
+from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
-    NUMBER,
-    PLANAR_POSITIONS,
     POSITION,
-    QUATERNION,
-    RATES,
-    SCALAR_FIRST,
     TUM_COLUMNS,
-    UNNAMED,
-    Table,
     named_columns,
-    table_of_object,
+    stamp_columns,
 )
-from hand_eye_calib.text import told_apart
+from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
+from hand_eye_calib.io.trajectory_files.layout import (
+    STAMPED_POSE,
+    TUM,
+    Layout,
+    layout_of,
+    lines_of,
+)
+from hand_eye_calib.io.trajectory_files.poses import poses_of
+from hand_eye_calib.io.trajectory_files.stamps import (
+    in_order,
+    notes_on_stamps,
+    refuse_coarse,
+    stamps_in_ns,
+)
+from hand_eye_calib.io.trajectory_files.table import Table, table_of_object
+from hand_eye_calib.text import MUCH_NULL, shortened, told_apart, without_poses
 
 #: The format that the lines look like.
 AUTO = "auto"
 
 # Of the formats whose columns have an order: their names, and what a row is.
 _FORMATS: dict[str, tuple[Sequence[str], str]] = {
-    "tum": (("t", *POSITION, *QUATERNION), f"8 numbers, {TUM_COLUMNS}"),
+    "tum": (TUM, f"8 numbers, {TUM_COLUMNS}"),
     "kitti": (MATRIX, "12 numbers, the first three rows of a pose"),
     "euroc": (
         ("t [ns]", *POSITION, "qw", "qx", "qy", "qz"),
@@ -56,19 +60,7 @@ _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
-# A stamp, a position and a quaternion, whose order is to be found.
-_UNNAMED = ("t", *POSITION, *UNNAMED)
-# Rows of numbers that have a matrix, all or the first three rows of it, by how many there are.
-_LAST_ROW = tuple(f"m4{column}" for column in "1234")
-_BY_NUMBER = {
-    13: ("t", *MATRIX),
-    16: (*MATRIX, *_LAST_ROW),
-    17: ("t", *MATRIX, *_LAST_ROW),
-}
 _TIMES = "times.txt"
-_LINE = re.compile(r"\S[^\r\n]*")
-_COMMENTS = ("#", "//")
-_DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+([eE][-+]?\d+)?)")
 # Time between poses that are paired without stamps.
 _STEP_NS = 100_000_000
 
@@ -104,13 +96,14 @@ class FileOptions:
 
 
 class FileReading(NamedTuple):
-    """A trajectory; what was wrong with its stamps; and what the file does not say and had to be
-    found or assumed.
+    """A trajectory; what was wrong with the file and was repaired; what the file does not say and
+    had to be found or assumed; and what a result has to be warned of.
     """
 
     trajectory: Trajectory
     repairs: list[str]
     guesses: list[str]
+    warnings: list[str]
 
 
 def read_trajectory(
@@ -200,8 +193,8 @@ def read_trajectory(
         measures=measures,
     )
     table = read_table(path, options) if path else table_of_object(source, times)
-    trajectory, repairs, guesses = _read(table, options)
-    for text in [*guesses, *repairs]:
+    trajectory, repairs, guesses, doubts = _read(table, options)
+    for text in [*guesses, *repairs, *doubts]:
         warnings.warn(text, UserWarning, stacklevel=2)
     return trajectory
 
@@ -263,19 +256,20 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
         return [read_trajectory(each, AUTO) for each in sources]
     readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])
     for reading in readings:
-        for text in (*reading.repairs, *reading.guesses):
+        for text in [*reading.repairs, *reading.guesses, *reading.warnings]:
             warnings.warn(text, UserWarning, stacklevel=3)
     return [reading.trajectory for reading in readings]
 
 
 def _pairs(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
-    """The rows of each table that belong to those of the others, without their stamps."""
-    counts = [len(table.line_numbers) for table in tables]
+    """The rows of each table that belong to those of the others, without their stamps; a row
+    without a pose is left out of all.
+    """
+    counts = [table.n_rows for table in tables]
     if pair_by == "row" and len({*counts}) > 1:
         raise InputError(f"to be paired by row, files need as many poses each; found {counts}")
-    keys = [
-        [*table.images] if pair_by == "name" else [*range(count)]
-        for table, count in zip(tables, counts, strict=True)
+    keys: list[list[Any]] = [
+        [*table.images] if pair_by == "name" else [*table.rows] for table in tables
     ]
     common = sorted(set.intersection(*map(set, keys)))
     if not common:
@@ -292,26 +286,48 @@ def _read(
 ) -> FileReading:
     """The trajectory of a table, or of some of its rows in place of its stamps."""
     if not table.line_numbers:
-        raise InputError(f"{table.path}: no poses in it; expected lines of {table.expected}")
-    repairs: list[str] = []
+        raise InputError(f"{table.path}: no poses in it{_all_left_out(table)}")
+    repairs, doubts = _left_out(table)
     if rows is None:
         stamps_ns = stamps_in_ns(table, options.stamp_unit)
+        refuse_coarse(table, stamps_ns, table.values())
         rows = np.arange(len(stamps_ns))
     else:
         stamps_ns = np.zeros(len(table.line_numbers), dtype=np.int64)
         stamps_ns[rows] = np.arange(len(rows)) * _STEP_NS
     values = poses_of(table, convention)
     if (np.diff(stamps_ns[rows]) <= 0).any():
-        rows, repairs = in_order(table, stamps_ns, options.repair)
+        rows, of_stamps = in_order(table, stamps_ns, options.repair)
+        repairs += of_stamps
     builders: dict[str, Callable[..., Trajectory]] = {"rates": Trajectory.from_rates}
     build = builders.get(table.measures, Trajectory.from_quat_xyzw)
-    trajectory = build(stamps_ns[rows], *(each[rows] for each in values))
+    trajectory = build(stamps_ns[rows], *(columns[rows] for columns in values))
     if table.measures not in ("poses", "rates"):
         table.guess(f"{table.measures} alone, as its columns have it")
     kind = table.measures if options.measures == AUTO else options.measures
     if kind != "poses":
         trajectory = replace(trajectory, measures=kind)
-    return FileReading(trajectory, repairs, table.guesses)
+    return FileReading(trajectory, repairs, table.guesses, doubts)
+
+
+def _all_left_out(table: Table) -> str:
+    if not table.n_rows:
+        return f"; expected lines of {table.expected}"
+    return (
+        f": all {table.n_rows} rows are empty, zero or not finite, the first on line "
+        f"{table.first_left_out}"
+    )
+
+
+def _left_out(table: Table) -> tuple[list[str], list[str]]:
+    """What was repaired by leaving out rows without a pose, or a warning if they are many."""
+    if not table.n_left_out:
+        return [], []
+    counts = without_poses(table.n_left_out, table.n_rows)
+    text = f"{table.path}: {counts}; the first is on line {table.first_left_out}"
+    if table.n_left_out <= MUCH_NULL * table.n_rows:
+        return [text], []
+    return [], [text]
 
 
 # ---- text
@@ -327,145 +343,97 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
         if re.search(pattern, head):
             return foreign_table(path, data, read, options.columns, options.measures)
     text = decoded(path, data.replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
-    number, cells, names, format, header = _beginning(path, text)
-    columns, times, guesses = options.columns, options.times, list[str]()
-    if options.format != AUTO or columns or times:
-        format = options.format if options.format != AUTO else "csv" if columns else "kitti"
-        header = _FORMATS[format][0] if format != "csv" else names
+    needs_names = not options.columns and options.format in (AUTO, "csv")
+    layout = layout_of(path, text, needs_names)
+    if options.format != AUTO or options.columns or options.times:
+        layout = _as_given(layout, options)
+        guesses = []
     else:
-        if format != "tum":
-            order = ", qw qx qy qz" * (format == "euroc")
-            guesses = [f"{path} looks like format {format}{order}; to change that, give `format`"]
-        beside = Path(path).with_name(_TIMES)
-        if format == "kitti" and beside.is_file():
-            times = beside
-            guesses.append(f"stamps read from {beside}; to change that, give `times`")
-    is_header = not any(map(NUMBER.fullmatch, cells))
-    if format == "csv" and header is names and not columns:
-        header, number = _completed(header, number, _lines(path, text, number * (names is cells)))
-    if columns:
-        header = [name.strip() for name in columns.split(",")]
-    elif format == "csv":
-        is_header = names is cells
-    if header is None and cells:
-        raise InputError(
-            f"{path}: the first line names no columns, so that their order is unknown; name the "
-            f"{len(cells)} with `columns`, such as t,x,y,z,qx,qy,qz,qw or t,wx,wy,wz"
-        )
-    header = (*(header or _UNNAMED),)
-    if format == "euroc":
-        header += ("",) * (len(cells) - len(header))
-    measures = options.measures if format == "csv" else AUTO
-    table = Table(path, header, measures, _FORMATS.get(format, ("", ""))[1], format)
+        guesses = [f"{path}{text}" for text in _guesses_of(layout)]
+    table = _empty_table(path, layout, options)
     table.guesses = guesses
-    if cells:  # a file without data is not gone through again
-        table.fill(_lines(path, text, number if is_header else 0), _cells)
-    if format == "kitti" and times is not None:
-        table.stamps = _stamps_of(times, table)
+    if layout.row:  # a file without data is not gone through again
+        table.fill(lines_of(path, text, layout.rows_after), layout.cells_of)
+        stamp_cells = [layout.row[place] for place in table.stamp_at if place < len(layout.row)]
+        for note in notes_on_stamps(table.stamp_names, stamp_cells):
+            table.guess(note)
+    _add_times(table, options)
     return table
 
 
-def _lines(path: str | Path, text: str, after: int | None = None) -> Iterator[tuple[int, str]]:
-    """The lines of a text that are not blank, with their numbers; those after one that are no
-    comments.
+def _as_given(layout: Layout, options: FileOptions) -> Layout:
+    """The layout with the format and columns that options name."""
+    if options.columns:
+        names = tuple(name.strip() for name in options.columns.split(","))
+        return replace(layout, format="csv", columns=names, is_transposable=False)
+    if options.format == "csv":
+        return replace(layout, format="csv", columns=layout.names, is_transposable=False)
+    if options.format != AUTO:
+        columns = tuple(_FORMATS[options.format][0])
+        return replace(layout, format=options.format, columns=columns, is_transposable=False)
+    has_own_stamps = layout.columns is None or stamp_columns(named_columns(layout.columns)[0])
+    # The file of times is for poses without stamps.
+    return replace(layout, format="kitti", columns=MATRIX) if has_own_stamps else layout
+
+
+def _guesses_of(layout: Layout) -> list[str]:
+    """What a person should know of a layout that no option names."""
+    if layout.format == "tum":
+        return []
+    order = ", qw qx qy qz" if layout.format == "euroc" else ""
+    guesses = [f" looks like format {layout.format}{order}; to change that, give `format`"]
+    is_usual = layout.columns in (STAMPED_POSE, STAMPED_POSE[1:])
+    if layout.names is None and layout.format == "csv" and layout.columns and not is_usual:
+        columns = ",".join(name or "-" for name in layout.columns).rstrip(",-")
+        guesses.append(
+            f": no columns are named; the numbers fit {shortened(columns, LONGEST_NAME)}; to "
+            "change that, give `columns`"
+        )
+    return guesses
+
+
+def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Table:
+    """The table that the rows of a layout go into."""
+    n_columns = len(layout.row)
+    columns = layout.columns
+    if columns is None and n_columns:
+        raise InputError(
+            f"{path}: the first line names no columns, so that their order is unknown; name the "
+            f"{n_columns} with `columns`, such as t,x,y,z,qx,qy,qz,qw, "
+            "t,x,y,z,roll_deg,pitch_deg,yaw_deg or t,wx,wy,wz"
+        )
+    columns = columns or STAMPED_POSE
+    if layout.format == "euroc":
+        columns += ("",) * (n_columns - len(columns))
+    measures = options.measures if layout.format == "csv" else AUTO
+    expected = _FORMATS.get(layout.format, ("", ""))[1]
+    return Table(path, columns, measures, expected, layout.format, layout.is_transposable)
+
+
+def _add_times(table: Table, options: FileOptions) -> None:
+    """Add stamps from a file of their own to poses without any: that of an option, or times.txt in
+    the same folder.
     """
-    number, end = 1, 0
-    for line in _LINE.finditer(text):
-        number += text.count("\n", end, line.start())
-        end = line.end()
-        if end - line.start() > LONGEST_LINE:
-            raise InputError(f"{path}, line {number}: longer than {LONGEST_LINE} characters")
-        if after is None or (number > after and not line[0].startswith(_COMMENTS)):
-            yield number, line[0].rstrip()
-
-
-def _cells(text: str) -> list[str]:
-    """The cells of a line: separated by commas, semicolons or white space."""
-    if "," not in text and ";" not in text:
-        return text.split()
-    delimiter = ";" if ";" in text else ","
-    row = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))
-    cells = [cell.strip() for cell in row]
-    if delimiter == ";" and "," in text:
-        return [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
-    return cells
-
-
-def _beginning(
-    path: str | Path, text: str
-) -> tuple[int, list[str], Sequence[str] | None, str, Sequence[str] | None]:
-    """What the beginning of a text tells: number and cells of the first line that is no comment (0
-    and none without one); the names of the columns, which are that line, unless it is a row of
-    numbers, otherwise the last comment above it that has as many cells, or one that ends in names;
-    the format, tum in doubt, so that its reader says what is wrong; and the columns of that format,
-    if they are known.
-    """
-    comments: dict[int, list[str]] = {}
-    first = 0, "", list[str](), True
-    for number, line in _lines(path, text):
-        cells = _cells(line.lstrip("#/").strip())
-        is_row = all(NUMBER.fullmatch(cell) for cell in cells if cell)
-        if not line.startswith(_COMMENTS):
-            first = number, line, cells, is_row
-            break
-        if not is_row:
-            comments[len(cells)] = cells
-    number, line, cells, is_row = first
-    found: tuple[str, Sequence[str] | None]
-    ends = (each[-len(cells) :] for each in comments.values())  # after "format:"
-    stated = (end for end in ends if {"x", "qw"} <= named_columns(end)[0].keys())
-    names: Sequence[str] | None = cells
-    if is_row:
-        names = comments.get(len(cells)) or next(stated, None)
-    is_separated, n_cells = "," in line or ";" in line, len(cells)
-    known = named_columns(names or ())[0].keys()
-    if names is cells or any({*group} <= known for group in (*PLANAR_POSITIONS, RATES)):
-        is_tum = " ".join((names or ())[1:]).lower() == TUM_COLUMNS.partition(" ")[2]
-        found = ("tum", _FORMATS["tum"][0]) if is_tum and not is_separated else ("csv", names)
-    elif (by_number := _BY_NUMBER.get(n_cells)) and _has_rotation(cells[by_number.index("m11") :]):
-        found = "csv", by_number
-    elif not is_separated and n_cells != 4:
-        by_default = "tum", _UNNAMED
-        found = {7: ("csv", _UNNAMED[1:]), 12: ("kitti", MATRIX)}.get(n_cells, by_default)
-    elif n_cells >= 8 and cells[0].isdecimal() and len(cells[0]) >= DIGITS["ns"]:
-        found = "euroc", ("t [ns]", *POSITION, *SCALAR_FIRST)
-    else:
-        found = "csv", _UNNAMED if n_cells == 8 else None
-    return number, cells, names, *found
-
-
-def _completed(
-    names: Sequence[str] | None, number: int, lines: Iterator[tuple[int, str]]
-) -> tuple[Sequence[str] | None, int]:
-    """Names of columns, with units from the row below them, and "t" for a first column without a
-    known name that has stamps since 1970; the number of the last line above the rows.
-    """
-    below, cells = next(((each, _cells(line)) for each, line in lines), (0, [""]))
-    if names and below and not any(map(NUMBER.fullmatch, cells)):
-        if len(cells) == len(names):
-            names = [" ".join(each) for each in zip(names, cells, strict=True)]
-        number, cells = below, next((_cells(line) for _, line in lines), [""])
-    if names and not {"t", "secs", *named_columns(names[:1])[0]} & named_columns(names)[0].keys():
-        names = ["t", *names[1:]] if re.fullmatch(r"\d{10,}(\.\d*)?", cells[0]) else names
-    return names, number
-
-
-def _has_rotation(cells: Sequence[str]) -> bool:
-    """Whether rows of a matrix have a rotation in their first three columns."""
-    with suppress(ValueError), np.errstate(all="ignore"):  # one may be a time, or empty
-        R = np.array(cells[:12], dtype=float).reshape(3, 4)[:, :3]
-        return bool(np.allclose(R @ R.T, np.eye(3), atol=ROTATION_TOLERANCE))
-    return False
+    times = options.times
+    is_auto = options.format == AUTO and not options.columns
+    beside = Path(str(table.path)).with_name(_TIMES)
+    if times is None and is_auto and not table.stamp_at and beside.is_file():
+        times = beside
+        table.guesses.append(
+            f"{table.path}: stamps read from {beside}; to change that, give `times`"
+        )
+    if times is not None and not table.stamp_at:
+        table.stamps = _stamps_of(times, table)
 
 
 def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
     """The stamps of poses from a file of their own."""
-    lines = _lines(times, read_text(times, "stamps"), after=0)
+    lines = lines_of(times, read_text(times, "stamps"), after=0)
     table = Table(times, ["t"], "stamps", "a stamp")
     table.fill(lines, lambda text: text.split()[:1])
-    if len(table.stamps) != len(poses.line_numbers):
+    if len(table.stamps) != poses.n_rows:
         raise InputError(
-            f"{poses.path}: {len(poses.line_numbers)} poses, but {times} has "
+            f"{poses.path}: {poses.n_rows} poses, but {times} has "
             f"{len(table.stamps)} stamps; they belong to different recordings"
         )
-    return table.stamps
+    return [table.stamps[row] for row in poses.rows]

@@ -2,124 +2,58 @@
 names, and what stands in them; and rows as they are written.
 """
 
+import math
 import re
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
 from hand_eye_calib.io.files import LONGEST_NAME, write_atomically, writing
+from hand_eye_calib.io.trajectory_files.cells import angle, is_null, number
+from hand_eye_calib.io.trajectory_files.columns import (
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    ROTATION,
+    SCALAR_FIRST,
+    TUM_COLUMNS,
+    UNNAMED,
+    measured,
+    named_columns,
+    stamp_columns,
+)
+from hand_eye_calib.io.trajectory_files.stamps import seconds, stamp_of
 from hand_eye_calib.text import shortened, shown_value
 
-POSITION = ("x", "y", "z")
-QUATERNION = ("qx", "qy", "qz", "qw")
-TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-# Coefficients of a quaternion with the scalar first, and of one whose order is not known.
-SCALAR_FIRST = ("q0", "q1", "q2", "q3")
-UNNAMED = ("q1", "q2", "q3", "q4")
-ROTATION_VECTOR = ("rotvec_x", "rotvec_y", "rotvec_z")
-# The first three rows of a pose's matrix.
-MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
-RATES = ("wx", "wy", "wz")
-TWIST = ("vx", "vy", "vz", *RATES)
-# Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
-# plane, fewer.
-_POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
-PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
-_ORIENTATIONS = (
-    QUATERNION,
-    SCALAR_FIRST,
-    ("roll", "pitch", "yaw"),
-    ("roll", "pitch", "heading"),
-    ROTATION_VECTOR,
-    UNNAMED,
-)
-_PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
-
-# What stands before the axis in names of angular rates, velocities and quaternions.
-_BEGINNINGS = {
-    "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
-    "v": "v",
-    "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
-}
-_OF_POSITION = "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
-# Last parts of column names, lower case, words joined by underscores; exports of bags have whole
-# paths such as .pose.pose.position.x.
-_ALIASES = {
-    "header": "header_stamp",
-    "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp",
-    "x": _OF_POSITION.format("x") + "easting pos_east position0 actual_tcp_pose_0",
-    "y": _OF_POSITION.format("y") + "northing pos_north position1 actual_tcp_pose_1",
-    "z": _OF_POSITION.format("z") + "altitude pos_up position2 actual_tcp_pose_2",
-    "lat": "lat latitude",
-    "lon": "lon long lng longitude",
-    "height": "height ht h_ell ellipsoid_height ellipsoidal_height altitude alt elevation ele",
-    "roll": "roll roll_angle",
-    "pitch": "pitch pitch_angle",
-    "yaw": "yaw yaw_angle theta",
-    "heading": "heading true_heading platform_heading hdg azimuth",
-    "secs": "stamp_secs stamp_sec secs sec",
-    "nsecs": "stamp_nsecs stamp_nanosec stamp_nsec nsecs nanosec nsec",
-    "image": "image",
-    **{
-        f"{kind}{axis}": " ".join(f"{name}{axis}" for name in names.split())
-        for kind, names in _BEGINNINGS.items()
-        for axis in "xyzw"
-    },
-    **{name: f"{name} quat_{name}" for name in (*SCALAR_FIRST, *UNNAMED)},
-    **{
-        name: f"{name} actual_tcp_pose_{k} r{name[-1]}" for k, name in enumerate(ROTATION_VECTOR, 3)
-    },
-    **{name: f"{name} t{int(name[1:]) - 11:02d}" for name in MATRIX},
-}
-# Names, after each other, of some part of an orientation or of a position, known or not.
-_ORIENTED = re.compile(
-    r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|"
-    r"(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
-).search
-_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)").search
-
-# Units as names have them, with a slash for what separates words.
-_UNITS = {
-    **{
-        unit: unit for unit in ("m", "mm", "cm", "ft", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)
-    },
-    "feet": "ft",
-    **dict.fromkeys(("degree", "degrees", "°"), "deg"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
-    **dict.fromkeys(("dps", "°/s"), "deg/s"),
-}
-#: Digits before the point of stamps since 1970; of seconds, fewer.
-DIGITS = {"ns": 17, "us": 14, "ms": 11}
-#: A number, or a time as of ISO 8601.
-NUMBER = re.compile(
-    r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|nan|[-+]?inf|\d{4}-\d\d-\d\d[t ]\d.*", re.IGNORECASE
-)
+# Quantities that are all 0 where there is no orientation, as of tracking that was lost.
+_TURNS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 
 
 @dataclass
 class Table:
     """The rows of a file: their line numbers, stamps (none without a column of them), and values,
-    one row after the other; the names of their images, if there is a column of them.
+    one row after the other; the names of their images, if there is a column of them. Rows without
+    a pose, with values that are absent or not finite, are left out: ``rows`` are the numbers of
+    the others, from 0, ``n_rows`` counts all, ``first_left_out`` is the line of the first.
 
     ``path`` is what messages call it, ``names`` are those of all columns. ``measures`` says what
     to read, one of config.MEASURES, "twists" for velocities, or "auto", which becomes what the
     columns are; ``expected`` is what a row should be, for messages. Found are the column of each
-    quantity (``at``), such as "x" or "qw", those of the stamp (``stamp_at``: one, or that of
-    seconds and that of nanoseconds), and the ``units`` of quantities and of "t" in the names.
+    quantity (``at``), such as "x" or "qw", those of the stamp (``stamp_at``) by what they are
+    (``stamp_names``), and the ``units`` of quantities and of "t" in the names.
     ``guesses`` are what a person should know of how the file was read, ``conventions`` those of
-    its angles that the motion does not contradict, the usual first. An InputError if a column is
-    missing, or several have the same meaning.
+    its angles that the motion does not contradict, the usual first; ``is_transposable`` if rows
+    and columns of its rotations could be exchanged. An InputError if a column is missing, or
+    several have the same meaning.
     """
 
     path: object
@@ -127,7 +61,11 @@ class Table:
     measures: str = "auto"
     expected: str = ""
     format: str = "csv"
+    is_transposable: bool = False
     line_numbers: "array[int]" = field(default_factory=lambda: array("q"))
+    rows: "array[int]" = field(default_factory=lambda: array("q"))
+    n_rows: int = 0
+    first_left_out: int | None = None
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
     images: list[str] = field(default_factory=list)
@@ -135,32 +73,44 @@ class Table:
     conventions: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        found, units = named_columns(self.names)
+        columns, units = named_columns(self.names)
         self.expected = self.expected or f"{len(self.names)} columns: {self._listed()}"
-        self.measures, measured = _measured(found, self.names, self.measures)
-        # The stamp of the message's header rather than the time of its arrival.
-        ways = (("secs", "nsecs"), ("header",), ("t",), ())
-        stamp = next(way for way in ways if {*way} <= found.keys())
-        if missing := [name for name in measured if name not in found]:
+        self.measures, quantities = measured(columns, self.names, self.measures)
+        self.stamp_names = stamp_columns(columns)
+        if missing := [name for name in quantities if name not in columns]:
             listed = self._listed()
-            no_pose = " (accelerations show no pose)" * bool(re.search(r", a(cc\w*)?_?x", listed))
+            has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
+            no_pose = " (accelerations show no pose)" if has_accelerations else ""
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among {listed}{no_pose}; name "
                 "all columns with `columns`, such as t,x,y,z,qw,qx,qy,qz, or roll_deg,pitch_deg,"
                 "yaw_deg or rotvec_x,rotvec_y,rotvec_z for turns, or t,wx,wy,wz of a gyroscope; "
                 "remove other text above the rows"
             )
-        for name in (*stamp, *measured):
-            if len(found[name]) > 1:
+        for name in (*self.stamp_names, *quantities):
+            if len(columns[name]) > 1:
                 raise InputError(
-                    f"{self.path}: columns {self._listed(found[name])} could all be {name}; name "
+                    f"{self.path}: columns {self._listed(columns[name])} could all be {name}; name "
                     "them with `columns`"
                 )
-        self.at = {name: found[name][0] for name in measured}
-        self.stamp_at = [found[name][0] for name in stamp]
-        self._image_at = found.get("image", ())
+        self.at = {name: columns[name][0] for name in quantities}
+        self.stamp_at = [columns[name][0] for name in self.stamp_names]
+        self._image_at = columns.get("image", ())
         self.units = {name: units[at] for name, at in self.at.items() if units[at]}
-        self.units["t"] = "ns" if len(stamp) > 1 else units[self.stamp_at[0]] if stamp else ""
+        self.units["t"] = ""
+        if self.stamp_names == ("secs", "nsecs"):
+            self.units["t"] = "ns"
+        elif len(self.stamp_at) == 1:
+            self.units["t"] = units[self.stamp_at[0]]
+        elif self.stamp_at:
+            self.units["t"] = "s"
+        turn = next((group for group in _TURNS if {*group} <= {*quantities}), ())
+        self._turn_at = [list(quantities).index(name) for name in turn]
+
+    @property
+    def n_left_out(self) -> int:
+        """How many rows have no pose."""
+        return self.n_rows - len(self.rows)
 
     def _listed(self, places: Iterable[int] | None = None) -> str:
         """The names of some columns, or of all, for a message."""
@@ -169,7 +119,8 @@ class Table:
 
     def values(self, names: Iterable[str] = ()) -> FloatArray:
         """(N, k) array: the values of some quantities, or of all."""
-        places, all_values = [*self.at], np.asarray(self.numbers).reshape(-1, len(self.at))
+        places = [*self.at]
+        all_values = np.asarray(self.numbers).reshape(-1, len(self.at))
         return all_values[:, [places.index(name) for name in names]] if names else all_values
 
     def fill(
@@ -178,25 +129,69 @@ class Table:
         """Add rows from their line numbers and texts; an InputError at the first line with another
         number of cells, or with something that is no number.
         """
-        stamp_at, at, n_columns = self.stamp_at, [*self.at.values()], len(self.names)
-        for number, text in lines:
+        n_columns = len(self.names)
+        for line_number, text in lines:
             cells = cells_of(text)
             if len(cells) != n_columns:
-                raise InputError(
-                    f"{self.path}, line {number}: expected {self.expected}; found {len(cells)}: "
-                    f"{shown_value(text)}"
-                )
+                cells = self._as_many_as_columns(cells, line_number, text)
             try:
-                if stamp_at:
-                    self.stamps.append(_stamp(*[cells[index] for index in stamp_at]))
-                self.numbers.extend([float(cells[index]) for index in at])
+                self._add(cells, line_number)
             except ValueError as error:
                 reason = f"expected {self.expected}; {shortened(str(error))}"
-                raise InputError(f"{self.path}, line {number}: {reason}") from None
-            if self._image_at:
-                self.images.append(cells[self._image_at[0]])
-            self.line_numbers.append(number)
+                raise InputError(f"{self.path}, line {line_number}: {reason}") from None
         return self
+
+    def _add(self, cells: Sequence[str], line_number: int) -> None:
+        """Add a row, or count it if it has no pose; a ValueError for what is no number."""
+        values = self._numbers_in(cells)
+        stamp_cells = [cells[place] for place in self.stamp_at]
+        row = self.n_rows
+        self.n_rows += 1
+        if not self._is_pose(values) or any(map(is_null, stamp_cells)):
+            if self.first_left_out is None:
+                self.first_left_out = line_number
+            return
+        if stamp_cells:
+            self.stamps.append(stamp_of(self.stamp_names, stamp_cells))
+        self.numbers.extend(values)
+        if self._image_at:
+            self.images.append(cells[self._image_at[0]])
+        self.line_numbers.append(line_number)
+        self.rows.append(row)
+
+    def _numbers_in(self, cells: Sequence[str]) -> list[float]:
+        try:
+            return [float(cells[place]) for place in self.at.values()]
+        except ValueError:
+            return [
+                (angle if name in ("lat", "lon") else number)(cells[place])
+                for name, place in self.at.items()
+            ]
+
+    def _is_pose(self, values: Sequence[float]) -> bool:
+        """Whether the values of a row are finite, and some of its orientation is not 0."""
+        # The sum is quick; that of large numbers may not be finite.
+        if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
+            return False
+        return not self._turn_at or any(values[place] for place in self._turn_at)
+
+    def _as_many_as_columns(
+        self, cells: Sequence[str], line_number: int, text: object
+    ) -> Sequence[str]:
+        """The cells of a row without an empty one at its end, or those of a row that has a stamp
+        alone; an InputError for any other number of cells.
+        """
+        n_columns = len(self.names)
+        if len(cells) == n_columns + 1 and not cells[-1]:
+            return cells[:-1]
+        others = (cell for place, cell in enumerate(cells) if place not in self.stamp_at)
+        has_stamp = self.stamp_at and max(self.stamp_at) < len(cells) < n_columns
+        if has_stamp and all(map(is_null, others)):
+            return [*cells, *[""] * (n_columns - len(cells))]
+        raise InputError(
+            f"{self.path}, line {line_number}: expected {self.expected}; found {len(cells)}: "
+            f"{shown_value(text)}"
+        )
 
     def guess(self, text: str) -> None:
         """Note how something was read that the file does not say."""
@@ -207,103 +202,6 @@ class Table:
         index = int(np.argmax(wrong))
         if wrong[index]:
             raise InputError(f"{self.path}, line {self.line_numbers[index]}: {message(index)}")
-
-
-def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
-    """Columns of each quantity, of those that have any: of one of its names; if there is none, of
-    paths that end in one; and the units in the names, empty for none.
-    """
-    plain, units = zip(*map(_split, names), strict=True) if names else ((), ())
-    found: dict[str, list[int]] = {}
-    for wanted, aliases in _ALIASES.items():
-        known = aliases.split()
-        # Of paths, the longest end that is known: position_x rather than x.
-        ends = tuple(f"_{alias}" for alias in known if "_" in alias)
-        columns = [at for at, name in enumerate(plain) if name in known]
-        columns = columns or [at for at, name in enumerate(plain) if name.endswith(ends)]
-        if wanted in ROTATION_VECTOR:
-            # In degrees they are rather angles, in an order that nothing names.
-            columns = [at for at in columns if not (is_brief(names[at]) and units[at] == "deg")]
-        if columns:
-            found[wanted] = columns
-    return found, [*units]
-
-
-def is_brief(name: str) -> bool:
-    """Whether a column is called rx, ry or rz: a rotation vector of Universal Robots, or angles of
-    other robots.
-    """
-    return _split(name)[0] in ("rx", "ry", "rz")
-
-
-def _measured(
-    found: Mapping[str, Any], names: Sequence[str], measures: str
-) -> tuple[str, Sequence[str]]:
-    """What the columns measure, and the quantities to read for that: poses and the preferred
-    quantities in doubt, so that what is missing is named.
-    """
-
-    known = [*_POSITIONS, *PLANAR_POSITIONS, *_ORIENTATIONS, *_PLANAR_ORIENTATIONS]
-    known = [group for group in known if {*group} <= found.keys()]
-    flat = next((group for group in known if group in (*_POSITIONS, *PLANAR_POSITIONS)), ())
-    turn = next((group for group in known if group in _ORIENTATIONS), ())
-    heading = next((group for group in known if group in _PLANAR_ORIENTATIONS), ())
-    if measures == "auto":
-        oriented = {*sum((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), ())}
-        measures = "poses"
-        listed = ",".join(_split(name)[0] for name in names)
-        if flat and not (found.keys() & oriented or _ORIENTED(listed)):
-            measures = "positions"
-        elif not found.keys() & {*sum(_POSITIONS, ())}:
-            is_turning = turn and not _PLACED(listed)
-            measures = (
-                "rates" if {*RATES} <= found.keys() else "rotations" if is_turning else "poses"
-            )
-    if measures == "poses" and MATRIX[0] in found:
-        return measures, MATRIX
-    orientation: Sequence[str] = turn or heading or QUATERNION
-    is_planar = measures == "positions" or orientation in _PLANAR_ORIENTATIONS
-    position = flat if flat and (is_planar or flat in _POSITIONS) else POSITION
-    parts = {"rates": RATES, "twists": TWIST, "positions": position, "rotations": orientation}
-    parts["stamps"] = ()
-    return measures, parts.get(measures, (*position, *orientation))
-
-
-def _split(name: str) -> tuple[str, str]:
-    """A column's name without its unit, and the unit, empty if there is none:
-    ``.pose.position.x [mm]`` to pose_position_x and mm, wx_deg_s to wx and deg/s.
-    """
-    # An element such as q[0], and frames as in p_RS_R_x.
-    name = re.sub(r"\[(\d)\]$", r"\1", name.strip().lower())
-    name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name)
-    words = re.findall("[a-z0-9°]+", re.sub(r"\[.*?\]|\(.*?\)", "", name))
-    if in_brackets := re.search(r"[\[(]\s*([^\])]*?)\s*(?:\^?-1)?\s*[\])]$", name):
-        return "_".join(words), _UNITS.get(re.sub(r"[\s/_]+", "/", in_brackets[1]), "")
-    is_time = any(re.fullmatch("t|time.*|stamp.*", word) for word in words)
-    for count in (2, 1):
-        unit = _UNITS.get("/".join(words[-count:]), "")
-        if len(words) > count and unit and (unit in STAMP_UNITS) == is_time:
-            return "_".join(words[:-count]), unit
-    return "_".join(words), ""
-
-
-def _stamp(text: str, nanoseconds: str = "") -> Decimal:
-    """A stamp as it is written, with no binary floating point in between; nanoseconds of one in two
-    columns; of a time of ISO 8601, in UTC if it names no zone, microseconds count.
-    """
-    if nanoseconds:
-        return Decimal(int(text) * STAMP_UNITS["s"] + int(nanoseconds))
-    try:
-        stamp = Decimal(text)
-    except InvalidOperation:
-        if not NUMBER.fullmatch(text):
-            raise ValueError(f"found {text!r} for the timestamp") from None
-        moment = datetime.fromisoformat(text)
-        moment = moment.replace(tzinfo=moment.tzinfo or UTC)
-        return Decimal(int(moment.timestamp())) + Decimal(moment.microsecond).scaleb(-6)
-    if not stamp.is_finite() or stamp.adjusted() > 30:
-        raise ValueError(f"found {text!r} for the timestamp")
-    return stamp
 
 
 # ---- numbers in memory
@@ -321,12 +219,29 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray]:
     except (TypeError, ValueError):
         raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
     if values.shape[1:] in ((3, 4), (4, 4)):
-        return MATRIX, values.reshape(len(values), -1)[:, :12]
+        return MATRIX, values.reshape(len(values), -1)[:, : len(MATRIX)]
     names = ("t", *POSITION, *QUATERNION)
     known = {8: names, 7: names[1:], 4: names[:4]}
     if values.ndim != 2 or values.shape[1] not in known:
         raise InputError(f"expected {_KINDS}; found an array {values.shape}")
     return known[values.shape[1]], values
+
+
+def _matrices_of(source: Any) -> tuple[Any, list[str]]:
+    """Matrices (N, 4, 4) with the translation in the last column, and a note if it was in the last
+    row; anything else as it is. An InputError if the last row is not 0 0 0 1.
+    """
+    shape = np.shape(source) if isinstance(source, np.ndarray | list | tuple) else ()
+    if shape[1:] != (4, 4):
+        return source, []
+    poses = np.asarray(source, dtype=float)
+    last_row = np.array([0.0, 0.0, 0.0, 1.0])
+    finite = poses[np.isfinite(poses).all(axis=(1, 2))]
+    if np.allclose(finite[:, 3], last_row, rtol=0.0, atol=ROTATION_TOLERANCE):
+        return poses, []
+    if np.allclose(finite[:, :, 3], last_row, rtol=0.0, atol=ROTATION_TOLERANCE):
+        return np.swapaxes(poses, 1, 2), ["matrices are transposed: read with rows as columns"]
+    raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
 
 
 def table_of_object(source: Any, times: Any = None) -> Table:
@@ -340,36 +255,70 @@ def table_of_object(source: Any, times: Any = None) -> Table:
         values = np.column_stack(columns)
         if times is None and len(table.stamp_at) == 1:
             times = source[keys[table.stamp_at[0]]]
+        elif times is None and table.stamp_at:
+            texts = zip(*(map(str, source[keys[at]]) for at in table.stamp_at), strict=True)
+            times = [stamp_of(table.stamp_names, cells) for cells in texts]
     else:
+        source, notes = _matrices_of(source)
         names, values = columns_of_array(source)
         if names[0] == "t":
-            times, names, values = (
-                values[:, 0] if times is None else times,
-                names[1:],
-                values[:, 1:],
-            )
+            times = values[:, 0] if times is None else times
+            names = names[1:]
+            values = values[:, 1:]
         table = Table("the poses", names, expected=_KINDS)
-    table.numbers.frombytes(np.ascontiguousarray(values).tobytes())
-    table.line_numbers.extend(range(1, len(values) + 1))
-    if times is not None:
-        if getattr(getattr(times, "dtype", None), "tz", None) is not None:
-            times = np.asarray(times, dtype="datetime64[ns]")
-        stamps = np.asarray(times)
-        if stamps.dtype.kind == "M":
-            table.units["t"] = "ns"
-            stamps = stamps.astype("datetime64[ns]").astype(np.int64)
-        if stamps.dtype.kind not in "iuf" or not np.isfinite(stamps).all():
-            raise InputError(
-                f"stamps must be finite numbers or datetimes; found {stamps.dtype} of shape "
-                f"{stamps.shape}"
-            )
-        if stamps.shape != (len(values),):
-            raise InputError(
-                f"there must be one stamp per pose; found {stamps.size} stamps and {len(values)} "
-                "poses"
-            )
-        table.stamps = [*map(Decimal, stamps.tolist())]
+        for note in notes:
+            table.guess(note)
+    stamps = None if times is None else _stamps_of_objects(times, table, len(values))
+    _fill_from_array(table, values, stamps)
     return table
+
+
+def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal | None]:
+    """One stamp per pose, none where it is not a time."""
+    if isinstance(times, list) and times and isinstance(times[0], Decimal):
+        return [*times]
+    if getattr(getattr(times, "dtype", None), "tz", None) is not None:
+        times = np.asarray(times, dtype="datetime64[ns]")
+    stamps = np.asarray(times)
+    is_time = np.ones(stamps.shape, dtype=bool)
+    if stamps.dtype.kind == "M":
+        table.units["t"] = "ns"
+        is_time = ~np.isnat(stamps)
+        stamps = stamps.astype("datetime64[ns]").astype(np.int64)
+    elif stamps.dtype.kind == "f":
+        is_time = np.isfinite(stamps)
+    if stamps.dtype.kind not in "iuf" or not is_time.any():
+        raise InputError(
+            f"stamps must be finite numbers or datetimes; found {stamps.dtype} of shape "
+            f"{stamps.shape}"
+        )
+    if stamps.shape != (n_poses,):
+        raise InputError(
+            f"there must be one stamp per pose; found {stamps.size} stamps and {n_poses} poses"
+        )
+    both = zip(stamps.tolist(), is_time.tolist(), strict=True)
+    return [Decimal(stamp) if is_one else None for stamp, is_one in both]
+
+
+def _fill_from_array(
+    table: Table, values: FloatArray, stamps: Sequence[Decimal | None] | None
+) -> None:
+    """Add the rows (N, k) that have a pose and a stamp."""
+    is_pose = np.isfinite(values).all(axis=1)
+    if table._turn_at:
+        is_pose &= values[:, table._turn_at].any(axis=1)
+    if stamps is not None:
+        is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
+        table.stamps = [
+            stamp for stamp, keep in zip(stamps, is_pose, strict=True) if stamp is not None and keep
+        ]
+    rows = np.flatnonzero(is_pose).tolist()
+    table.numbers.frombytes(np.ascontiguousarray(values[is_pose]).tobytes())
+    table.line_numbers.extend(row + 1 for row in rows)
+    table.rows.extend(rows)
+    table.n_rows = len(values)
+    if table.n_left_out:
+        table.first_left_out = int(np.argmin(is_pose)) + 1
 
 
 # ---- rows that are written
@@ -401,9 +350,3 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
     """The line of a pose x y z qx qy qz qw, which keeps every digit."""
     return f"{seconds(stamp_ns)} {' '.join(map(repr, pose))}"
-
-
-def seconds(stamp_ns: int) -> str:
-    """A stamp in seconds, with all its digits."""
-    whole, nanoseconds = divmod(abs(int(stamp_ns)), STAMP_UNITS["s"])
-    return f"{'-' if stamp_ns < 0 else ''}{whole}.{nanoseconds:09d}"

@@ -1,0 +1,143 @@
+"""Dates and times of day as programs write them, as exact seconds.
+
+Every pattern meets text of at most :data:`_LONGEST` characters.
+"""
+
+import re
+from datetime import date
+from decimal import Decimal
+
+#: Characters of the longest date with time and zone, with room for spaces.
+_LONGEST = 48
+#: Proleptic day of 1970-01-01.
+_EPOCH_DAY = date(1970, 1, 1).toordinal()
+_DAY_S = 86_400
+#: GPS time begins at 1980-01-06, s since 1970, and counts weeks.
+_GPS_EPOCH_S = 315_964_800
+WEEK_S = 604_800
+
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_YEAR_FIRST = re.compile(r"(\d{4})([-/._ ])(\d\d?|[a-z]{3,9})\2(\d\d?)", re.IGNORECASE | re.ASCII)
+_YEAR_LAST = re.compile(r"(\d\d?)([-/. ])(\d\d?|[a-z]{3,9})\2(\d{4})", re.IGNORECASE | re.ASCII)
+_PACKED = re.compile(r"(20\d\d)()(\d\d)(\d\d)", re.ASCII)
+# Between date and time.
+_BETWEEN = re.compile(r"T|[ ,_-]{1,4}", re.IGNORECASE)
+_TIME = re.compile(
+    r"(\d\d?)([:._-]?)(\d\d)(?:\2(\d\d)(?:([.,]|\2)(\d{1,12}))?)? ?([ap]m)? ?"
+    r"(z|utc|gmt|[-+]\d\d(?::?\d\d)?)?",
+    re.IGNORECASE | re.ASCII,
+)
+_ZONE = re.compile(r"([-+])(\d\d):?(\d\d)?", re.ASCII)
+
+
+def seconds_of(text: str) -> Decimal:
+    """Seconds since 1970 of a date with a time of day, or of the day for a time of day alone.
+
+    Without a zone the time is UTC. A fraction behind the same character as between minutes and
+    seconds is a count of milliseconds, microseconds or nanoseconds.
+
+    Raises
+    ------
+    ValueError
+        If the text is neither.
+    """
+    text = text.strip()
+    if len(text) > _LONGEST:
+        raise ValueError("too long for a time")
+    day, rest = _day_and_rest(text)
+    if day is None:
+        if ":" not in text:
+            raise ValueError("no time of day")
+        return _time_of_day(text)
+    if not rest:
+        return Decimal(_DAY_S * day)
+    between = _BETWEEN.match(rest)
+    start = between.end() if between else 0
+    return _DAY_S * day + _time_of_day(rest[start:])
+
+
+def is_date_or_time(text: str) -> bool:
+    """Whether the text is a date, a time of day, or both."""
+    try:
+        seconds_of(text)
+    except ValueError:
+        return False
+    return True
+
+
+def is_date(text: str) -> bool:
+    """Whether the text is a date without a time of day."""
+    try:
+        day, rest = _day_and_rest(text.strip()[: _LONGEST + 1])
+    except ValueError:
+        return False
+    return day is not None and not rest
+
+
+def is_ambiguous(text: str) -> bool:
+    """Whether day and month of a date could be exchanged."""
+    match = _YEAR_LAST.match(text.strip()[:_LONGEST])
+    if not match or match[2] != "/" or not match[3].isdigit():
+        return False
+    return int(match[1]) <= 12 and int(match[3]) <= 12 and match[1] != match[3]
+
+
+def seconds_of_week(week: str, second: Decimal) -> Decimal:
+    """Seconds since 1970, in GPS time, of a second of a week of GPS."""
+    number = Decimal(week)
+    if number != int(number) or not 0 <= number < 10_000:
+        raise ValueError(f"found {week[:20]!r} for the week of GPS")
+    return _GPS_EPOCH_S + WEEK_S * int(number) + second
+
+
+def _day_and_rest(text: str) -> tuple[int | None, str]:
+    """The day since 1970 at the beginning of a text, none without one, and what follows it."""
+    if match := _YEAR_FIRST.match(text) or _PACKED.match(text):
+        return _day(match[1], match[3], match[4]), text[match.end() :]
+    if match := _YEAR_LAST.match(text):
+        first = match[1]
+        second = match[3]
+        # Month first is usual with slashes, unless it cannot be.
+        month_first = match[2] == "/" and int(first) <= 12
+        day, month = (second, first) if month_first else (first, second)
+        return _day(match[4], month, day), text[match.end() :]
+    return None, text
+
+
+def _day(year: str, month: str, day: str) -> int:
+    number = int(month) if month.isdigit() else 1 + _MONTHS.index(month[:3].lower())
+    return date(int(year), number, int(day)).toordinal() - _EPOCH_DAY
+
+
+def _time_of_day(text: str) -> Decimal:
+    """Seconds of a time of day, in UTC."""
+    match = _TIME.fullmatch(text)
+    if not match:
+        raise ValueError("no time of day")
+    hour_text, separator, minute_text, second_text, point, digits, half, zone = match.groups()
+    hour = int(hour_text)
+    minute = int(minute_text)
+    second = int(second_text or 0)
+    if half:
+        if not 1 <= hour <= 12:
+            raise ValueError("no hour of twelve")
+        hour = hour % 12 + (12 if half.lower() == "pm" else 0)
+    if hour > 24 or minute > 59 or second > 60:
+        raise ValueError("no time of day")
+    fraction = _fraction(digits, is_count=point == separator and point != ".") if digits else 0
+    return 3600 * hour + 60 * minute + second + Decimal(fraction) - _zone_s(zone or "")
+
+
+def _fraction(digits: str, is_count: bool) -> Decimal:
+    """The part of a second in digits after a point, or a count of ms, us or ns."""
+    places = -(-len(digits) // 3) * 3 if is_count else len(digits)
+    return Decimal(digits).scaleb(-places)
+
+
+def _zone_s(zone: str) -> int:
+    """Seconds that a zone is ahead of UTC."""
+    match = _ZONE.fullmatch(zone)
+    if not match:
+        return 0
+    size = 3600 * int(match[2]) + 60 * int(match[3] or 0)
+    return -size if match[1] == "-" else size
