@@ -15,7 +15,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import PoseTable
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.bags.sources import Source, source_of
-from hand_eye_calib.io.trajectory_files.stamps import seconds
+from hand_eye_calib.io.trajectory_files.dates import seconds
 from hand_eye_calib.option import Options
 
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.

@@ -58,6 +58,11 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     bags = [*urls, *(path for path in files if path.suffix in _BAG_SUFFIXES or path.is_dir())]
     if len(bags) == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
         return True
+    folder = next((bag for bag in bags if isinstance(bag, Path) and not _has_bag(bag)), None)
+    if folder:
+        raise ConfigError(
+            f"{folder} is a folder without a bag: give a trajectory file of each sensor, or a bag"
+        )
     if bags:
         raise ConfigError(
             f"{bags[0]} is a bag, but not all of the others are: give two trajectory files, or the "
@@ -68,6 +73,13 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
             f"{paths[0]} is one trajectory file: give those of two sensors, PARENT CHILD, or a bag"
         )
     return False
+
+
+def _has_bag(path: Path) -> bool:
+    """Whether a path is a bag's file, or a folder with one."""
+    if not path.is_dir():
+        return True
+    return any(inside.suffix in _BAG_SUFFIXES for inside in path.iterdir())
 
 
 # ----------------------------------------------------------------------- files

@@ -13,7 +13,8 @@ from hand_eye_calib.cli.main import main
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.table import seconds, write_trajectory
+from hand_eye_calib.io.trajectory_files.dates import seconds
+from hand_eye_calib.io.trajectory_files.table import write_trajectory
 
 POSE = "1 2 3 0 0 0 1"
 START_NS = 1_700_000_000_123_456_789

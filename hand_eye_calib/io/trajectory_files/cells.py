@@ -18,10 +18,15 @@ _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE)
 # What programs write where they have no value.
 _NULLS = {"", "nan", "-nan", "null", "none", "na", "n/a", "#n/a", "nil", "-", "--", "?"}
-# Degrees, minutes and seconds with their signs.
-_ANGLE = re.compile(r"[-+]?[\d.\s°ºd'′’m\"″”s:]+", re.ASCII)
+# Degrees, minutes and seconds with their signs, in at most so many characters.
+_ANGLE = re.compile(
+    r"([-+]?\d{1,3}(?:[.,]\d*)?)(?:[°ºd:\s]+(\d{1,2}(?:[.,]\d*)?)"
+    r"(?:['′’m:\s]+(\d{1,2}(?:[.,]\d*)?))?)?[°ºdms'′’\"″”\s]*",
+    re.ASCII,
+)
 _LONGEST_ANGLE = 40
-_PARTS = re.compile(r"\d+(?:\.\d*)?", re.ASCII)
+# What an angle has and other cells of numbers have not.
+_ANGLE_SIGNS = set("NSEW°º'′’\"″”:")
 
 CellsOf = Callable[[str], list[str]]
 
@@ -33,7 +38,7 @@ def is_number(cell: str) -> bool:
 
 def is_value(cell: str) -> bool:
     """Whether a cell is a number, a date or time, or says that there is none."""
-    return is_number(cell) or is_null(cell) or is_date_or_time(cell) or is_angle(cell)
+    return is_number(cell) or is_null(cell) or is_date_or_time(cell) or _is_marked_angle(cell)
 
 
 def is_null(cell: str) -> bool:
@@ -44,6 +49,11 @@ def is_null(cell: str) -> bool:
 def is_angle(cell: str) -> bool:
     """Whether a cell is an angle in degrees, minutes and seconds, with a sign or a hemisphere."""
     return _degrees(cell) is not None
+
+
+def _is_marked_angle(cell: str) -> bool:
+    """Whether a cell is an angle and no row of numbers that blanks separate."""
+    return not _ANGLE_SIGNS.isdisjoint(cell) and is_angle(cell)
 
 
 def number(cell: str) -> float:
@@ -89,10 +99,11 @@ def _degrees(cell: str) -> float | None:
     sides = [letter for letter in (text[:1], text[-1:]) if letter and letter in "NSEW"]
     if sides:
         text = text.strip("NSEW").strip()
-    if len(sides) > 1 or not _ANGLE.fullmatch(text.replace(",", ".")):
+    match = _ANGLE.fullmatch(text)
+    if len(sides) > 1 or not match:
         return None
-    parts = [float(part) for part in _PARTS.findall(text.replace(",", "."))]
-    if not 1 <= len(parts) <= 3 or any(part >= 60 for part in parts[1:]):
+    parts = [abs(float(part.replace(",", "."))) for part in match.groups() if part]
+    if any(part >= 60 for part in parts[1:]):
         return None
     size = sum(part / 60**power for power, part in enumerate(parts))
     is_negative = text.startswith("-") or "S" in sides or "W" in sides
@@ -122,12 +133,17 @@ def _at_blanks(line: str) -> list[str]:
 
 
 def separator_of(lines: Sequence[str]) -> str:
-    """What separates the cells of lines: with what they have the most numbers."""
+    """What separates the cells of lines: with it, the most digits are in cells that are numbers."""
     counts = [
-        sum(sum(map(is_number, splitter(separator)(line))) for line in lines)
+        sum(_digits_in_numbers(splitter(separator)(line)) for line in lines)
         for separator in _SEPARATORS
     ]
     return _SEPARATORS[counts.index(max(counts))] if any(counts) else _usual(lines)
+
+
+def _digits_in_numbers(cells: Sequence[str]) -> int:
+    numbers = (cell for cell in cells if is_number(cell) or _is_marked_angle(cell))
+    return sum(letter.isdigit() for cell in numbers for letter in cell)
 
 
 def _usual(lines: Sequence[str]) -> str:

@@ -1,17 +1,25 @@
-"""Dates and times of day as programs write them, as exact seconds.
+"""Stamps in text: numbers, weeks of GPS, dates and times of day, exactly as they are written.
 
 Every pattern meets text of at most :data:`_LONGEST` characters.
 """
 
 import re
+from collections.abc import Sequence
 from datetime import date
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
+
+from hand_eye_calib.config import STAMP_UNITS
+
+#: What a person should know of stamps of GPS time.
+GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
+
+_NS = STAMP_UNITS["s"]
 
 #: Characters of the longest date with time and zone, with room for spaces.
 _LONGEST = 48
 #: Proleptic day of 1970-01-01.
 _EPOCH_DAY = date(1970, 1, 1).toordinal()
-_DAY_S = 86_400
+DAY_S = 86_400
 #: GPS time begins at 1980-01-06, s since 1970, and counts weeks.
 _GPS_EPOCH_S = 315_964_800
 WEEK_S = 604_800
@@ -50,10 +58,10 @@ def seconds_of(text: str) -> Decimal:
             raise ValueError("no time of day")
         return _time_of_day(text)
     if not rest:
-        return Decimal(_DAY_S * day)
+        return Decimal(DAY_S * day)
     between = _BETWEEN.match(rest)
     start = between.end() if between else 0
-    return _DAY_S * day + _time_of_day(rest[start:])
+    return DAY_S * day + _time_of_day(rest[start:])
 
 
 def is_date_or_time(text: str) -> bool:
@@ -141,3 +149,68 @@ def _zone_s(zone: str) -> int:
         return 0
     size = 3600 * int(match[2]) + 60 * int(match[3] or 0)
     return -size if match[1] == "-" else size
+
+
+# ---- the stamp of a row
+
+
+def stamp_of(names: Sequence[str], cells: Sequence[str]) -> Decimal:
+    """The stamp of a row as it is written, with no binary floating point in between, in the unit of
+    its column; in seconds for dates and weeks of GPS, in nanoseconds for two columns.
+
+    Raises
+    ------
+    ValueError
+        If the cells have something else.
+    """
+    if len(cells) == 1:
+        return _decimal(cells[0])
+    if names == ("secs", "nsecs"):
+        return Decimal(int(cells[0]) * _NS + int(cells[1]))
+    second = _number(cells[1])
+    if names[0] == "week" and second is not None and second.is_finite():
+        return seconds_of_week(cells[0], second) if second < 2 * WEEK_S else second
+    last = cells[-1]
+    # A time of day belongs to its date, whatever else is complete in itself.
+    if names[0] == "date" and ":" in last and len(last) < len("HH:MM:SS") + 12:
+        return seconds_of(" ".join(cells))
+    return _decimal(last)
+
+
+def _number(text: str) -> Decimal | None:
+    """The number in a text, none if it is something else."""
+    if "_" in text:  # Decimal skips it, but in a stamp it separates
+        return None
+    for written in (text, text.replace(",", ".")):
+        try:
+            return Decimal(written)
+        except InvalidOperation:
+            continue
+    return None
+
+
+def _decimal(text: str) -> Decimal:
+    """Seconds or another unit in a number, or seconds of a date or time of day."""
+    stamp = _number(text)
+    if stamp is None and is_date_or_time(text):
+        return seconds_of(text)
+    if stamp is None or not stamp.is_finite() or stamp.adjusted() > 30:
+        raise ValueError(f"found {text!r} for the timestamp")
+    return stamp
+
+
+def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
+    """What a person should know of stamps like those of one row."""
+    notes = []
+    if names and names[0] == "week":
+        notes.append(GPS_TIME)
+    if any(map(is_ambiguous, cells)):
+        notes.append(f"the date {cells[0]} read as month/day/year")
+    return notes
+
+
+def seconds(stamp_ns: int) -> str:
+    """A stamp in seconds, with all its digits."""
+    whole, nanoseconds = divmod(abs(int(stamp_ns)), _NS)
+    sign = "-" if stamp_ns < 0 else ""
+    return f"{sign}{whole}.{nanoseconds:09d}"

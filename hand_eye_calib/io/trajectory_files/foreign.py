@@ -32,7 +32,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     QUATERNION,
     ROTATION_VECTOR,
 )
-from hand_eye_calib.io.trajectory_files.stamps import GPS_TIME
+from hand_eye_calib.io.trajectory_files.dates import GPS_TIME
 from hand_eye_calib.io.trajectory_files.table import Table, columns_of_array
 from hand_eye_calib.text import shortened
 

@@ -129,15 +129,35 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
         columns = STAMPED_POSE if of_last is None else of_last
         return Layout(rows_after, split, [], of_last, "tum" if of_last is None else "csv", columns)
     rows = cells[first_row:]
-    names, merge = _names_above(above, rows[0], separator, n_above > 0)
-    if names is None and needs_names:
-        _refuse_other_number(path, lines[:n_above], rows[0], separator)
-    merge = merge or _of_stamps(rows[0])
-    if merge:
-        rows = [merge(row) for row in rows]
-    cells_of: CellsOf = split if merge is None else lambda line: merge(split(line))
-    layout = Layout(rows_after, cells_of, rows[0], names)
+    row = _usual_row(rows)
+    names, merge = _names_above(above, row, separator, n_above > 0)
+    if names is None and not row[-1]:
+        row = row[:-1]
+        merge = _without_last
+        names, _ = _names_above(above, row, separator, n_above > 0)
+    if names is None:
+        if needs_names:
+            _refuse_other_number(path, lines[:n_above], row, separator)
+        merge = merge or _of_stamps(row)
+    cells_of = split if merge is None else _merged(split, merge)
+    rows = [cells_of(line) for _, line in lines[first_row:]]
+    layout = Layout(rows_after, cells_of, _usual_row(rows), names)
     return _by_names_or_numbers(layout, rows, "," in separator or ";" in separator)
+
+
+def _usual_row(rows: Sequence[list[str]]) -> list[str]:
+    """The first row that has as many cells as most."""
+    n_cells = Counter(map(len, rows)).most_common(1)[0][0]
+    return next(row for row in rows if len(row) == n_cells)
+
+
+def _merged(split: CellsOf, merge: "_Merge") -> CellsOf:
+    return lambda line: merge(split(line))
+
+
+def _without_last(cells: Sequence[str]) -> list[str]:
+    """Cells without an empty one behind the last separator."""
+    return [*cells] if cells[-1] else [*cells[:-1]]
 
 
 def _beginning(path: str | Path, text: str) -> tuple[list[str], list[tuple[int, str]]]:

@@ -26,6 +26,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     named_columns,
     stamp_columns,
 )
+from hand_eye_calib.io.trajectory_files.dates import notes_on_stamps
 from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
 from hand_eye_calib.io.trajectory_files.layout import (
     STAMPED_POSE,
@@ -37,7 +38,6 @@ from hand_eye_calib.io.trajectory_files.layout import (
 from hand_eye_calib.io.trajectory_files.poses import poses_of
 from hand_eye_calib.io.trajectory_files.stamps import (
     in_order,
-    notes_on_stamps,
     refuse_coarse,
     stamps_in_ns,
 )

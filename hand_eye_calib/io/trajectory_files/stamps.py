@@ -1,32 +1,18 @@
-"""Stamps: from the text of a file to increasing whole nanoseconds."""
+"""Stamps of a table, as increasing whole nanoseconds."""
 
-from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
-from typing import TYPE_CHECKING
+from decimal import Decimal
 
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.trajectory_files.dates import (
-    WEEK_S,
-    is_ambiguous,
-    is_date_or_time,
-    seconds_of,
-    seconds_of_week,
-)
+from hand_eye_calib.io.trajectory_files.dates import DAY_S, WEEK_S, seconds, seconds_of
 from hand_eye_calib.io.trajectory_files.layout import DIGITS
+from hand_eye_calib.io.trajectory_files.table import Table
 from hand_eye_calib.stats import median
 
-if TYPE_CHECKING:
-    from hand_eye_calib.io.trajectory_files.table import Table
-
-#: What a person should know of stamps of GPS time.
-GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
-
 _NS = STAMP_UNITS["s"]
-_DAY_S = 86_400
 # Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
 # mistaken.
 _LONGEST_INTERVAL_S = 10
@@ -41,64 +27,7 @@ _COARSE_SHARE = 0.25
 _SAME = 1e-12
 
 
-# ---- the stamp of a row
-
-
-def stamp_of(names: Sequence[str], cells: Sequence[str]) -> Decimal:
-    """The stamp of a row as it is written, with no binary floating point in between, in the unit of
-    its column; in seconds for dates and weeks of GPS, in nanoseconds for two columns.
-
-    Raises
-    ------
-    ValueError
-        If the cells have something else.
-    """
-    if names == ("secs", "nsecs"):
-        return Decimal(int(cells[0]) * _NS + int(cells[1]))
-    if names[0] == "week" and _is_number(cells[1]):
-        second = _decimal(cells[1])
-        return seconds_of_week(cells[0], second) if second < _PARTS * WEEK_S else second
-    last = cells[-1]
-    # A time of day belongs to its date, whatever else is complete in itself.
-    if names[0] == "date" and len(cells) > 1 and ":" in last and len(last) < len("HH:MM:SS") + 12:
-        return seconds_of(" ".join(cells))
-    return _decimal(last)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return Decimal(text.replace(",", ".")).is_finite()
-    except InvalidOperation:
-        return False
-
-
-def _decimal(text: str) -> Decimal:
-    """Seconds or another unit in a number, or seconds of a date or time of day."""
-    try:
-        stamp = Decimal(text.replace(",", "."))
-    except InvalidOperation:
-        if not is_date_or_time(text):
-            raise ValueError(f"found {text!r} for the timestamp") from None
-        return seconds_of(text)
-    if not stamp.is_finite() or stamp.adjusted() > 30:
-        raise ValueError(f"found {text!r} for the timestamp")
-    return stamp
-
-
-def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """What a person should know of stamps like those of one row."""
-    notes = []
-    if names and names[0] == "week":
-        notes.append(GPS_TIME)
-    if any(map(is_ambiguous, cells)):
-        notes.append(f"the date {cells[0]} read as month/day/year")
-    return notes
-
-
-# ---- the stamps of all rows
-
-
-def stamps_in_ns(table: "Table", stamp_unit: str | None) -> IntArray:
+def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     """Stamps (N,) in nanoseconds, in the unit that is given, that the format has, or that their
     size tells; an InputError if there are none, they are too large, or their unit is not clear.
     """
@@ -127,7 +56,7 @@ def stamps_in_ns(table: "Table", stamp_unit: str | None) -> IntArray:
     # Stamps with a fraction are in seconds.
     if not unit and not any(stamp % 1 for stamp in stamps):
         _refuse_unclear_unit(table, stamps_ns, recognised)
-    for period_s in (_DAY_S, WEEK_S):
+    for period_s in (DAY_S, WEEK_S):
         stamps_ns = _continued(stamps_ns, period_s)
     return stamps_ns
 
@@ -140,7 +69,7 @@ def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
         return stamps
 
 
-def _refuse_unclear_unit(table: "Table", stamps_ns: IntArray, recognised: str) -> None:
+def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> None:
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
         raise InputError(
@@ -161,7 +90,7 @@ def _continued(stamps_ns: IntArray, period_s: int) -> IntArray:
     return stamps_ns + np.cumsum(begins_again) * period_ns
 
 
-def refuse_coarse(table: "Table", stamps_ns: IntArray, values: FloatArray) -> None:
+def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None:
     """Raise an InputError if many poses (N, k) differ from the one before with the same stamp: the
     stamps have lost their last digits.
     """
@@ -183,7 +112,7 @@ def refuse_coarse(table: "Table", stamps_ns: IntArray, values: FloatArray) -> No
     )
 
 
-def in_order(table: "Table", stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
+def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
     """Indices of poses in the order of time, each stamp once, and what was repaired for that; an
     InputError if it must not be repaired.
     """
@@ -208,10 +137,3 @@ def in_order(table: "Table", stamps_ns: IntArray, repair: bool) -> tuple[IntArra
     if n_dropped:
         repairs.append(f"dropped {n_dropped} whose stamp was there already")
     return keep, [f"{table.path}: {'; '.join(repairs)}"]
-
-
-def seconds(stamp_ns: int) -> str:
-    """A stamp in seconds, with all its digits."""
-    whole, nanoseconds = divmod(abs(int(stamp_ns)), _NS)
-    sign = "-" if stamp_ns < 0 else ""
-    return f"{sign}{whole}.{nanoseconds:09d}"

@@ -31,7 +31,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     named_columns,
     stamp_columns,
 )
-from hand_eye_calib.io.trajectory_files.stamps import seconds, stamp_of
+from hand_eye_calib.io.trajectory_files.dates import seconds, stamp_of
 from hand_eye_calib.text import shortened, shown_value
 
 # Quantities that are all 0 where there is no orientation, as of tracking that was lost.
@@ -95,6 +95,7 @@ class Table:
                 )
         self.at = {name: columns[name][0] for name in quantities}
         self.stamp_at = [columns[name][0] for name in self.stamp_names]
+        self._value_at = [*self.at.values()]
         self._image_at = columns.get("image", ())
         self.units = {name: units[at] for name, at in self.at.items() if units[at]}
         self.units["t"] = ""
@@ -143,25 +144,34 @@ class Table:
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
         """Add a row, or count it if it has no pose; a ValueError for what is no number."""
-        values = self._numbers_in(cells)
-        stamp_cells = [cells[place] for place in self.stamp_at]
         row = self.n_rows
         self.n_rows += 1
-        if not self._is_pose(values) or any(map(is_null, stamp_cells)):
+        values = self._numbers_in(cells)
+        if not self._is_pose(values) or not self._add_stamp(cells):
             if self.first_left_out is None:
                 self.first_left_out = line_number
             return
-        if stamp_cells:
-            self.stamps.append(stamp_of(self.stamp_names, stamp_cells))
         self.numbers.extend(values)
         if self._image_at:
             self.images.append(cells[self._image_at[0]])
         self.line_numbers.append(line_number)
         self.rows.append(row)
 
+    def _add_stamp(self, cells: Sequence[str]) -> bool:
+        """Add the stamp of a row, and return whether it has one if it needs one."""
+        if self.stamp_at:
+            texts = [cells[place] for place in self.stamp_at]
+            try:
+                self.stamps.append(stamp_of(self.stamp_names, texts))
+            except ValueError:
+                if any(map(is_null, texts)):
+                    return False
+                raise
+        return True
+
     def _numbers_in(self, cells: Sequence[str]) -> list[float]:
         try:
-            return [float(cells[place]) for place in self.at.values()]
+            return [float(cells[place]) for place in self._value_at]
         except ValueError:
             return [
                 (angle if name in ("lat", "lon") else number)(cells[place])

@@ -1,0 +1,67 @@
+"""Trajectory files rebuilt from public bug reports give the truth, or one line with the cause."""
+
+import json
+
+import numpy as np
+import pytest
+from published_data import data_folder
+
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.geometry import se3
+
+# Translation (m) and roll, pitch, yaw (deg) of the child in the parent.
+ON_CAMERA = ([0.42, -0.11, 0.25], [-88.0, 3.0, -92.0])
+ON_LIDAR = ([-1.2, 0.3, -0.4], [0.5, -0.8, 2.0])
+TO_ITSELF = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+RIGHT = [
+    ("p.tum", "nan.tum", ON_CAMERA),
+    ("p.tum", "empty.csv", ON_CAMERA),
+    ("p.tum", "date_dash_13.txt", ON_CAMERA),
+    ("p.tum", "lamar_nocov.txt", ON_CAMERA),
+    ("p.tum", "plotjuggler.csv", ON_CAMERA),
+    ("p.tum", "r_then_t_13.txt", ON_CAMERA),
+    ("lidar.tum", "week_sow.csv", ON_LIDAR),
+]
+CAUSES = [
+    ("p.tum", "sci.tum", "the timestamps have whole seconds only"),
+    ("p.tum", "r_then_t.txt", "the poses have no stamps"),
+]
+
+
+@pytest.fixture
+def calibrated(capsys):
+    """Runs calibrate on two files of the reports; exit code, document and what is said."""
+    folder = data_folder() / "reports" / "files"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+
+    def run(parent, child, *options):
+        files = [str(folder / parent), str(folder / child)]
+        code = main(["calibrate", *files, *options, "--json"])
+        printed, said = capsys.readouterr()
+        return code, json.loads(printed) if printed else None, said
+
+    return run
+
+
+@pytest.mark.parametrize(("parent", "child", "truth"), RIGHT)
+def test_the_truth_is_found(calibrated, parent, child, truth):
+    estimate = ["--time-offset", "estimate"] if parent == "lidar.tum" else []
+    code, document, _ = calibrated(parent, child, *estimate)
+    translation, rpy_deg = truth
+    T = np.array(document["T_parent_child"]["matrix"])
+    R = se3.rotation_from_rpy(np.radians([rpy_deg]))[0]
+    assert code == 0
+    assert document["verdict"] != "DO NOT USE"
+    np.testing.assert_allclose(T[:3, 3], translation, atol=0.02)
+    assert np.degrees(se3.rotation_angle(R.T @ T[:3, :3])) < 0.2
+
+
+@pytest.mark.parametrize(("parent", "child", "cause"), CAUSES)
+def test_the_cause_is_one_line(calibrated, parent, child, cause):
+    code, document, said = calibrated(parent, child)
+    assert (code, document) == (1, None)
+    *_, last = said.splitlines()
+    assert cause in last
+    assert child in last
