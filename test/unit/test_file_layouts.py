@@ -21,21 +21,38 @@ START_NS = 1_700_000_000_250_000_000
 AWAY = se3.exp(np.array([3.0, -2.0, 1.0, 0.4, -0.9, 0.7]))
 TRUTH = as_trajectory(AWAY @ wandering_poses(N), rate_hz=20.0, start_ns=START_NS)
 STAMPS_NS = TRUTH.stamps_ns.tolist()
-P = TRUTH.poses[:, :3, 3]
-R = TRUTH.poses[:, :3, :3]
-Q = se3.to_quat_xyzw(TRUTH.poses)
-WXYZ = Q[:, [3, 0, 1, 2]]
+
+
+def parts_of(poses):
+    """Positions, rotations, quaternions with the scalar last and first; rotations and poses row by
+    row and column by column.
+    """
+    rotations = poses[:, :3, :3]
+    quats_xyzw = se3.to_quat_xyzw(poses)
+    quats_wxyz = np.roll(quats_xyzw, 1, axis=1)
+    flat = [
+        matrices.reshape(N, -1)
+        for matrices in (rotations, np.swapaxes(rotations, 1, 2), poses, np.swapaxes(poses, 1, 2))
+    ]
+    return poses[:, :3, 3], rotations, quats_xyzw, quats_wxyz, *flat
+
+
+def weeks_and_seconds():
+    """Week of GPS and second of the week of every pose."""
+    week_ns = 604_800_000_000_000
+    since_1980_ns = [stamp_ns - 315_964_800_000_000_000 for stamp_ns in STAMPS_NS]
+    weeks = [stamp_ns // week_ns for stamp_ns in since_1980_ns]
+    return weeks, [f"{stamp_ns % week_ns / 1e9:.3f}" for stamp_ns in since_1980_ns]
+
+
+P, R, Q, WXYZ, ROWS, COLUMNS, MATRIX, TRANSPOSED = parts_of(TRUTH.poses)
 VECTORS = se3.rotation_log(R)
 RPY_DEG = Rotation.from_matrix(R).as_euler("xyz", degrees=True)
 # A place south of the equator and west of Greenwich.
-ORIGIN = (-33.5, -70.25, 600.0)
-LAT, LON, HEIGHT = geodetic(P - P[0], ORIGIN)
+LAT, LON, HEIGHT = geodetic(P - P[0], (-33.5, -70.25, 600.0))
 COVARIANCE = np.tile(np.linspace(0.0, 0.35, 36), (N, 1))
-SINCE_1980 = [(stamp_ns - 315_964_800_000_000_000) for stamp_ns in STAMPS_NS]
-WEEK_NS = 604_800_000_000_000
 SECONDS = [f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}" for stamp_ns in STAMPS_NS]
-SOW = [f"{ns % WEEK_NS / 1e9:.3f}" for ns in SINCE_1980]
-WEEKS = [ns // WEEK_NS for ns in SINCE_1980]
+WEEKS, SOW = weeks_and_seconds()
 
 
 def dates(form):
@@ -80,10 +97,6 @@ def with_comma(text):
     return text.replace(".", ",")
 
 
-ROWS = R.reshape(N, 9)
-COLUMNS = np.swapaxes(R, 1, 2).reshape(N, 9)
-MATRIX = TRUTH.poses.reshape(N, 16)
-TRANSPOSED = np.swapaxes(TRUTH.poses, 1, 2).reshape(N, 16)
 NAMES = "t,x,y,z,qx,qy,qz,qw\n"
 ROS_NAMES = (
     "__time,/odom/header/stamp,/odom/pose/covariance[0;0],/odom/pose/covariance[1;1],"

@@ -287,7 +287,7 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
 
 
 def _of_numpy(data: bytes, _: str | None) -> _Rows:
-    return *columns_of_array(np.load(io.BytesIO(data), allow_pickle=False)), ()
+    return columns_of_array(np.load(io.BytesIO(data), allow_pickle=False))
 
 
 def _of_pcd(data: bytes, _: str | None) -> _Rows:

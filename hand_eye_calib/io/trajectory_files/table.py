@@ -222,36 +222,33 @@ _KINDS = (
 )
 
 
-def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray]:
-    """Names and values of the columns of an array of poses; an InputError if it is none."""
+def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]:
+    """Names and values of the columns of an array of poses, and notes on how it was read; an
+    InputError if it is none.
+    """
     try:
         values = np.asarray(source, dtype=float)
     except (TypeError, ValueError):
         raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
+    notes: list[str] = []
+    if values.shape[1:] == (4, 4) and not _has_last_row(values):
+        values = np.swapaxes(values, 1, 2)
+        notes = ["matrices are transposed: read with their rows as columns"]
+        if not _has_last_row(values):
+            raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
     if values.shape[1:] in ((3, 4), (4, 4)):
-        return MATRIX, values.reshape(len(values), -1)[:, : len(MATRIX)]
+        return MATRIX, values.reshape(len(values), -1)[:, : len(MATRIX)], notes
     names = ("t", *POSITION, *QUATERNION)
     known = {8: names, 7: names[1:], 4: names[:4]}
     if values.ndim != 2 or values.shape[1] not in known:
         raise InputError(f"expected {_KINDS}; found an array {values.shape}")
-    return known[values.shape[1]], values
+    return known[values.shape[1]], values, notes
 
 
-def _matrices_of(source: Any) -> tuple[Any, list[str]]:
-    """Matrices (N, 4, 4) with the translation in the last column, and a note if it was in the last
-    row; anything else as it is. An InputError if the last row is not 0 0 0 1.
-    """
-    shape = np.shape(source) if isinstance(source, np.ndarray | list | tuple) else ()
-    if shape[1:] != (4, 4):
-        return source, []
-    poses = np.asarray(source, dtype=float)
-    last_row = np.array([0.0, 0.0, 0.0, 1.0])
-    finite = poses[np.isfinite(poses).all(axis=(1, 2))]
-    if np.allclose(finite[:, 3], last_row, rtol=0.0, atol=ROTATION_TOLERANCE):
-        return poses, []
-    if np.allclose(finite[:, :, 3], last_row, rtol=0.0, atol=ROTATION_TOLERANCE):
-        return np.swapaxes(poses, 1, 2), ["matrices are transposed: read with rows as columns"]
-    raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
+def _has_last_row(matrices: FloatArray) -> bool:
+    """Whether the last row of all finite matrices (N, 4, 4) is 0 0 0 1."""
+    finite = matrices[np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))]
+    return bool(np.allclose(finite[:, 3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE))
 
 
 def table_of_object(source: Any, times: Any = None) -> Table:
@@ -269,8 +266,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
             texts = zip(*(map(str, source[keys[at]]) for at in table.stamp_at), strict=True)
             times = [stamp_of(table.stamp_names, cells) for cells in texts]
     else:
-        source, notes = _matrices_of(source)
-        names, values = columns_of_array(source)
+        names, values, notes = columns_of_array(source)
         if names[0] == "t":
             times = values[:, 0] if times is None else times
             names = names[1:]
