@@ -149,6 +149,21 @@ _ROWS = {
         "invert every pose of both streams, or the result is the pose of one world in the other "
         "(which is what a fixed camera beside an arm needs)",
     ),
+    "inverse_unclear": _Row(
+        "two readings fit alike: {first}, or {second}. Neither noise nor shape of the motion tells "
+        "which is right",
+        "give parent_invert and child_invert: none for poses of the sensor in its world, poses for "
+        "poses of the world in the sensor",
+        "small or short motion, or a fixed camera beside an arm",
+        code="{code}",
+    ),
+    "inverse_small": _Row(
+        "both streams were inverted, as their noise and shape ask for; poses of a fixed camera "
+        "beside an arm look like that, too",
+        "give parent_invert none and child_invert none for a fixed camera beside an arm",
+        severity=_WARNING,
+        code="inverse_both",
+    ),
     "time_offset": _Row(
         "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
         "add {total_s} s in all to the child's stamps, or have it estimated",
@@ -167,6 +182,11 @@ _ROWS = {
         "{sigma:.2g})",
         "convert them to metres; if the child has no unit, such as a single camera, have the scale "
         "estimated",
+    ),
+    "unit_or_scale": _Row(
+        "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g}: the parent's are "
+        "{unit}, or the child has a scale of its own",
+        "give parent_scale {factor:g} if the parent's lengths are {unit}, or scale estimate if not",
     ),
     "scale": _Row(
         "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
@@ -360,7 +380,6 @@ LIMITS = {
     "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
     "frozen": (0.0, 0.02, 0.02, 0.02),  # share of the time
     "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m
-    "inverse_both": (0.0, 0.06, 0.06, 0.5),  # logarithm of lengths
     # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
     # smoothing does not contain noise of the columns. Both by the shift of positions, m.
     "late": (4.5, 0.008, 0.008, 0.05),

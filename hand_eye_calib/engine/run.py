@@ -15,6 +15,7 @@ from hand_eye_calib.checks import check as checking
 from hand_eye_calib.checks import parts
 from hand_eye_calib.checks.findings import Finding, Severity, answered, finding, gravest_first
 from hand_eye_calib.config import METHODS, CalibratorConfig
+from hand_eye_calib.engine import readings as choosing
 from hand_eye_calib.engine.snapshot import MOST_MOVED_S, STREAMS, UNASKED_S, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.option import Options
@@ -28,8 +29,13 @@ Progress: TypeAlias = Callable[[float, str], None]
 _ESTIMATED: Options = {"time_offset": "estimate"}
 
 # Findings whose options are certain; and options that repair a stream: the second solve proves it.
-_MENDED = ("time_offset", "scale", "units")
+_MENDED = ("time_offset", "scale", "units", "unit_or_scale")
+# Those whose values are estimated, so that their uncertainty counts.
+_ESTIMATES = ("time_offset", "scale", "unit_or_scale")
 _REPAIRS = ("parent_scale", *(f"{s}_{o}" for s in STREAMS for o in ("invert", "quaternion")))
+
+# Options that settle which reading of the streams is right.
+_INVERSIONS = frozenset({"parent_invert", "child_invert"})
 
 # Positions alone are paired anew from this offset (s) on: their model knows it better than speeds
 # do.
@@ -83,7 +89,7 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     tell = progress or (lambda share, step: None)
     tell(0.0, "solving")
     other = _on_another_clock(snapshot, checks)
-    if other and _is_sound(other):
+    if other and _is_sound(other) and not other.check.readings:
         tell(1.0, "done")
         return _telling(other, _ESTIMATED, ())
     try:
@@ -91,7 +97,7 @@ def run(snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | 
     except NotEnoughDataError:
         # With some mistakes the scale cannot be estimated, or poses not be paired.
         is_asked = checks is not False and snapshot.config.measured == "poses"
-        repaired = _repaired(snapshot, check(snapshot).findings) if is_asked else None
+        repaired = _repaired_unsolved(snapshot) if is_asked else None
         if not repaired:
             raise
         found = repaired
@@ -130,10 +136,79 @@ def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str
     return _reviewed(_checked(calibration, snapshot), settled)
 
 
-def _reviewed(first: Run, settled: Collection[str], known: Run | None = None) -> Run:
+def _reviewed(first: Run, settled: Collection[str] = (), known: Run | None = None) -> Run:
     """Solve once more with what the checks of a run are certain of, and return the better of both.
     ``known`` is the run with an estimated time offset, if that was tried before.
+
+    If two readings of the streams fit alike, inverse poses or not, one is chosen first.
     """
+    given = first.snapshot.config.given.union(settled)
+    if _INVERSIONS & given:
+        return _bettered(_without_readings(first), settled, known)
+    if not first.check.readings:
+        return _bettered(first, settled, known)
+    choice = _chosen(first.snapshot, first.check, first.calibration.time_offset_s)
+    first = _with_findings(first, choice.findings)
+    if not choice.is_repair:
+        settled = _INVERSIONS.union(settled)
+        known = known and _without_readings(known)
+    return _doubting(_bettered(first, settled, known), choice.doubts)
+
+
+def _chosen(snapshot: Snapshot, result: checking.CheckResult, known_s: float) -> choosing.Choice:
+    """Choose between the two readings of a check. ``known_s`` is the time offset that the check was
+    made with.
+    """
+    left_s = result.offset.seconds if result.offset else 0.0
+    clock: Options = {"time_offset": known_s + left_s}
+
+    def pairs_of(options: Options) -> PosePairs:
+        return with_options(snapshot, {**options, **clock}).pose_pairs
+
+    def answer_with(options: Options) -> Calibration | None:
+        solved = _solved_with(snapshot, {**options, **clock})
+        return solved.calibration if solved else None
+
+    return choosing.choose(result, pairs_of, answer_with)
+
+
+def _with_findings(found: Run, findings: tuple[Finding, ...]) -> Run:
+    """The run with other findings, and no reading left to choose."""
+    return replace(
+        found,
+        calibration=replace(found.calibration, findings=findings),
+        check=replace(found.check, findings=findings, readings=None),
+    )
+
+
+def _without_readings(found: Run) -> Run:
+    """The run without the findings about both streams being inverse, which is settled."""
+    kept = [
+        each
+        for each in found.check.findings
+        if each.code != "inverse_both" or each.severity is Severity.NOTE
+    ]
+    return _with_findings(found, tuple(kept))
+
+
+def _repaired_unsolved(snapshot: Snapshot) -> Run | None:
+    """The run with the options that repair streams from which nothing could be solved; None if
+    there are none.
+    """
+    result = check(snapshot)
+    findings = result.findings
+    doubts: tuple[Finding, ...] = ()
+    if result.readings and not _INVERSIONS & snapshot.config.given:
+        offset_s = snapshot.config.time_offset
+        known_s = 0.0 if isinstance(offset_s, str) else offset_s
+        choice = _chosen(snapshot, result, known_s)
+        findings, doubts = choice.findings, choice.doubts
+    repaired = _repaired(snapshot, findings)
+    return _doubting(repaired, doubts) if repaired else None
+
+
+def _bettered(first: Run, settled: Collection[str], known: Run | None) -> Run:
+    """:func:`_reviewed` once it is settled which poses are inverse."""
     calibration, snapshot, found = first.calibration, first.snapshot, first.check.findings
     given = snapshot.config.given.union(settled)
     options = _certain(found, given)
@@ -154,9 +229,24 @@ def _reviewed(first: Run, settled: Collection[str], known: Run | None = None) ->
     second = second or (_solved_with(first.snapshot, options) if options else None)
     if not second:
         return first
+    if _INVERSIONS & given:
+        second = _without_readings(second)
     (bad, n_first, fit_first), (is_bad, n_second, fit_second) = map(_against, (first, second))
     is_better = is_bad < bad or (n_second <= n_first - least and fit_second >= fit_first)
-    return _telling(second, options, found) if is_better or _is_sound(second) else first
+    if not (is_better or _is_sound(second)):
+        return first
+    doubts = []
+    if "parent_scale" not in given:
+        doubts = [_as_doubt(each) for each in found if each.code == "unit_or_scale"]
+    return _doubting(_telling(second, options, found), doubts)
+
+
+def _as_doubt(found: Finding) -> Finding:
+    """A finding about lengths that may be read in two ways, once one way is taken: as grave as the
+    scale is close to a unit.
+    """
+    severity = Severity.ERROR if found.evidence["is_exact"] else Severity.WARNING
+    return replace(found, severity=severity, options={})
 
 
 def _against(found: Run) -> tuple[bool, int, bool]:
@@ -190,7 +280,7 @@ def _repaired(
         options["time_offset"] = "estimate"
         second = _solved_with(snapshot, options)
     second = _reviewed(second, {*settled, *options}) if second else None
-    if not second or any(each.makes_unusable for each in second.check.findings):
+    if not second or any(map(_speaks_against_repair, second.check.findings)):
         return None
     what = [each.what for each in findings if {*each.options} & {*options}]
     done = ", ".join(f"{name} {value}" for name, value in options.items())
@@ -206,14 +296,27 @@ def _repaired(
     return _doubting(second, [*doubts, *(each for each in findings if each.code == "ambiguous")])
 
 
+def _speaks_against_repair(found: Finding) -> bool:
+    """Whether a finding shows that the streams do not agree after a repair. Lengths that may be
+    read in two ways do not.
+    """
+    return found.makes_unusable and found.code != "unit_or_scale"
+
+
 def _doubting(found: Run, doubts: Collection[Finding]) -> Run:
     """Add findings about options that were set; a large offset that nobody gave is one."""
     offset_s = found.calibration.time_offset_s
     if "time_offset" in found.options and abs(offset_s) > UNASKED_S:
         large = finding("large_time_offset", "child", **checking.offset_values(offset_s))
         doubts = [*doubts, *([] if large in found.calibration.findings else [large])]
-    findings = gravest_first((*found.calibration.findings, *doubts))
-    return replace(found, calibration=replace(found.calibration, findings=findings))
+    if not doubts:
+        return found
+    calibration, check = found.calibration, found.check
+    return replace(
+        found,
+        calibration=replace(calibration, findings=gravest_first((*calibration.findings, *doubts))),
+        check=replace(check, findings=gravest_first((*check.findings, *doubts))),
+    )
 
 
 def _saying(found: Run, options: Options, told: tuple[str, ...]) -> Run:
@@ -294,7 +397,7 @@ def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str,
             is_sure = each.makes_unusable or (name == "time_offset" and is_warning)
             is_known = each.code in _MENDED or name.endswith(("invert", "quaternion"))
             if is_sure and is_known and name not in given:
-                certain[name] = "estimate" if each.code in ("time_offset", "scale") else value
+                certain[name] = "estimate" if each.code in _ESTIMATES else value
     return certain
 
 
@@ -330,7 +433,15 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> checkin
     ):
         obsolete.add("one_axis")  # the result has shown otherwise
     findings = [found for found in result.findings if found.code not in obsolete]
-    return replace(result, findings=gravest_first(answered(findings, snapshot.config)))
+    findings = answered(findings, snapshot.config)
+    if _INVERSIONS & snapshot.config.given:
+        # Whether both streams are inverse is the user's word.
+        is_said = [found.code == "inverse_both" for found in findings]
+        findings = [
+            replace(found, severity=Severity.NOTE) if said else found
+            for found, said in zip(findings, is_said, strict=True)
+        ]
+    return replace(result, findings=gravest_first(findings))
 
 
 def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Finding]:

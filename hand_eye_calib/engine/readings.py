@@ -1,0 +1,170 @@
+"""Which of two readings of both streams is right: as they are, or inverted besides.
+
+Both readings fit alike (:class:`~hand_eye_calib.checks.hypotheses.Readings`). Two kinds of evidence
+differ: the likelihood of the noise (:mod:`~hand_eye_calib.gls.readings`), and the shape of the
+motion. The noise is believed first. In a small space it needs the shape's support: there, the noise
+of a camera that sees a target is like that of inverse poses. Where neither decides, both answers
+are shown, and the result is not to be used.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.alignment.similarity import estimate_scale
+from hand_eye_calib.checks.check import CheckResult
+from hand_eye_calib.checks.findings import Finding, finding, gravest_first
+from hand_eye_calib.checks.hypotheses import Readings, findings_of
+from hand_eye_calib.errors import NotEnoughDataError
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.gls.readings import loss_difference
+from hand_eye_calib.option import Options
+from hand_eye_calib.pairing.motion_pairs import PosePairs
+from hand_eye_calib.results.calibration import Calibration
+
+# Difference of the losses that decides. In 200 right recordings whose sensors are no cameras that
+# see a target, the difference was -9 or more.
+CLEAR_NOISE = 20.0
+
+# Logarithm of paths from which on they support the noise in a small space.
+_CLEAR_PATHS = 0.06
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a check finds after the choice of a reading.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        Those of the check, for the chosen reading.
+    doubts : tuple of Finding
+        To be added to the result with that reading.
+    is_repair : bool
+        Whether the reading needs options.
+    """
+
+    findings: tuple[Finding, ...]
+    doubts: tuple[Finding, ...]
+    is_repair: bool
+
+
+def choose(
+    result: CheckResult,
+    pairs_of: Callable[[Options], PosePairs],
+    answer_with: Callable[[Options], Calibration | None],
+) -> Choice:
+    """Choose between the two readings of a check.
+
+    Parameters
+    ----------
+    result : CheckResult
+        A check that has readings.
+    pairs_of : callable
+        Returns the poses with some options, on one clock.
+    answer_with : callable
+        Returns the result with some options, on one clock.
+    """
+    readings = result.readings
+    assert readings is not None
+    of_both = [findings_of(hypothesis) for hypothesis in readings.hypotheses]
+    options = [_options_of(findings) for findings in of_both]
+    difference = _difference(pairs_of(options[0]), pairs_of(options[1]))
+    index = decide(readings, difference)
+    can_be_right = readings.hypotheses[0].is_upright
+    doubts: tuple[Finding, ...] = ()
+    if index is None:
+        answers = [answer_with(each) for each in options]
+        doubts = (_unclear(options, answers, difference),)
+        index = 0 if can_be_right else int(readings.shape > 0.0)
+    elif index == 1 and can_be_right and readings.is_small:
+        doubts = (finding("inverse_small", "both"),)
+    codes = {"inverse_both"}
+    for findings in of_both:
+        codes.update(each.code for each in findings)
+    others = [each for each in result.findings if each.code not in codes]
+    return Choice(
+        findings=gravest_first((*others, *of_both[index])),
+        doubts=doubts,
+        is_repair=bool(options[index]),
+    )
+
+
+def decide(readings: Readings, difference: float) -> int | None:
+    """Return the index of the right reading, or None if the evidence is not clear.
+
+    Parameters
+    ----------
+    readings : Readings
+    difference : float
+        Loss of the second reading less that of the first.
+    """
+    by_shape = readings.by_shape
+    by_noise = 0
+    if abs(difference) > CLEAR_NOISE:
+        by_noise = -int(np.sign(difference))
+    if by_noise and readings.is_small and by_noise != by_shape:
+        is_supported = by_noise * readings.paths > _CLEAR_PATHS
+        is_usual = by_noise < 0 and by_shape == 0
+        choice = by_noise if is_supported or is_usual else 0
+    elif by_noise:
+        choice = by_noise
+    else:
+        choice = by_shape if readings.is_clear else 0
+    if choice == 0 and readings.hypotheses[0].is_upright and readings.shape < 0.0:
+        choice = -1
+    return {1: 1, -1: 0}.get(choice)
+
+
+def _difference(first: PosePairs, second: PosePairs) -> float:
+    """Return the loss of the second reading less that of the first, at the stamps of both; 0 if the
+    noise model fits neither.
+    """
+    _, of_first, of_second = np.intersect1d(
+        first.stamps_ns, second.stamps_ns, assume_unique=True, return_indices=True
+    )
+    first, second = first[of_first], second[of_second]
+    try:
+        fit = estimate_scale(first)
+    except NotEnoughDataError:
+        return 0.0
+    scale = fit.scale if fit.has_own_unit else 1.0
+    first, second = first.child_scaled(scale), second.child_scaled(scale)
+    try:
+        return loss_difference(
+            first.stamps_ns, (first.Ts_pw_p, first.Ts_cw_c), (second.Ts_pw_p, second.Ts_cw_c)
+        )
+    except np.linalg.LinAlgError:
+        return 0.0
+
+
+def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
+    options: dict[str, float | str] = {}
+    for each in findings:
+        options.update(each.options)
+    return options
+
+
+def _unclear(
+    options: Sequence[Options], answers: Sequence[Calibration | None], difference: float
+) -> Finding:
+    """The finding that two readings are possible, with both answers."""
+    texts = []
+    for of_reading, answer in zip(options, answers, strict=True):
+        values = ", ".join(f"{name} {value}" for name, value in of_reading.items())
+        reading = f"with {values}" if values else "as the streams are"
+        pose = _in_words(answer.T_parent_child) if answer else "no result"
+        texts.append(f"{reading} ({pose})")
+    code = "inverse" if options[0] else "inverse_both"
+    return finding(
+        "inverse_unclear", code=code, first=texts[0], second=texts[1], difference=difference
+    )
+
+
+def _in_words(T_parent_child: np.ndarray) -> str:
+    """A pose as people read it."""
+    x, y, z, *rpy = se3.xyz_rpy(T_parent_child)
+    roll, pitch, yaw = np.degrees(rpy)
+    place = f"x {x:.3f}, y {y:.3f}, z {z:.3f} m"
+    return f"{place}, roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} deg"
