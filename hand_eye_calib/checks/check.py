@@ -24,13 +24,15 @@ from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
 from hand_eye_calib.checks import agreement, hypotheses, independence
 from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
-from hand_eye_calib.checks.hypotheses import Explanation, StreamPair
+from hand_eye_calib.checks.hypotheses import Explanation, Readings, StreamPair
 from hand_eye_calib.checks.streams import (
     check_flat,
     check_frozen,
     check_lengths,
     check_positions,
     check_stream,
+    is_too_fast,
+    is_too_slow,
 )
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import NotEnoughDataError
@@ -44,7 +46,11 @@ from hand_eye_calib.text import axes_in_words
 _COARSE, _SLOW_GAP = 0.5, 1.5
 
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
-_UNIT_TOLERANCE = 0.05
+
+# A scale is that of a unit within so many of its standard deviations, or to rounding (share).
+_UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
+# A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
+_UNIT_NEAR = 0.05
 
 # Most motions that faults of their response are looked for in.
 _MAX_MOTIONS = 1500
@@ -65,11 +71,15 @@ class CheckResult:
         The fit under the hypothesis that holds; None if none does.
     offset : TimeOffset or None
         What is left of the clock offset, beside the one that is known; None if no hypothesis holds.
+    readings : Readings or None
+        Two readings of the streams that fit alike, if another than that of the findings may be
+        right: one in which both streams are inverted besides.
     """
 
     findings: tuple[Finding, ...]
     fit: SimilarityFit | None = None
     offset: TimeOffset | None = None
+    readings: Readings | None = None
 
 
 def check_streams(
@@ -136,13 +146,13 @@ def check_streams(
     right = explanation.hypothesis.undo(streams)
     offset = _fine_offset(right, at, explanation.fit)
     right = right.shifted(offset.seconds)
-    sizes, fit = _check_sizes(right.synchronised, explanation, offset.fit, scale)
+    sizes, fit = _check_sizes(right, explanation, offset.fit, scale)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
         findings += _check_agreeing(
             right, given, fit, known, time_offset_s + offset.seconds, are_exact
         )
-    return CheckResult(gravest_first(findings), explanation.fit, offset)
+    return CheckResult(gravest_first(findings), explanation.fit, offset, explanation.readings)
 
 
 def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None, TimeOffset]:
@@ -217,11 +227,12 @@ def _explained(
 
 
 def _check_sizes(
-    pose_pairs: PosePairs, explanation: Explanation, timed: SimilarityFit | None, known: float
+    streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, known: float
 ) -> tuple[list[Finding], SimilarityFit]:
     """Findings about the scale, beside the one that is known, and the axes of rotation of streams
     that agree, and the fit with the scale. ``timed`` is the fit with the time offset.
     """
+    pose_pairs = streams.synchronised
     motions, fit = _motions(pose_pairs, hypotheses.MAX_PAIRS), explanation.fit
     chords = motions.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
     hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
@@ -235,7 +246,9 @@ def _check_sizes(
                 values: dict[str, Any] = {"scale": total, "sigma": sigma}
                 values["options"] = {"scale": float(f"{total:.4g}")}
                 differs = graded("scale", "child", fit.scale - 1.0, **values)
-                findings.append(in_other_units(fit.scale, fit.scale_sigma, known) or differs)
+                as_given = streams.parent, streams.child.scaled(1.0 / known)
+                unit = in_other_units(fit.scale, fit.scale_sigma, *as_given, known)
+                findings.append(unit or differs)
     return [*filter(None, findings)], fit
 
 
@@ -303,21 +316,71 @@ def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
     return values | {"total_s": round(known_s + offset_s, 4)}
 
 
-def in_other_units(scale: float, sigma: float, known: float = 1.0) -> Finding | None:
-    """The finding that a stream's lengths are in another unit, by the scale that was found beside
-    the known one, or by both together, as the solve may have found that one: the child's if it is
-    below 1, otherwise the parent's; None if it is about that of no unit.
+def in_other_units(
+    scale: float, sigma: float, parent: Trajectory, child: Trajectory, known: float = 1.0
+) -> Finding | None:
+    """Return the finding that a stream's lengths are in another unit, or None.
+
+    Below 1, a scale within three standard deviations of a unit says that the child is in that unit;
+    any other is a scale of the child. Above 1 the ratio has two explanations: the parent is in that
+    unit, or the child has a scale of its own, as that of a single camera. A ratio alone never
+    changes the parent. The motion decides: a parent that would be too fast in metres is in that
+    unit, a child that would hardly move in metres has a scale of its own. Where both are plausible
+    in metres, the finding names both explanations. The result is not to be used within three
+    standard deviations of a unit, and with care within 5 %. Two streams in one wrong unit have no
+    ratio; :func:`~hand_eye_calib.checks.streams.check_lengths` asks about them.
+
+    Parameters
+    ----------
+    scale, sigma : float
+        Factor of the child's lengths beside the known one, and its standard deviation.
+    parent, child : Trajectory
+        As they are given, without the known scale.
+    known : float
+        The known factor. The solve may have found a known factor near 1 itself.
     """
-    for total in (scale * known, scale) if 0.5 < known < 2.0 else (scale,):
-        stream, other = ("child", "parent") if total < 1.0 else ("parent", "child")
-        for factor, unit in _UNITS.items():
-            if abs(min(total, 1.0 / total) / factor - 1.0) < _UNIT_TOLERANCE:
-                options = {"parent_scale": factor}
-                if stream == "child":
-                    options = {"scale": round(factor * known * scale / total, 9)}
-                told: dict[str, Any] = {"scale": total, "sigma": sigma * total / scale}
-                return finding("units", stream, options=options, other=other, unit=unit, **told)
+    # Of a factor that the solve found, the total is what the streams have.
+    totals = (scale * known, scale) if 0.5 < known < 2.0 else (scale,)
+    for total in totals:
+        values: dict[str, Any] = {"scale": total, "sigma": sigma * total / scale}
+        unit, is_exact = _unit_of(total, values["sigma"])
+        if unit and total > 1.0:
+            return _parent_or_child(unit, is_exact, values, parent, child)
+        if unit and is_exact:
+            options = {"scale": round(unit * known * scale / total, 9)}
+            values |= {"other": "parent", "unit": _UNITS[unit]}
+            return finding("units", "child", options=options, **values)
     return None
+
+
+def _unit_of(total: float, sigma: float) -> tuple[float, bool]:
+    """Return the unit (m) whose factor, or whose inverse if it is above 1, is near this scale, or
+    0; and whether the scale is that of the unit within its standard deviation.
+    """
+    for unit in _UNITS:
+        factor = unit if total < 1.0 else 1.0 / unit
+        off = abs(total - factor)
+        is_exact = off <= max(_UNIT_SIGMAS * sigma, _UNIT_ROUNDING * factor)
+        if is_exact or off <= _UNIT_NEAR * factor:
+            return unit, is_exact
+    return 0.0, False
+
+
+def _parent_or_child(
+    unit: float, is_exact: bool, values: dict[str, Any], parent: Trajectory, child: Trajectory
+) -> Finding | None:
+    """The finding about a child whose lengths are shorter than the parent's by a unit (m); None if
+    it has a scale of its own.
+    """
+    if is_too_fast(parent) and not is_too_fast(child):
+        options = {"parent_scale": unit}
+        values |= {"other": "child", "unit": _UNITS[unit]}
+        return finding("units", "parent", options=options, **values)
+    if is_too_slow(child) and not is_too_slow(parent):
+        return None
+    options = {"scale": float(f"{values['scale']:.4g}")}
+    values |= {"unit": _UNITS[unit], "factor": unit, "is_exact": is_exact}
+    return finding("unit_or_scale", "parent", options=options, **values)
 
 
 def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:

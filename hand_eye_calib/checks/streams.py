@@ -58,6 +58,8 @@ _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
 # gravity in a tenth of all seconds (m/s^2). Recordings have 6 at most; arms, which move least, 0.1,
 # and so exceed that in millimetres; what hand-held sensors have exceeds it in centimetres.
 _FASTEST, _HARDEST = 340.0, 49.0
+# Slowest usual speed (m/s) of a sensor while it is calibrated. Arms have 0.05.
+_SLOWEST = 0.01
 
 # Velocities are over so long (s), so that noise adds little. A tenth of them may be of jumps.
 _STEP_S, USUAL = 1.0, 0.9
@@ -245,16 +247,36 @@ def check_lengths(parent: Trajectory) -> list[Finding]:
     """Finding about motion that no vehicle has, or none: two streams in millimetres agree, and
     nothing else tells.
     """
-    parent = coarse(parent, _STEP_S)
-    if len(parent) < 4:
+    if not is_too_fast(parent):
         return []
-    intervals_s = np.diff(parent.stamps_ns)[:, None] * 1e-9
-    velocities = np.diff(parent.poses[:, :3, 3], axis=0) / intervals_s
-    changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
-    speed = quantile(np.linalg.norm(velocities, axis=1), USUAL)
-    change = quantile(np.linalg.norm(changes, axis=1), USUAL)
-    if speed < _FASTEST and change < _HARDEST:
-        return []
+    speed, change = _usual_motion(parent)
     options: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
     values = {"speed_m_s": speed, "acceleration_m_s2": change}
     return [finding("lengths", "parent", None, options, **values)]
+
+
+def is_too_fast(trajectory: Trajectory) -> bool:
+    """Whether no vehicle moves like this, so that the lengths are not in metres."""
+    speed, change = _usual_motion(trajectory)
+    return speed >= _FASTEST or change >= _HARDEST
+
+
+def is_too_slow(trajectory: Trajectory) -> bool:
+    """Whether hardly any sensor moves so slowly while it is calibrated by its motion."""
+    speed, _ = _usual_motion(trajectory)
+    return speed < _SLOWEST
+
+
+def _usual_motion(trajectory: Trajectory) -> tuple[float, float]:
+    """Return the speed (m/s) and the change of velocity (m/s^2) that nine tenths of all seconds do
+    not exceed; zeros for fewer than four seconds.
+    """
+    few = coarse(trajectory, _STEP_S)
+    if len(few) < 4:
+        return 0.0, 0.0
+    intervals_s = np.diff(few.stamps_ns)[:, None] * 1e-9
+    velocities = np.diff(few.poses[:, :3, 3], axis=0) / intervals_s
+    changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
+    speed = quantile(np.linalg.norm(velocities, axis=1), USUAL)
+    change = quantile(np.linalg.norm(changes, axis=1), USUAL)
+    return speed, change

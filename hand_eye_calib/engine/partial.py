@@ -21,6 +21,7 @@ from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine import estimation
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.gls import estimator as adaptive_estimator
 from hand_eye_calib.gls import increments
 from hand_eye_calib.gls import positions as of_positions
@@ -126,6 +127,24 @@ def _steps(
     )
 
 
+def _other_units(
+    scale: float,
+    sigma: float,
+    stamps_ns: IntArray,
+    poses: FloatArray,
+    positions: FloatArray,
+    is_child: bool,
+) -> Finding | None:
+    """The finding that the positions or the odometry are in other units, or None. ``is_child`` if
+    the positions are the child's.
+    """
+    odometry = Trajectory(stamps_ns, poses)
+    antenna = Trajectory.from_positions(stamps_ns, positions)
+    if is_child:
+        return in_other_units(scale, sigma, odometry, antenna)
+    return in_other_units(scale, sigma, antenna, odometry)
+
+
 def _of_path(
     solution: of_positions.LeverArmSolution,
     fused: covariance.Assessment,
@@ -146,7 +165,8 @@ def _of_path(
         scaled = of_positions.solve(stamps_ns, poses, positions, True)
         left = of_positions.unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
         scale = scaled.scale if is_child else 1.0 / scaled.scale
-        unit = in_other_units(scale, scaled.scale_sigma * (scale / scaled.scale))
+        sigma = scaled.scale_sigma * (scale / scaled.scale)
+        unit = _other_units(scale, sigma, stamps_ns, poses, positions, is_child)
         if unit and not is_near and left < _UNRELATED_PATH:
             return (unit,)
         if not is_scale_given and left < min(_SUSPECT_PATH, _MENDED_PATH * share):

@@ -1,0 +1,147 @@
+"""Lengths in other units: what a ratio of lengths says, and what it does not."""
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib.checks.check import in_other_units
+from hand_eye_calib.checks.streams import is_too_fast, is_too_slow
+from hand_eye_calib.geometry.se3 import deviation
+from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from reproduction.coverage.classes import make
+
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+
+
+@pytest.fixture(scope="module")
+def hand():
+    """Metres at walking speed, as hand-held sensors move."""
+    poses = wandering_poses(400)
+    child = disturbed(child_of(poses), 1, 0.002, 0.001)
+    return as_trajectory(poses), as_trajectory(child)
+
+
+@pytest.fixture(scope="module")
+def expected(hand):
+    return hec.calibrate(*hand, reference="B5").T_parent_child
+
+
+def moving_at(speed_m_s):
+    """Ten seconds along a line that bends."""
+    times_s = 0.1 * np.arange(100)
+    places = speed_m_s * np.stack([times_s, np.sin(0.3 * times_s), 0.0 * times_s], axis=1)
+    return Trajectory.from_positions(np.round(1e9 * times_s).astype(np.int64), places)
+
+
+class TestRatio:
+    """``in_other_units`` of a scale, with both streams at these speeds as they are given."""
+
+    @pytest.mark.parametrize("unit", UNITS)
+    def test_a_child_in_another_unit_is_named_within_three_sigma(self, unit):
+        factor = UNITS[unit]
+        streams = moving_at(0.5), moving_at(0.5 / factor)
+        found = in_other_units(1.002 * factor, 0.001 * factor, *streams)
+        assert (found.code, found.stream) == ("units", "child")
+        assert found.options == {"scale": factor}
+        assert unit in found.what
+        assert in_other_units(1.004 * factor, 0.001 * factor, *streams) is None
+
+    @pytest.mark.parametrize("unit", UNITS)
+    def test_a_ratio_alone_never_changes_the_parent(self, unit):
+        factor = UNITS[unit]
+        streams = moving_at(2.0), moving_at(2.0 * factor)
+        found = in_other_units(1.002 / factor, 0.001 / factor, *streams)
+        if unit == "millimetres":
+            assert found is None  # a child at 2 mm/s is not in metres
+        else:
+            assert found.code == "unit_or_scale"
+            assert "parent_scale" not in found.options
+            assert f"parent_scale {factor:g}" in found.advice
+
+    @pytest.mark.parametrize(("off", "is_exact"), [(1.002, 1.0), (1.004, 0.0), (0.96, 0.0)])
+    def test_a_ratio_near_a_unit_is_a_question(self, off, is_exact):
+        streams = moving_at(2.0), moving_at(0.6)
+        found = in_other_units(off / 0.3048, 0.001 / 0.3048, *streams)
+        assert (found.code, found.evidence["is_exact"]) == ("unit_or_scale", is_exact)
+
+    @pytest.mark.parametrize("unit", ["millimetres", "centimetres"])
+    def test_a_parent_faster_than_sound_in_metres_is_in_that_unit(self, unit):
+        factor = UNITS[unit]
+        found = in_other_units(
+            1.0 / factor, 0.001 / factor, moving_at(8.0 / factor), moving_at(8.0)
+        )
+        assert (found.code, found.stream) == ("units", "parent")
+        assert found.options == {"parent_scale": factor}
+
+    @pytest.mark.parametrize("scale", [1.05, 3.09, 3.48, 2.0, 10.0, 0.1, 0.28, 0.32])
+    def test_a_scale_near_no_unit_is_a_scale(self, scale):
+        assert in_other_units(scale, 0.005, moving_at(1.0), moving_at(1.0 / scale)) is None
+
+    def test_speeds_of_sensors(self):
+        speeds = [0.004, 0.05, 30.0, 500.0]
+        assert [is_too_slow(moving_at(speed)) for speed in speeds] == [True, False, False, False]
+        assert [is_too_fast(moving_at(speed)) for speed in speeds] == [False, False, False, True]
+
+
+class TestResult:
+    @pytest.mark.parametrize("unit", UNITS)
+    def test_a_child_in_another_unit_is_repaired(self, hand, expected, unit):
+        parent, child = hand
+        result = hec.calibrate(parent, child.scaled(1.0 / UNITS[unit]), reference="B5")
+        assert result.scale == UNITS[unit]
+        np.testing.assert_allclose(result.T_parent_child, expected, atol=0.01)
+        assert result.findings == ()
+
+    def test_a_parent_in_millimetres_is_repaired_with_care(self, hand, expected):
+        parent, child = hand
+        result = hec.calibrate(parent.scaled(1000.0), child, reference="B5")
+        np.testing.assert_allclose(result.T_parent_child, expected, atol=0.01)
+        assert result.verdict is hec.Verdict.USE_WITH_CARE
+        assert ("units", "parent") in {(each.code, each.stream) for each in result.findings}
+
+    def test_a_parent_in_feet_is_asked_about(self, hand, expected):
+        parent, child = hand
+        parent = parent.scaled(1.0 / 0.3048)
+        result = hec.calibrate(parent, child, reference="B5")
+        assert result.verdict is hec.Verdict.DO_NOT_USE
+        (found,) = (each for each in result.findings if each.makes_unusable)
+        assert found.code == "unit_or_scale"
+        assert result.scale == pytest.approx(3.2808, abs=0.01)
+        answered = hec.calibrate(parent, child, reference="B5", parent_scale=0.3048)
+        np.testing.assert_allclose(answered.T_parent_child, expected, atol=0.01)
+        assert not any(each.makes_unusable for each in answered.findings)
+        scaled = hec.calibrate(parent, child, reference="B5", scale="estimate")
+        assert not any(each.makes_unusable for each in scaled.findings)
+
+    @pytest.mark.parametrize("scale", [3.24, 3.32, 39.0, 98.0, 1030.0])
+    def test_a_camera_without_a_unit_leaves_the_parent_in_metres(self, hand, expected, scale):
+        parent, child = hand
+        result = hec.calibrate(parent, child.scaled(1.0 / scale), reference="B5")
+        assert result.scale == pytest.approx(scale, rel=0.005)
+        np.testing.assert_allclose(result.T_parent_child, expected, atol=0.02)
+        assert not any(each.makes_unusable for each in result.findings)
+        codes = {each.code for each in result.findings}
+        assert codes == (set() if scale == 1030.0 else {"unit_or_scale"})
+
+    @pytest.mark.parametrize("name", ["car_ins_lidar", "arm_target"])
+    @pytest.mark.parametrize("unit", ["millimetres", "feet"])
+    def test_no_platform_is_wrong_without_a_word(self, name, unit):
+        drive = make(name, 31)
+        result = hec.calibrate(drive.parent.scaled(1.0 / UNITS[unit]), drive.child)
+        error_m = np.abs(deviation(result.T_parent_child, drive.T_parent_child))[:3].max()
+        assert error_m < 0.2 or result.verdict is hec.Verdict.DO_NOT_USE
+
+
+def test_positions_are_asked_about_as_poses_are():
+    drive = simulate_drive(5, HILLY_DRIVE, NoiseConfig(gaussian=0.001))
+    antenna = Trajectory.from_positions(drive.child.stamps_ns, drive.child.poses[:, :3, 3])
+    feet = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), antenna)
+    assert feet.verdict is hec.Verdict.DO_NOT_USE
+    # Nothing that drives changes its velocity so fast.
+    centimetres = hec.calibrate(drive.parent.scaled(100.0), antenna)
+    expected = drive.T_parent_child[:3, 3]
+    np.testing.assert_allclose(centimetres.T_parent_child[:3, 3], expected, atol=0.02)
+    assert centimetres.verdict is hec.Verdict.USE_WITH_CARE
