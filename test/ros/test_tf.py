@@ -101,13 +101,19 @@ class TestNode:
         def state(part="extrinsic", key="tf_static"):
             return values_of(said[f"/calibrator: {part}"])[key]
 
+        def fault():
+            newest = said.get("/calibrator: progress")
+            is_faulty = newest is not None and values_of(newest)["is_faulty"] == "true"
+            return newest.message if is_faulty else ""
+
         publishers, poses = peer.publishers(), drive(450)
         peer.solve(publishers, *(part[:400] for part in poses))
         early = "the goal is not reached"
-        peer.spin_until(lambda: said and state(key="tf_static_reason") == early, "the state")
+        is_early = lambda: said and state(key="tf_static_reason") == early  # noqa: E731
+        peer.spin_until(is_early, "the state", fault)
         assert state() == "not_yet"
         peer.solve(publishers, *(part[400:] for part in poses))
-        peer.spin_until(lambda: state("progress", "done") == "true", "the goal")
+        peer.spin_until(lambda: state("progress", "done") == "true", "the goal", fault)
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")
         peer.spin_until(lambda: state() == "broadcast", "the state")
