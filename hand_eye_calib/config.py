@@ -32,6 +32,10 @@ POSE_TYPES = (
 
 BACKENDS = ("fast", "ipopt")
 
+# Largest time offset (s): that between any two stamps of 64 bits of nanoseconds which are not
+# negative. Clocks may count from 1970, 1904, the start of the computer or of the GPS week.
+_LONGEST_OFFSET_S = 9.2e9
+
 
 class MethodRecord(NamedTuple):
     """What other code has to know about a method: it solves the motion pairs of a reference alone,
@@ -213,10 +217,10 @@ class CalibratorConfig(OptionSet):
     time_offset: float | str = option(
         0.0,
         "Added to the child's stamps to get the parent's clock; estimate finds it from the angular "
-        "rates of both streams.",
+        "rates of both streams, of any size.",
         unit="s",
         words=("estimate",),
-        within=(-1e9, 1e9),
+        within=(-_LONGEST_OFFSET_S, _LONGEST_OFFSET_S),
     )
     scale: float | str = option(
         "none",

@@ -52,6 +52,9 @@ _UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
 # A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
 _UNIT_NEAR = 0.05
 
+# Code of positions that are rounded, which is a matter of the unit of length.
+_ROUNDED = "coarse_positions"
+
 # Most motions that faults of their response are looked for in.
 _MAX_MOTIONS = 1500
 
@@ -108,11 +111,12 @@ def check_streams(
     are_exact : bool
         The user called both streams exact: that they do not drift apart is no reason for doubt.
     """
-    findings = check_stream(parent, "parent", max_gap_s)
-    findings += check_stream(child, "child", max_gap_s)
-    if any(each.makes_unusable for each in findings):
-        return CheckResult(gravest_first(findings))
     given = StreamPair(parent, child.scaled(scale), max_gap_s)
+    findings = check_stream(given.parent, "parent", max_gap_s)
+    findings += check_stream(given.child, "child", max_gap_s)
+    # Whether positions are coarse is decided once the unit of length is known.
+    if any(found.makes_unusable for found in findings if found.code != _ROUNDED):
+        return CheckResult(gravest_first(findings))
     streams = given.shifted(time_offset_s)
     explanation, at = None, TimeOffset()
     if known and not streams.is_slow:
@@ -141,18 +145,53 @@ def check_streams(
         findings += found
     if not explanation:
         return CheckResult(gravest_first(findings))
-    is_sound = not any(each.makes_unusable for each in findings)
-    lengths = check_lengths(parent) if is_sound else []
+    are_read_well = not any(found.makes_unusable for found in findings if found.code != _ROUNDED)
+    lengths = check_lengths(parent) if are_read_well else []
     right = explanation.hypothesis.undo(streams)
     offset = _fine_offset(right, at, explanation.fit)
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right, explanation, offset.fit, scale)
+    findings = _in_metres(findings, [*lengths, *sizes], scale)
+    is_sound = not any(found.makes_unusable for found in findings)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
     if is_sound and not lengths:
         findings += _check_agreeing(
             right, given, fit, known, time_offset_s + offset.seconds, are_exact
         )
     return CheckResult(gravest_first(findings), explanation.fit, offset, explanation.readings)
+
+
+def _in_metres(
+    findings: Sequence[Finding], units: Sequence[Finding], scale: float
+) -> list[Finding]:
+    """Return findings with steps of positions in metres, by the units that were found.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        The child's lengths were multiplied by ``scale``.
+    units : sequence of Finding
+        Those that say in which unit a stream's lengths are.
+    scale : float
+        Known factor of the child's lengths.
+    """
+    options: dict[str, Any] = {}
+    for unit in units:
+        if unit.code in ("units", "lengths"):
+            options.update(unit.options)
+    factors = {
+        "parent": float(options.get("parent_scale", 1.0)),
+        "child": float(options.get("scale", scale)) / scale,
+    }
+    right: list[Finding] = []
+    for found in findings:
+        if found.code != _ROUNDED:
+            right.append(found)
+            continue
+        step_m = found.evidence["step_m"] * factors[found.stream]
+        if coarse := graded(_ROUNDED, found.stream, step_m, step_m=step_m):
+            right.append(coarse)
+    return right
 
 
 def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None, TimeOffset]:
@@ -284,7 +323,7 @@ def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list
     findings = check_positions(parent, "parent", max_gap_s)
     findings += check_positions(child, "child", max_gap_s)
     # Rounded positions stay the same while the sensor moves.
-    if any(each.makes_unusable or each.code == "coarse_positions" for each in findings):
+    if any(each.makes_unusable or each.code == _ROUNDED for each in findings):
         return findings
     return [*findings, *check_lengths(parent), *check_frozen(parent, child)]
 

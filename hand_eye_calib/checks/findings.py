@@ -172,8 +172,8 @@ _ROWS = {
         "the child's clock is {size_s:.2f} s {direction} the parent's, and no offset was given",
         "check that both streams are of one vehicle; if the clocks differ so much, give "
         "time_offset {total_s} or estimate",
-        "a clock of another time scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a "
-        "vehicle that follows",
+        "a clock of another epoch (start of the computer or of the recording, GPS week) or time "
+        "scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a vehicle that follows",
         severity=_WARNING,
         code="time_offset",
     ),

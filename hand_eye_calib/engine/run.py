@@ -450,7 +450,9 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
-        found += checking.check_parts(parent, child.shifted(known_s), snapshot.config.max_gap)
+        scale = calibration.scale if calibration else snapshot.config.scale
+        in_metres = child.scaled(1.0 if isinstance(scale, str) else scale)
+        found += checking.check_parts(parent, in_metres.shifted(known_s), snapshot.config.max_gap)
     hidden = calibration.hidden if calibration else []
     if len(hidden) == 3 or any(each.code == "unrelated" for each in found):
         of_speed, max_gap_s = snapshot.config.measured == "positions", snapshot.config.max_gap

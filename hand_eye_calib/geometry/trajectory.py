@@ -62,6 +62,11 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
+# Range of stamps (ns).
+_FIRST_NS = int(np.iinfo(np.int64).min)
+_LAST_NS = int(np.iinfo(np.int64).max)
+
+
 @dataclass(frozen=True, eq=False)
 class WithArrays:
     """Base of dataclasses with ``eq=False``: equal if all fields are, arrays as a whole."""
@@ -256,10 +261,22 @@ class Trajectory(Columns):
     def shifted(self, offset_s: float, rate: float = 0.0, about_ns: int = 0) -> Self:
         """The same poses with ``offset_s`` seconds added to every stamp, and ``rate`` seconds more
         for each second after a stamp.
+
+        Raises
+        ------
+        InputError
+            If a stamp would not fit 64 bits.
         """
         if not (offset_s or rate):
             return self
-        stamps_ns = self.stamps_ns + np.int64(round(offset_s * 1e9))
+        offset_ns = round(offset_s * 1e9)
+        ends_ns = [int(stamp_ns) + offset_ns for stamp_ns in self.stamps_ns[[0, -1]]]
+        if min(ends_ns) < _FIRST_NS or max(ends_ns) > _LAST_NS:
+            raise InputError(
+                f"a time offset of {offset_s:.10g} s moves stamps beyond 64 bits of nanoseconds; "
+                "check its unit and sign"
+            )
+        stamps_ns = self.stamps_ns + np.int64(offset_ns)
         if rate:
             stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
         return self._unchecked("stamps_ns", stamps_ns, None if rate else self._alike or self)

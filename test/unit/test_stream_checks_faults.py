@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, noisy_pair, wandering_poses
+from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, noisy_pair, wandering_poses
 from scipy.ndimage import gaussian_filter1d
 
 import hand_eye_calib as hec
@@ -70,6 +70,20 @@ def test_the_time_of_a_loose_mount_does_not_depend_on_noise(level):
     assert "60 s after the start" in found.what or "5" in found.what
 
 
+def rounded_pair(step_m, in_mm):
+    """Two precise streams that move slowly; the positions of those in millimetres are multiples of
+    a step.
+    """
+    poses = wandering_poses(900, 3, step_m=0.004, step_rad=0.04)
+    streams = dict(zip(("parent", "child"), noisy_pair(poses, 1, 3e-4, 5e-4), strict=True))
+    for name, stream in streams.items():
+        if in_mm in (name, "both"):
+            poses = stream.poses.copy()
+            poses[:, :3, 3] = np.round(poses[:, :3, 3] / step_m) * step_m * 1000.0
+            streams[name] = Trajectory(stream.stamps_ns, poses)
+    return streams["parent"], streams["child"]
+
+
 class TestGrid:
     def test_steps_of_rounded_positions_are_measured(self):
         child = drive().child
@@ -78,6 +92,35 @@ class TestGrid:
         (found,) = check_stream(Trajectory(child.stamps_ns, poses), "child")
         assert (found.code, found.severity) == ("coarse_positions", Severity.ERROR)
         assert found.evidence["step_m"] == pytest.approx(0.05)
+
+    @pytest.mark.parametrize(
+        ("in_mm", "options"),
+        [
+            ("child", {}),
+            ("child", {"scale": 0.001}),
+            ("child", {"scale": "estimate"}),
+            ("parent", {"parent_scale": 0.001}),
+            ("both", {"parent_scale": 0.001, "scale": 0.001}),
+        ],
+    )
+    def test_millimetres_with_one_decimal_are_fine(self, in_mm, options):
+        streams = rounded_pair(step_m=1e-4, in_mm=in_mm)
+        result = hec.calibrate(*streams, **options)
+        assert [found.code for found in result.findings] == []
+        assert result.verdict is Verdict.USE
+        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=2e-3)
+
+    @pytest.mark.parametrize("stream", ["parent", "child"])
+    @pytest.mark.parametrize(
+        ("step_m", "severity"), [(0.008, Severity.WARNING), (0.05, Severity.ERROR)]
+    )
+    def test_coarse_millimetres_are_named_by_their_step_in_metres(self, stream, step_m, severity):
+        option = {"parent": "parent_scale", "child": "scale"}[stream]
+        streams = rounded_pair(step_m=step_m, in_mm=stream)
+        result = hec.calibrate(*streams, **{option: 0.001})
+        (found,) = (found for found in result.findings if found.code == "coarse_positions")
+        assert (found.stream, found.severity) == (stream, severity)
+        assert found.what == f"the {stream} stream's positions are multiples of {step_m:g} m"
 
     def test_steady_motion_is_no_grid(self):
         poses = np.tile(np.eye(4), (300, 1, 1))
