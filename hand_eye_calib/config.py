@@ -115,11 +115,12 @@ _KIND = _both(
 
 
 _EXAMPLES = {"m": "1.85+/-0.02 or 185cm+/-2cm", "rad": "-90deg+/-2deg"}
+_UNITS_NEEDED = {"m": "More than 5 m needs its unit, as in 8m+/-0.02m. ", "rad": ""}
 _PRIOR: dict[str, Any] = {
     axis: option(
         "",
         f"Prior on {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, "
-        f"such as {_EXAMPLES[unit]}. Empty for none.",
+        f"such as {_EXAMPLES[unit]}. {_UNITS_NEEDED[unit]}Empty for none.",
         unit=unit,
         parse=text.parse_prior,
     )

@@ -4,7 +4,7 @@ and as they type them. Every place that prints or reads a quantity takes it from
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import PurePath
 from typing import TypeAlias
@@ -164,6 +164,10 @@ _QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm
 # Lengths (m) and angles (rad) that a person gives are smaller: no square of one overflows.
 _LARGEST = 1e6
 
+# Longest length (m) of a prior that may have no unit: sensors are seldom farther apart, and 22 of
+# centimetres must not become 22 m.
+_LONGEST_WITHOUT_UNIT_M = 5.0
+
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
 # pitch, yaw (rad): value and standard deviation, or both as the text of the option ``prior.AXIS``.
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
@@ -186,13 +190,52 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     Raises
     ------
     ConfigError
-        If the text has another form, an unknown unit or a standard deviation of 0.
+        If the text has another form, an unknown unit or a standard deviation of 0; if a length of
+        more than 5 m has no unit, or only the value has one that is not m or rad.
     """
     value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
-    units = [AXIS_UNITS[name.removeprefix("prior.")]]
+    unit = AXIS_UNITS[name.removeprefix("prior.")]
     form = "VALUE+/-SIGMA, with its standard deviation"
-    (known,) = quantities(name, units, value.split(), form)
-    return known, quantities(name, units, sigma.split(), form, 0.0)[0]
+    (known,) = quantities(name, [unit], value.split(), form)
+    (known_sigma,) = quantities(name, [unit], sigma.split(), form, 0.0)
+    words = value.strip(), sigma.strip()
+    # A large standard deviation is a vague prior.
+    is_long = unit == "m" and abs(known) > _LONGEST_WITHOUT_UNIT_M
+    if is_long and not _unit_of(words[0]):
+        raise ConfigError(
+            f"{name} needs a unit: {words[0]} may be m, cm or mm; write "
+            f"{' or '.join('+/-'.join(_with_units(words, each)) for each in ('cm', 'm'))}"
+        )
+    if _unit_of(words[0]) not in ("", unit) and not _unit_of(words[1]):
+        raise ConfigError(
+            f"{name}: the standard deviation {words[1]} needs a unit: write "
+            f"{words[1]}{_unit_of(words[0])} or {words[1]}{unit}"
+        )
+    return known, known_sigma
+
+
+def _unit_of(word: str) -> str:
+    """Return the unit at the end of a quantity; empty if it has none."""
+    match = _QUANTITY.fullmatch(word)
+    return (match[2] or "") if match else ""
+
+
+def _with_units(words: Iterable[str], unit: str) -> list[str]:
+    """Return quantities with a unit in those that have none."""
+    return [word if _unit_of(word) else f"{word}{unit}" for word in words]
+
+
+def prior_as_typed(axis: str, value: str, sigma: str) -> str:
+    """Return the text of ``prior.AXIS`` for what somebody typed beside the units m and deg.
+
+    A length of more than 5 m gets no unit: the option asks for it.
+    """
+    words = [word.strip().replace(",", ".") for word in (value, sigma)]
+    if AXIS_UNITS[axis] == "rad":
+        return "+/-".join(_with_units(words, "deg"))
+    value_without_unit = _QUANTITY.fullmatch(words[0]) and not _unit_of(words[0])
+    is_short = not value_without_unit or abs(float(words[0])) <= _LONGEST_WITHOUT_UNIT_M
+    return "+/-".join(_with_units(words, "m") if is_short else words)
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:

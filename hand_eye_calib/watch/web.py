@@ -25,7 +25,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from hand_eye_calib.errors import ConfigError, printable
 from hand_eye_calib.live.state import REPORT_PERIOD_S
-from hand_eye_calib.text import AXIS_UNITS, capital
+from hand_eye_calib.text import AXIS_UNITS, capital, prior_as_typed
 from hand_eye_calib.watch.board import Bar, Board, Line, Tone, View
 
 # Requests of the page, beside those about an axis measured by hand.
@@ -169,10 +169,8 @@ class _Handler(BaseHTTPRequestHandler):
         elif request in BUTTONS:
             self.server.ask(request)
         elif request == "prior" and axis in AXIS_UNITS:  # the node refuses what is no number
-            unit = "m" if AXIS_UNITS[axis] == "m" else "deg"
-            given = [self._given(each).strip() for each in ("value", "sigma")]
-            value, sigma = (each.replace(",", ".") for each in given)
-            self.server.ask(printable(f"prior.{axis}:={value}{unit}+/-{sigma}{unit}"))
+            prior = prior_as_typed(axis, self._given("value"), self._given("sigma"))
+            self.server.ask(printable(f"prior.{axis}:={prior}"))
         else:
             status, text = HTTPStatus.NOT_FOUND, "there is no such request"
         self._send(status, text)

@@ -24,6 +24,7 @@ from hand_eye_calib.io.results import load_result
 from hand_eye_calib.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.text import prior_as_typed
 
 DNL = Method("dnl")
 
@@ -298,6 +299,10 @@ class TestOption:
             ("prior.x", "-.5±1e-2", {"x": (-0.5, 0.01)}),
             ("prior.yaw", "-90deg+/-2deg", {"yaw": (-np.pi / 2, np.radians(2))}),
             ("prior.roll", "0.1+/-0.05", {"roll": (0.1, 0.05)}),
+            ("prior.z", "8m+/-0.02", {"z": (8.0, 0.02)}),
+            ("prior.z", "800cm+/-2cm", {"z": (8.0, 0.02)}),
+            ("prior.x", "-22cm+/-20mm", {"x": (-0.22, 0.02)}),
+            ("prior.y", "4.9+/-0.1", {"y": (4.9, 0.1)}),
             ("prior.y", "", {}),
         ],
     )
@@ -318,6 +323,12 @@ class TestOption:
             ("prior_x", "1e999+/-1", r"at most 1e\+06 m; got '1e999'"),
             ("prior_x", "1+/-1e200", r"at most 1e\+06 m; got '1e200'"),
             ("prior_yaw", "1+/-1e999", r"at most 1e\+06 rad; got '1e999'"),
+            ("prior_z", "-22+/-2", r"write -22cm\+/-2cm or -22m\+/-2m"),
+            ("prior_x", "5.1+/-0.02", r"write 5.1cm\+/-0.02cm or 5.1m\+/-0.02m"),
+            ("prior_y", "220.0+/-20.0", "may be m, cm or mm"),
+            ("prior_z", "8+/-2cm", r"write 8cm\+/-2cm or 8m\+/-2cm"),
+            ("prior_z", "-22cm+/-2", "standard deviation 2 needs a unit: write 2cm or 2m"),
+            ("prior_yaw", "-90deg+/-2", "standard deviation 2 needs a unit: write 2deg or 2rad"),
         ],
     )
     def test_what_does_not_say_enough_is_refused(self, name, text, message):
@@ -371,7 +382,7 @@ class TestFullMotion:
 
     @pytest.mark.parametrize(
         ("axis", "prior"),
-        [("x", (-0.6, 0.001)), ("x", (100.0, 1e-9)), ("z", (15.0, 0.05)), ("yaw", (0.2, 0.01))],
+        [("x", (-0.6, 0.001)), ("x", "100m+/-1e-9m"), ("z", "15m+/-0.05m"), ("yaw", (0.2, 0.01))],
     )
     def test_a_contradiction_is_refused_and_the_prior_left_out(self, wandering, axis, prior):
         streams, plain = wandering
@@ -385,12 +396,43 @@ class TestFullMotion:
         np.testing.assert_array_equal(result.covariance_measured, plain.covariance_measured)
 
 
+@pytest.mark.parametrize("road", ["Python", "command", "YAML", "page"])
+def test_centimetres_that_were_typed_without_a_unit_are_asked_about(road, tmp_path, capsys):
+    paths = motions.write_pair(tmp_path, *flat_drive())
+    expected = "prior.z needs a unit: -22"
+    if road == "Python":
+        with pytest.raises(ConfigError, match=expected):
+            calibrate(*flat_drive(), prior={"z": (-22.0, 2.0)})
+        return
+    if road == "page":
+        with pytest.raises(ConfigError, match=expected):
+            CalibratorConfig(prior_z=prior_as_typed("z", "-22", "2"))
+        assert prior_as_typed("z", "-22 ", "2cm") == "-22+/-2cm"
+        assert prior_as_typed("z", "-0,22", "0.02") == "-0.22m+/-0.02m"
+        assert prior_as_typed("z", "8m", "0.02") == "8m+/-0.02m"
+        assert prior_as_typed("yaw", "-90", "2") == "-90deg+/-2deg"
+        return
+    options = ["--prior", "z=-22+/-2"]
+    if road == "YAML":
+        file = tmp_path / "options.yaml"
+        file.write_text("prior.z: -22+/-2\n", encoding="utf-8")
+        options = ["--config", str(file)]
+    try:
+        status = main(["calibrate", *paths, *options, "--out", str(tmp_path / "out")])
+    except SystemExit as usage:
+        status = usage.code
+    assert status == 2
+    error = capsys.readouterr().err
+    assert "needs a unit: -22 may be m, cm or mm; write -22cm+/-2cm or -22m+/-2m" in error
+    assert not (tmp_path / "out").exists()
+
+
 def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
     # A boom of 15 m is longer than "unknown" assumes, and the motion says nothing about it.
-    long = calibrate(*flat_drive(), reference="B10", prior={"z": (15.0, 0.05)})
+    long = calibrate(*flat_drive(), reference="B10", prior={"z": "15m+/-0.05m"})
     assert long.status is SolveStatus.OK
     assert long.T_parent_child[2, 3] == pytest.approx(15.0, abs=0.05)
-    in_millimetres = calibrate(*flat_drive(), reference="B10", prior={"z": (1850.0, 20.0)})
+    in_millimetres = calibrate(*flat_drive(), reference="B10", prior={"z": "1850m+/-20m"})
     assert in_millimetres.status is SolveStatus.CONTRADICTED
     assert in_millimetres.unobservable() == ["z"]
 
@@ -399,7 +441,7 @@ def test_the_command_refuses_a_contradiction(tmp_path, capsys):
     paths = motions.write_pair(tmp_path, *flat_drive())
     frames = ["--parent-frame", "lidar", "--child-frame", "camera"]
     command = ["calibrate", *paths, *frames, "--reference", "B10", "--out", str(tmp_path / "out")]
-    assert main([*command, "--prior", "x=100+/-1e-9"]) == 1
+    assert main([*command, "--prior", "x=100m+/-1e-9m"]) == 1
     captured = capsys.readouterr()
     assert "the prior on x is " in captured.err
     assert captured.out.startswith("DO NOT USE: the prior on x is ")

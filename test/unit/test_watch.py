@@ -521,6 +521,11 @@ def test_an_axis_measured_by_hand_becomes_a_parameter(server):
     good = fetch(server, "POST", "/prior?key=word&axis=z&value=1,85&sigma=0.02")
     assert good.status == 200
     assert server.requests.get(timeout=PATIENCE_S) == "prior.z:=1.85m+/-0.02m"
+    # The page asks in metres: the node refuses 22 without a unit, and takes one that was typed.
+    fetch(server, "POST", "/prior?key=word&axis=z&value=-22&sigma=2")
+    assert server.requests.get(timeout=PATIENCE_S) == "prior.z:=-22+/-2"
+    fetch(server, "POST", "/prior?key=word&axis=z&value=-22cm&sigma=2cm")
+    assert server.requests.get(timeout=PATIENCE_S) == "prior.z:=-22cm+/-2cm"
     fetch(server, "POST", "/prior?key=word&axis=yaw&value=-90&sigma=2")
     assert server.requests.get(timeout=PATIENCE_S) == "prior.yaw:=-90deg+/-2deg"
     assert fetch(server, "POST", "/prior?key=word&axis=q&value=1&sigma=1").status == 404
