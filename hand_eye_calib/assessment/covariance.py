@@ -263,8 +263,22 @@ def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
     rows = [index for index, axis in enumerate(AXES) if axis in known]
     if not rows:
         return assessment
+    rotation = assessment.T_parent_child[:3, :3]
+    return _without(assessment, np.asarray(np.kron(np.eye(2), rotation)[rows].T, dtype=float))
+
+
+def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
+    """Return an assessment in which a lever arm along an axis (3,) of the parent is unknown."""
+    # A direction that is unknown already is the same one: both would hide a second one.
+    if any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]):
+        return assessment
+    in_child = assessment.T_parent_child[:3, :3].T @ axis
+    return _without(assessment, np.r_[in_child, np.zeros(3)][:, None])
+
+
+def _without(assessment: Assessment, unknown: FloatArray) -> Assessment:
+    """Return an assessment in which directions (6, U) of the child are unknown, too."""
     T = assessment.T_parent_child
-    unknown = np.asarray(np.kron(np.eye(2), T[:3, :3])[rows].T, dtype=float)
     found = combined(T, assessment.cov_parent_child_in_child, None, unknown)
     observability = tuple(
         before if before.verdict is DofVerdict.UNOBSERVABLE else after

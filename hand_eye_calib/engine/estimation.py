@@ -17,10 +17,11 @@ import numpy as np
 
 from hand_eye_calib.alignment.similarity import SimilarityFit, settle_scale
 from hand_eye_calib.alignment.time_offset import TimeOffset
-from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.assessment import covariance
 from hand_eye_calib.assessment.moved import possible_shift
 from hand_eye_calib.assessment.prior import fuse, widened
+from hand_eye_calib.assessment.rocking import rocking_axis
 from hand_eye_calib.config import METHODS, CalibratorConfig, require_backend
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.geometry.se3 import deviation
@@ -217,9 +218,14 @@ def solve_poses(
         by_offset = time_offset.fit.sensitivity[:, 1]
         spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
     spread += solved.spread
+    if spread.any():
+        assessment = widened(assessment, spread)
+    axis = None if is_beside else rocking_axis(pose_pairs)
+    if axis is not None:
+        assessment = covariance.without_direction(assessment, axis)
     return replace(
         solved,
-        assessment=widened(assessment, spread) if spread.any() else assessment,
+        assessment=assessment,
         config=config,
         scale=scale,
         scale_fit=scale_fit,
@@ -363,20 +369,35 @@ _ROUNDING = 1e-9
 
 
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
-    """The result of a solve, compared with what DNLO gives at a few references and from each half:
-    part of every solve. An axis that none of the references reveals is unobservable. Options and
-    poses are those that gave it: on one clock, each stream in its own unit of length.
+    """Compare the result of a solve with DNLO at a few references and from each half.
+
+    Part of every solve. Options and poses are those that gave the result: on one clock, each stream
+    in its own unit of length. An axis that no reference determines is weak; a prior on such an axis
+    is taken instead of the motion.
     """
     result = solved.calibration()
     others, halves = other_answers(result, config, pose_pairs)
-    robust = _sound(others)
-    # One of a reference was solved where the motion shows most, which others need not see.
-    if len(robust) >= _MIN_OTHERS and not METHODS[result.method].uses_reference:
-        of_others = np.array([other.sigmas_measured for other in robust])
-        unseen = np.isfinite(result.sigmas) & np.isinf(of_others).all(axis=0)
-        if unseen.any():
-            result = solved.calibration(np.array(AXES)[unseen].tolist())
+    unconfirmed = np.array(AXES)[_unconfirmed(result, _sound(others))].tolist()
+    replaced = [axis for axis in unconfirmed if axis in config.prior()]
+    if replaced:
+        result = solved.calibration(replaced)
+    observability = tuple(
+        replace(dof, verdict=DofVerdict.WEAK)
+        if dof.name in unconfirmed and dof.verdict is DofVerdict.OBSERVED
+        else dof
+        for dof in result.observability_measured
+    )
+    result = replace(result, observability_measured=observability)
     return replace(result, cross_check=compare_answers(result, others, halves))
+
+
+def _unconfirmed(result: Calibration, sound: Sequence[Calibration]) -> BoolArray:
+    """Whether (6,) an axis of the result is determined by none of the other answers."""
+    # An answer of a reference was solved where the motion shows most, which others need not see.
+    if len(sound) < _MIN_OTHERS or METHODS[result.method].uses_reference:
+        return np.zeros(len(AXES), dtype=bool)
+    of_others = np.array([other.sigmas_measured for other in sound])
+    return np.isfinite(result.sigmas_measured) & np.isinf(of_others).all(axis=0)
 
 
 def other_answers(
@@ -449,9 +470,10 @@ def compare_answers(
     }
     table = np.where(np.isfinite(sigmas), [*columns.values()], np.nan).T.tolist()
     rows = [[each if math.isfinite(each) else None for each in row] for row in table]
+    confirmed = (~_unconfirmed(calibration, sound)).tolist()
     return {
-        axis: AxisScatter(**dict(zip(columns, row, strict=True)))
-        for axis, row in zip(AXES, rows, strict=True)
+        axis: AxisScatter(**dict(zip(columns, row, strict=True)), is_confirmed=is_confirmed)
+        for axis, row, is_confirmed in zip(AXES, rows, confirmed, strict=True)
     }
 
 

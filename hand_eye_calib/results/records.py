@@ -272,6 +272,8 @@ class AxisScatter:
     excess_over_own : float or None
         Distance of other methods and references in the result's own standard deviations, over those
         that are not much less certain.
+    is_confirmed : bool
+        False if the result determines the axis and no other method or reference does.
     """
 
     sigma: float | None
@@ -280,6 +282,7 @@ class AxisScatter:
     excess_of_methods: float | None = None
     excess_of_halves: float | None = None
     excess_over_own: float | None = None
+    is_confirmed: bool = True
 
 
 #: Axis (x, y, z, roll, pitch, yaw) to the scatter of other answers about a result.

@@ -12,7 +12,14 @@ from functools import cached_property, partial
 from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.config import METHODS
-from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS, Severity, SolveStatus
+from hand_eye_calib.results.records import (
+    ROTATIONS,
+    TRANSLATIONS,
+    AxisScatter,
+    DofVerdict,
+    Severity,
+    SolveStatus,
+)
 from hand_eye_calib.results.result import Result
 from hand_eye_calib.text import amount, axes_in_words, listing
 
@@ -99,7 +106,8 @@ FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
 
 # Rules that state a limit of the recording; the others are signs that something is wrong.
 _KINDS = dict.fromkeys(
-    ("nothing_known", "unobservable", "target", "floor", "part_of_poses"), "physics"
+    ("nothing_known", "unobservable", "unconfirmed", "target", "floor", "part_of_poses"),
+    "physics",
 )
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
@@ -226,13 +234,9 @@ def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
     told, sigmas = {}, []
     for axis in _axes(result):
         row = (result.cross_check or {}).get(axis.name)
-        scatter, excess = (getattr(row, f"{what}of_{kind}", None) for what in ("", "excess_"))
-        if row is None or scatter is None or not math.isfinite(axis.sigma):
+        if row is None or not math.isfinite(axis.sigma):
             continue
-        of_target = scatter / axis.target
-        is_far = (excess or 0.0) > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
-        if kind == "methods" and (row.excess_over_own or 0.0) > CONTRADICTED_SIGMAS:
-            is_far |= of_target > CONTRADICTED_TARGETS
+        scatter, is_far = _scatter_of(kind, row, axis)
         if is_far:
             told[axis.name] = f"about {axes_in_words([axis.name])} by {amount(axis.name, scatter)}"
             sigmas.append(f"+/- {amount(axis.name, axis.total)}")
@@ -240,6 +244,37 @@ def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
         who, advice = _OTHERS[kind]
         differ = f"{who} disagree {listing([*told.values()])}"
         yield f"{differ}; this result claims {listing(sigmas)}", advice, tuple(told), {}
+
+
+def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
+    """Scatter of other answers (``kind``: halves or methods) on an axis, and if it is too large."""
+    if kind == "halves":
+        scatter, excess, over_own = row.of_halves, row.excess_of_halves, None
+    else:
+        scatter, excess, over_own = row.of_methods, row.excess_of_methods, row.excess_over_own
+    if scatter is None and over_own is not None:
+        # Too few answers determine the axis for a scatter, but those that do are about as certain.
+        scatter = over_own * axis.total
+    if scatter is None:
+        return 0.0, False
+    of_target = scatter / axis.target
+    is_far = (excess or 0.0) > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
+    if (over_own or 0.0) > CONTRADICTED_SIGMAS:
+        is_far |= of_target > CONTRADICTED_TARGETS
+    return scatter, is_far
+
+
+def _unconfirmed(result: Result) -> Iterator[_Found]:
+    rows = result.cross_check or {}
+    axes = [
+        (axis.name, axis.total)
+        for axis in _axes(result)
+        if axis.name in rows and not rows[axis.name].is_confirmed and not axis.is_known_by_hand
+    ]
+    if axes:
+        names = tuple(name for name, _ in axes)
+        text = f"only the noise model determines {_amounts(axes, ' to ')}; no other method does"
+        yield text, f"compare {axes_in_words(names)} with a drawing or a tape measure", names, {}
 
 
 def _hidden(result: Result) -> Iterator[_Found]:
@@ -342,12 +377,20 @@ class _Axis(NamedTuple):
     total: float
     target: float
     is_hidden: bool
+    is_known_by_hand: bool
 
 
 def _axes(result: Result) -> list[_Axis]:
     hidden, totals = result.unobservable(), result.sigmas.tolist()
     return [
-        _Axis(dof.name, dof.sigma, total, target_of(dof.name, result), dof.name in hidden)
+        _Axis(
+            name=dof.name,
+            sigma=dof.sigma,
+            total=total,
+            target=target_of(dof.name, result),
+            is_hidden=dof.name in hidden,
+            is_known_by_hand=dof.verdict is DofVerdict.PRIOR,
+        )
         for dof, total in zip(result.observability_measured, totals, strict=True)
         if dof.name not in result.out_of_reach
     ]
@@ -407,6 +450,12 @@ RULES = (
         f"other methods and references {_APART}; or those about as certain by "
         f"{CONTRADICTED_SIGMAS:g} of the result's own and {CONTRADICTED_TARGETS:g} targets",
         partial(_contradiction, "methods"),
+    ),
+    Rule(
+        "unconfirmed",
+        _CARE,
+        "the noise model determines an axis that no other method or reference determines",
+        _unconfirmed,
     ),
     Rule(
         "outliers",

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
+from result_making import good_calibration
 
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
@@ -16,7 +17,9 @@ from hand_eye_calib.results.calibration import (
     DofObservability,
     DofVerdict,
     SolveStatus,
+    Verdict,
 )
+from hand_eye_calib.results.records import AXES, AxisScatter
 
 KINDS = ("methods", "halves", "model")
 
@@ -103,16 +106,74 @@ def gentle_ramps(degrees):
     return as_trajectory(disturbed(parent, 21, *noise)), as_trajectory(disturbed(child, 11, *noise))
 
 
-def test_an_axis_that_no_other_reference_reveals_is_unobservable():
-    hidden, shown = (calibrate(*gentle_ramps(degrees)) for degrees in (1.5, 4.0))
-    assert (hidden.method, shown.method) == ("adaptive", "adaptive")
-    assert (hidden.unobservable(), shown.unobservable()) == (["z"], [])
-    assert hidden.status is SolveStatus.UNOBSERVABLE
-    assert hidden.T_parent_child[2, 3] == pytest.approx(0.0, abs=1e-6)
-    assert hidden.T_method[2, 3] == pytest.approx(0.3, abs=0.1)
-    assert {*vars(hidden.cross_check["z"]).values()} == {None}
+def test_an_axis_that_no_other_reference_reveals_is_weak_and_used_with_care():
+    alone, shown = (calibrate(*gentle_ramps(degrees)) for degrees in (1.5, 4.0))
+    assert (alone.method, shown.method) == ("adaptive", "adaptive")
+    assert (alone.unobservable(), shown.unobservable()) == ([], [])
+    assert alone.status is SolveStatus.OK
+    assert alone.observability[2].verdict is DofVerdict.WEAK
+    assert abs(alone.T_parent_child[2, 3] - 0.3) < 2.0 * alone.sigmas[2]
+    assert alone.sigmas[2] < 0.1
+    assert not alone.cross_check["z"].is_confirmed
+    assert alone.verdict is Verdict.USE_WITH_CARE
+    (reason,) = [reason for reason in alone.reasons if reason.rule == "unconfirmed"]
+    assert reason.axes == ("z",)
+    assert reason.sentence.startswith("only the noise model determines z to ")
     assert shown.T_parent_child[2, 3] == pytest.approx(0.3, abs=0.03)
-    np.testing.assert_allclose(hidden.T_parent_child[:2, 3], [0.6, -0.3], atol=0.02)
+    assert all(row.is_confirmed for row in shown.cross_check.values())
+    np.testing.assert_allclose(alone.T_parent_child[:2, 3], [0.6, -0.3], atol=0.02)
+
+
+def scattered(axis="z", **columns):
+    """A good result whose cross-check has these values for an axis, and nothing for the others."""
+    nothing = AxisScatter(sigma=0.003, of_methods=None, of_halves=None)
+    rows = dict.fromkeys(AXES, nothing) | {axis: dataclasses.replace(nothing, **columns)}
+    return good_calibration(cross_check=rows)
+
+
+@pytest.mark.parametrize(("excess_over_own", "rules"), [(18.0, ["methods"]), (2.5, []), (None, [])])
+def test_two_answers_that_contradict_count_without_a_scatter_of_three(excess_over_own, rules):
+    result = scattered(excess_over_own=excess_over_own)
+    assert [reason.rule for reason in result.reasons] == rules
+    if rules:
+        (reason,) = result.reasons
+        assert reason.sentence == (
+            "other methods and references disagree about z by 5.4 cm; this result claims +/- 3 mm"
+        )
+
+
+def on_springs(seed, degrees_per_m_s2):
+    """Streams of a car on a flat road, whose body rolls and pitches with its acceleration."""
+    random = np.random.default_rng(seed)
+    t = 0.1 * np.arange(900)
+    phases = random.uniform(0.0, 6.0, 3)
+    speed = 6.0 + 1.5 * np.sin(0.5 * t + phases[0]) + np.sin(1.3 * t + phases[1])
+    turning = 0.35 * np.sin(0.21 * t + phases[2])
+    heading = np.cumsum(0.1 * turning)
+    forward = np.gradient(speed, 0.1)
+    slope = np.radians(degrees_per_m_s2)
+    angles = np.c_[slope * speed * turning, -slope * forward, heading]
+    velocity = speed[:, None] * np.c_[np.cos(heading), np.sin(heading), 0.0 * t]
+    position = np.cumsum(0.1 * velocity, axis=0)
+    parent = se3.from_rotation_translation(se3.rotation_from_rpy(angles), position)
+    mount = se3.from_rotation_translation(se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3])
+    noise = 0.003, 0.0002
+    pair = disturbed(parent, seed, *noise), disturbed(child_of(parent, mount), seed + 50, *noise)
+    return [as_trajectory(each) for each in pair]
+
+
+@pytest.mark.parametrize("method", ["auto", "dnlo"])
+def test_a_body_that_rocks_on_its_springs_reveals_no_height(method):
+    for seed in (3, 4):
+        rocking = calibrate(*on_springs(seed, 0.2), method=method)
+        assert "z" in rocking.unobservable()
+        assert np.isinf(rocking.sigmas[2])
+        np.testing.assert_allclose(rocking.T_parent_child[:2, 3], [0.6, -0.3], atol=0.05)
+
+
+def test_ramps_reveal_the_height_of_a_body_on_springs():
+    parent, child = gentle_ramps(4.0)
+    assert calibrate(parent, child).unobservable() == []
 
 
 def test_a_prior_holds_for_an_axis_that_no_other_reference_reveals():

@@ -71,6 +71,10 @@ CASES = {
     "recordings": dict(together=several("one off")),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
+    "unconfirmed": dict(
+        cross_check=dict.fromkeys(NAMES, AxisScatter(sigma=0.003, of_methods=None, of_halves=None))
+        | {"z": AxisScatter(sigma=0.01, of_methods=None, of_halves=None, is_confirmed=False)}
+    ),
     "outliers": dict(n_pairs=100, n_inliers=65),
     "target": dict(observability_measured=observed(x=0.04, yaw=0.02)),
     "floor": dict(T_parent_child=np.eye(4), covariance_allowance=FLOOR),
