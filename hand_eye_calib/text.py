@@ -39,6 +39,20 @@ def amount(axis: str, value: float) -> str:
     return length(value) if axis in ("x", "y", "z") else angle(value)
 
 
+def amount_beside(axis: str, value: float, other: float) -> str:
+    """Return an amount with as many digits as it takes to differ from another of the axis."""
+    text = amount(axis, value)
+    if text != amount(axis, other) or value == other or not math.isfinite(value):
+        return text
+    unit = text.rpartition(" ")[2]
+    factors = {name: factor for _, name, factor in _LENGTHS} | {"deg": math.degrees(1.0)}
+    for decimals in range(_MOST_DECIMALS):
+        texts = [f"{factors[unit] * size:.{decimals}f}" for size in (value, other)]
+        if float(texts[0]) != float(texts[1]):
+            return f"{texts[0]} {unit}"
+    return text
+
+
 def change(axis: str, value: float, sigma: float) -> str:
     """A difference along or about an axis (m, rad) with its sign and standard deviation."""
     unit, factor = ("deg", math.degrees(1.0)) if axis in _ABOUT else ("cm", 100.0)

@@ -97,12 +97,20 @@ class Assessment:
     contradictions : mapping
         Axis name to the number of standard deviations between prior and motion, for the axes on
         which they contradict each other. The prior on these was left out.
+    from_motion : (6, 6) array
+        Share of an error of the estimate from motion that is left in the answer, by xi: the
+        identity without a prior, zero along what a prior alone determines.
     """
 
     T_parent_child: FloatArray
     cov_parent_child_in_child: FloatArray
     observability: tuple[DofObservability, ...]
     contradictions: Mapping[str, float] = field(default_factory=dict)
+    from_motion: FloatArray = field(default_factory=lambda: np.eye(6))
+
+    def allowance(self, of_motion: FloatArray) -> FloatArray:
+        """Return the allowance (6, 6) of the answer from that of the estimate from motion."""
+        return self.from_motion @ of_motion @ self.from_motion.T
 
 
 def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) -> Assessment:

@@ -88,7 +88,8 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
         # An axis is mostly from the prior if that at least halves its variance.
         if is_known and axis in prior and 2 * sigma**2 < before[k] ** 2:
             verdicts[k] = DofObservability(axis, DofVerdict.PRIOR, sigma)
-    return Assessment(T, posterior, tuple(verdicts), contradictions)
+    from_motion = root @ np.linalg.inv(normal) @ inverse_root
+    return Assessment(T, posterior, tuple(verdicts), contradictions, from_motion)
 
 
 def widened(assessment: Assessment, spread: FloatArray) -> Assessment:

@@ -39,7 +39,7 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
-from hand_eye_calib.text import axes_in_words
+from hand_eye_calib.text import axes_in_words, with_sigma
 
 # Of the interval of slow streams: accuracy of the coarse offset between them, and the gap that they
 # are interpolated across if their clocks differ by more.
@@ -353,6 +353,31 @@ def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
     values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
     values["direction"] = "behind" if offset_s > 0 else "ahead of"
     return values | {"total_s": round(known_s + offset_s, 4)}
+
+
+def check_model_scale(scale: float, sigma: float) -> list[Finding]:
+    """Return a finding about a scale that nobody asked for and the noise model estimated.
+
+    Parameters
+    ----------
+    scale, sigma : float
+        Factor of the child's lengths, and its standard deviation; 0 if it was not estimated.
+    """
+    if sigma <= 0.0:
+        return []
+    longer = 1.0 / scale - 1.0
+    of_longer = sigma / scale**2
+    found = graded(
+        "model_scale",
+        "child",
+        longer,
+        of_longer,
+        scale=scale,
+        sigma=sigma,
+        size=with_sigma(100.0 * abs(longer), 100.0 * of_longer, 1),
+        than="longer" if longer > 0.0 else "shorter",
+    )
+    return [found] if found else []
 
 
 def in_other_units(

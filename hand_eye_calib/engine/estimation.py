@@ -117,7 +117,7 @@ class Solved:
             warnings,
             measured=self.measured,
             T_method=found.T_parent_child,
-            covariance_allowance=self.floor,
+            covariance_allowance=fused.allowance(self.floor),
             proved_global=self.proved_global,
             method=self.method,
             method_reason=self.method_reason,

@@ -88,6 +88,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
     offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
+    allowance = 2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     return estimation.calibration_of(
         solution,
         fused,
@@ -98,7 +99,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         measured="positions",
         noise=solution.describe(stamps_ns),
         T_method=T,
-        covariance_allowance=2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+        covariance_allowance=fused.allowance(allowance),
         time_offset_s=offset_s,
         time_offset_sigma_s=solution.time_offset_sigma_s,
         scale=given * scale,

@@ -433,6 +433,8 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> checkin
     ):
         obsolete.add("one_axis")  # the result has shown otherwise
     findings = [found for found in result.findings if found.code not in obsolete]
+    if calibration and snapshot.config.scale == "none":
+        findings += checking.check_model_scale(calibration.scale, calibration.scale_sigma)
     findings = answered(findings, snapshot.config)
     if _INVERSIONS & snapshot.config.given:
         # Whether both streams are inverse is the user's word.

@@ -17,11 +17,12 @@ from hand_eye_calib.results.records import (
     TRANSLATIONS,
     AxisScatter,
     DofVerdict,
+    Finding,
     Severity,
     SolveStatus,
 )
 from hand_eye_calib.results.result import Result
-from hand_eye_calib.text import amount, axes_in_words, listing
+from hand_eye_calib.text import amount, amount_beside, axes_in_words, listing
 
 
 class Verdict(str, Enum):
@@ -147,19 +148,27 @@ class Judged(Result):
     def headline(self) -> str:
         """The verdict with its gravest reason, or with what is known, in one line."""
         decided, gravest = self.verdict.value, shown(self.reasons)
+        notable = "".join(f"; {finding.what}" for finding in self.findings if _is_notable(finding))
         if not gravest:
-            return f"{decided}: {what_is_known(self)}"
+            return f"{decided}: {what_is_known(self)}{notable}"
         if gravest[0].rule == "unobservable":
             hidden = listing(gravest[0].axes)
             it = hidden if len(gravest[0].axes) == 1 else "them"
             also = "".join(f"; {each.sentence}" for each in gravest[1:2])
-            return f"{decided}: all but {hidden}; measure {it} by hand{also}"
+            return f"{decided}: all but {hidden}; measure {it} by hand{also}{notable}"
         if [reason.rule for reason in gravest] == ["part_of_poses"]:
-            return f"{decided}: {what_is_known(self)}; {gravest[0].sentence}"
+            return f"{decided}: {what_is_known(self)}; {gravest[0].sentence}{notable}"
         note = "" if any(reason.kind == "suspicion" for reason in self.reasons) else _NO_FAULT
         more = len(gravest) - 1
         rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
-        return f"{decided}: {gravest[0].sentence}{rest}{note}"
+        if self.verdict is Verdict.DO_NOT_USE:
+            notable = ""
+        return f"{decided}: {gravest[0].sentence}{rest}{note}{notable}"
+
+
+def _is_notable(finding: Finding) -> bool:
+    """Whether a headline names a finding that is no reason: it changes what the numbers mean."""
+    return finding.code == "model_scale" and finding.severity is Severity.NOTE
 
 
 def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
@@ -309,7 +318,13 @@ def _worse_than_target(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
     if rough:
         names = tuple(axis.name for axis in rough)
-        told = _amounts((axis.name, axis.total) for axis in rough)
+        sizes = [amount_beside(axis.name, axis.total, axis.target) for axis in rough]
+        told = listing(
+            [
+                f"{axes_in_words([axis.name])} {size}"
+                for axis, size in zip(rough, sizes, strict=True)
+            ]
+        )
         targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
         more = "more rotation about other axes" if {*names} & {*TRANSLATIONS} else "more rotation"
         text = f"standard deviations above the target of {targets}: {told}"
@@ -325,11 +340,19 @@ def _floor(result: Result) -> Iterator[_Found]:
     rough = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
     if rough:
         names = tuple(axis.name for axis in rough)
-        told = _amounts(((each.name, each.total) for each in rough), " to ")
-        targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
+        sizes = [amount_beside(axis.name, axis.total, axis.target) for axis in rough]
+        others = [
+            f"{axes_in_words([axis.name])} to {size}"
+            for axis, size in zip(rough[1:], sizes[1:], strict=True)
+        ]
+        good_to = listing([f"{axes_in_words(names[:1])} is good to {sizes[0]}", *others])
+        targets = [*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)]
+        target_is = "the target is" if len(targets) == 1 else "the targets are"
+        share = "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in rough) else "Part"
+        kind = "" if result.measured == "positions" else "odometry "
         text = (
-            "constant odometry errors, which no recording can show, limit the knowledge of "
-            f"{told}: more than the target of {targets}"
+            f"{good_to}; {target_is} {listing(targets)}. "
+            f"{share} of it is an allowance for constant {kind}errors"
         )
         yield text, _OF_FLOOR, names, {}
 

@@ -79,6 +79,18 @@ class TestRoadVehicle:
         assert max(verdicts["x"].sigma, verdicts["y"].sigma) < 0.05
         np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
 
+    @pytest.mark.parametrize("method", ["auto", "dnlo"])
+    def test_a_flat_drive_on_springs_gives_no_height(self, method):
+        """DNLO at B1 had 1.34 +/- 0.19 m, the noise model 1.23 +/- 0.16 m."""
+        folder = real_data.data_folder() / "zxl19" / "raw_bag1"
+        names = "bag1-novatel_data-inspvax.csv", "bag1-aft_mapped_to_init.csv"
+        files = [(folder / name, FileOptions(format=AUTO)) for name in names]
+        streams = [reading.trajectory for reading in read_trajectory_files(files)]
+        result = calibrate(*streams, time_offset="estimate", method=method)
+        assert result.unobservable() == ["z"]
+        assert result.T_parent_child[2, 3] == pytest.approx(0.0, abs=0.03)
+        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.40, -0.02), atol=0.05)
+
     @pytest.mark.parametrize(("bag", "scale"), [(1, 3.34), (3, 2.66)])
     def test_monocular_scale(self, bag, scale):
         recording = real_data.zxl19(bag, "VO")

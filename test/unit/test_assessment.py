@@ -337,6 +337,22 @@ class TestOption:
 
 
 class TestFlatGround:
+    def test_a_prior_alone_has_no_allowance_and_can_be_used(self):
+        sigmas_m = {}
+        for sigma_m in (0.02, 0.005):
+            result = calibrate(*flat_drive(), prior={"z": (1.85, sigma_m)}, checks=False)
+            sigmas_m[sigma_m] = result.sigmas[2]
+            assert result.observability[2].verdict is DofVerdict.PRIOR
+            assert result.allowance[2] < 0.0005
+            assert result.allowance[:2].min() > 0.005
+        assert sigmas_m == pytest.approx({0.02: 0.02, 0.005: 0.005}, rel=0.02)
+        assert sigmas_m[0.02] <= 0.02
+
+    def test_a_prior_beside_a_better_estimate_keeps_the_allowance_of_that(self, wandering):
+        streams, plain = wandering
+        vague = calibrate(*streams, reference="B10", prior={"z": (0.0, 100.0)}, checks=False)
+        np.testing.assert_allclose(vague.allowance, plain.allowance, rtol=1e-3)
+
     def test_prior_fills_in_what_is_unknown(self):
         result = calibrate(*flat_drive(), reference="B10", prior={"z": (1.85, 0.02)})
         assert result.status is SolveStatus.OK

@@ -17,6 +17,7 @@ from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.results.calibration import Verdict
+from hand_eye_calib.results.records import Severity
 from reproduction.coverage.classes import make
 
 
@@ -241,3 +242,41 @@ def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(kind, spa
     assert result.noise.misfit < 2.0
     assert code in [finding.code for finding in result.findings]
     assert result.verdict is Verdict.DO_NOT_USE
+
+
+@pytest.mark.parametrize(
+    ("factor", "severity", "words"),
+    [
+        (1.0, None, ""),
+        (1.006, None, ""),
+        (1.02, Severity.NOTE, "longer"),
+        (0.98, Severity.NOTE, "shorter"),
+        (1.06, Severity.WARNING, "longer"),
+        (0.9, Severity.WARNING, "shorter"),
+    ],
+)
+def test_a_scale_that_the_noise_model_finds_unasked_is_stated(factor, severity, words):
+    poses = wandering_poses(500)
+    parent = as_trajectory(disturbed(poses, 4, 0.002, 0.001))
+    child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(factor)
+    result = hec.calibrate(parent, child)
+    found = {each.code: each for each in result.findings}
+    if severity is None:
+        assert "model_scale" not in found
+        assert "lengths" not in result.headline
+        return
+    assert found["model_scale"].severity is severity
+    assert found["model_scale"].evidence["scale"] == pytest.approx(1.0 / factor, abs=0.002)
+    assert f"% {words} than the parent's" in result.headline
+    is_care = severity is Severity.WARNING
+    assert result.verdict is (Verdict.USE_WITH_CARE if is_care else Verdict.USE)
+
+
+@pytest.mark.parametrize("scale", ["auto", "estimate"])
+def test_a_scale_that_was_asked_for_is_no_finding(scale):
+    poses = wandering_poses(500)
+    parent = as_trajectory(disturbed(poses, 4, 0.002, 0.001))
+    child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(1.06)
+    result = hec.calibrate(parent, child, scale=scale)
+    assert result.scale == pytest.approx(1.0 / 1.06, abs=0.002)
+    assert "model_scale" not in {each.code for each in result.findings}

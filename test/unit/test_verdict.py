@@ -107,8 +107,8 @@ def test_each_rule_alone_decides(rule):
         ),
         (
             "floor",
-            "constant odometry errors, which no recording can show, limit the knowledge of x to "
-            "3 cm: more than the target of 2 cm",
+            "x is good to 3 cm; the target is 2 cm. Most of it is an allowance for constant "
+            "odometry errors",
         ),
     ],
 )
@@ -215,3 +215,52 @@ def test_a_file_keeps_what_the_verdict_comes_from():
 
 if __name__ == "__main__":
     PAGE.write_text(TABLE.sub(lambda _: table(), PAGE.read_text("utf-8")), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("sigma", "allowance", "begins"),
+    [
+        (0.004, 0.0199, "x is good to 2.03 cm; the target is 2 cm. Most of it is an allowance"),
+        (0.0199, 0.004, "x is good to 2.03 cm; the target is 2 cm. Part of it is an allowance"),
+        (0.0004, 0.0200001, "x is good to 2.0004 cm; the target is 2 cm. Most of it"),
+    ],
+)
+def test_a_size_above_its_target_has_the_digits_that_show_it(sigma, allowance, begins):
+    result = good(
+        T_parent_child=np.eye(4),
+        observability_measured=observed(x=sigma),
+        covariance_allowance=np.diag([allowance, 0, 0, 0, 0, 0]) ** 2,
+    )
+    (reason,) = result.reasons
+    assert reason.rule == "floor"
+    assert reason.sentence.startswith(begins)
+
+
+def test_a_measured_size_just_above_its_target_has_the_digits_that_show_it():
+    (reason,) = good(observability_measured=observed(x=0.02003)).reasons
+    assert reason.sentence == "standard deviations above the target of 2 cm: x 2.003 cm"
+
+
+def test_several_axes_and_targets_are_named_together():
+    allowance = np.diag([0.03, 0.04, 0, 0, 0, np.radians(0.4)]) ** 2
+    (reason,) = good(T_parent_child=np.eye(4), covariance_allowance=allowance).reasons
+    assert reason.sentence == (
+        "x is good to 3 cm, y to 4 cm and the rotation about z to 0.4 deg; the targets are 2 cm "
+        "and 0.3 deg. Most of it is an allowance for constant odometry errors"
+    )
+
+
+def scaled(severity):
+    text = (
+        "the child's lengths are 2.1 +/- 0.1 % longer than the parent's; the result allows for it"
+    )
+    return dataclasses.replace(FINDING, code="model_scale", severity=severity, what=text)
+
+
+def test_a_scale_that_the_model_found_is_in_the_headline_and_a_large_one_is_a_reason():
+    small, large = (good(findings=(scaled(each),)) for each in (Severity.NOTE, Severity.WARNING))
+    assert (small.verdict, small.reasons) == (Verdict.USE, ())
+    assert small.headline.endswith("; " + scaled(Severity.NOTE).what)
+    assert large.verdict is Verdict.USE_WITH_CARE
+    assert [reason.rule for reason in large.reasons] == ["warning_finding"]
+    assert large.headline.count("lengths") == 1
