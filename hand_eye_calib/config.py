@@ -270,14 +270,10 @@ class CalibratorConfig(OptionSet):
         parse=text.parse_targets,
     )
     parent_frame: str = option(
-        "",
-        "Name of the parent sensor's frame; empty takes it from the messages.",
-        read_only=True,
+        "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
     )
     child_frame: str = option(
-        "",
-        "Name of the child sensor's frame; empty takes it from the messages.",
-        read_only=True,
+        "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
     )
 
     def is_known(self, name: str) -> bool:

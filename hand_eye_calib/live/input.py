@@ -269,9 +269,11 @@ class PoseInput:
         for stamp_ns, read in judgement.taken:
             try:
                 pose = read()
-                check_not_null(*pose.position, *pose.quat_xyzw)
+                has_new_frame = pose.sensor_frame not in (None, self._sensor_frame)
+                if has_new_frame or pose.world_frame != self._world_frame:
+                    check_not_null(*pose.position, *pose.quat_xyzw)  # whose frames mean nothing
                 # An empty name is the one before, too: parameters or a default name it.
-                if pose.sensor_frame not in (None, self._sensor_frame):
+                if has_new_frame:
                     self._session.engines.set_frame(self.name, pose.sensor_frame)
                     self._sensor_frame = pose.sensor_frame
                 if pose.world_frame != self._world_frame:

@@ -11,6 +11,7 @@ from published_data import data_folder
 
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.bags.reader import PoseBag
 
 # Position (m) and roll, pitch, yaw (deg) of the child in the parent.
 TRUTH = ((0.42, -0.11, 0.25), (-88.0, 3.0, -92.0))
@@ -110,3 +111,16 @@ def test_header_stamps_of_0_are_said_and_receive_times_taken_if_asked(bag, capsy
     code, document, _ = calibrated(capsys, path, "--child-stamps", "receive")
     assert code == 0
     assert_near(document, matrix_of(TRUTH))
+
+
+def test_clocks_of_two_epochs_are_estimated(bag, capsys):
+    path = bag("boot_time")
+    code, document, _ = calibrated(capsys, path, "--time-offset", "estimate")
+    assert (code, document["verdict"]) == (0, "USE")
+    assert_near(document, matrix_of(TRUTH))
+    with PoseBag(path) as opened:
+        table = opened.poses("/lidar/odometry", "/camera/odometry")
+    first_ns = [table.stamps_ns[table.streams == stream][0] for stream in ("parent", "child")]
+    apart_s = (int(first_ns[0]) - int(first_ns[1])) * 1e-9
+    assert abs(document["time_offset_s"] - apart_s) < 60.0
+    assert document["time_offset_s"] > 1.6e9

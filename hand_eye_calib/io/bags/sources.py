@@ -86,9 +86,10 @@ class Reading(ABC):
         if n_zero > 1:  # a simulation may begin at 0
             self.notes.append(f"{name}: {n_zero:,} poses were left out: their header stamps are 0")
             table = table[~is_zero]
+        if not len(table) or (table.stamps_ns % messages.NS_PER_S).any():
+            return table
         n_stamps = len(np.unique(table.stamps_ns))
-        has_whole_seconds = len(table) > 0 and not (table.stamps_ns % messages.NS_PER_S).any()
-        if has_whole_seconds and n_stamps <= _MOSTLY * len(table):
+        if n_stamps <= _MOSTLY * len(table):
             raise InputError(
                 f"{name}: the header stamps have whole seconds only: {len(table):,} poses have "
                 f"{n_stamps:,} stamps; have the publisher set header.stamp.nanosec; "
