@@ -14,7 +14,7 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.estimation import solve_poses
-from hand_eye_calib.engine.run import run
+from hand_eye_calib.engine.run import Run, run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
@@ -23,7 +23,7 @@ from hand_eye_calib.pairing.motion_pairs import synchronise
 from hand_eye_calib.plain import Document, plain
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.stats import CHI2
-from hand_eye_calib.text import angle, length, listing
+from hand_eye_calib.text import angle, frame_name, length, listing
 
 # Options that are of one pair of sensors, by their beginnings.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
@@ -69,16 +69,31 @@ def calibrate_rig(
     named = {"time_offset": time_offset, "scale": scale}
     options = dict(options or {}) | {name: each for name, each in named.items() if each is not None}
     _refuse(trajectories, options)
-    first, *rest = [replace(each, sensor_frame=name) for name, each in trajectories.items()]
+    first, *rest = [
+        replace(trajectory, sensor_frame=frame_name(name))
+        for name, trajectory in trajectories.items()
+    ]
     star, moved = [], []
     for other in rest:
-        snapshot = whole_snapshot(first, other, options)
-        answer = run(snapshot).calibration
+        found = run(whole_snapshot(first, other, options))
+        answer = found.calibration
         star.append(answer)
+        other = _as_solved(other, found)
         moved.append(other.scaled(answer.scale).shifted(answer.time_offset_s))
     couples = zip(star, moved, moved[1:], strict=False)
-    chain = [_between(*each, snapshot.config.max_gap) for each in couples]
-    return RigCalibration.of(tuple(trajectories), star, chain)
+    chain = [_between(*each, found.snapshot.config.max_gap) for each in couples]
+    sensors = (first.sensor_frame, *(answer.child_frame for answer in star))
+    return RigCalibration.of(sensors, star, chain)
+
+
+def _as_solved(child: Trajectory, found: Run) -> Trajectory:
+    """Return the poses of a child as a run has read them, with the name of the sensor's frame.
+
+    Inverse poses are those of the other frame of the stream: of a camera that sees a marker.
+    """
+    config = found.snapshot.config
+    poses = se3.put_right(child.poses, config.child_invert, config.child_quaternion)
+    return replace(child, poses=poses, sensor_frame=found.calibration.child_frame)
 
 
 def _between(

@@ -105,7 +105,7 @@ def test_null_poses_of_a_bag_are_left_out_and_counted(tmp_path, storage, kind, n
     np.testing.assert_allclose(poses[:, :3], CHILD[kept, :3], atol=1e-12)
     assert warnings == [
         f"{name}: 6 of 200 poses (3.0%) were left out: their quaternion is 0, or a value is not "
-        "finite"
+        "finite or absent"
     ]
 
 

@@ -56,6 +56,17 @@ def test_extrinsics_and_closure(rig, found):
     assert "front" in repr(found)
 
 
+def test_a_sensor_of_inverse_poses_is_named_and_closes(rig):
+    lidar, front, rear = trajectories_of(rig).values()
+    observed = hec.Trajectory(front.stamps_ns, se3.inverse(front.poses), "tag", "front_camera")
+    found = hec.calibrate_rig({"/lidar": lidar, "tag": observed, "rear": rear})
+    assert found.sensors == ("lidar", "front_camera", "rear")
+    assert [each.child_frame for each in found.calibrations] == ["front_camera", "rear"]
+    np.testing.assert_allclose(found.T("lidar", "front_camera"), rig.Xs[1], atol=0.05)
+    (closure,) = found.closures
+    assert closure.closes
+
+
 def test_two_good_sensors_do_not_suffer_from_a_bad_first_one():
     """Their own answer for each other decides, by what the answers with the first one close."""
     rig = simulated(3, 400, unequal(3) * [[6.0], [1.0], [1.0]])
