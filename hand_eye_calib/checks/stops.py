@@ -7,8 +7,9 @@ one, seen from other axes. Only the positions contradict. So each usual mistake 
 and a robust fit of ``A X = Z B`` shows whether rotations and positions agree without it.
 """
 
+import itertools
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -25,11 +26,22 @@ _FEWEST = 6
 # Most stops that are compared with each other: pairs are their square.
 _MOST = 150
 
-# Shares of the rotation or of the positions that stay unexplained. Real arms leave up to 0.08
-# (CamOdoCal's example), sides that do not belong together 0.5 and more.
-_EXPLAINED = 0.12
+# Shares of the rotation or of the positions that stay unexplained. From the first on other
+# explanations are tried, from the others on a warning and an error say so. Three real arms leave
+# 0.015 to 0.07 (MoveIt's samples, ETHZ, CamOdoCal), simulated ones 0.01, sides that do not belong
+# together 0.5.
+_EXPLAINED = 0.04
+_DOUBTFUL = 0.12
 _HOLDS = 0.3
 _UNRELATED = 0.5
+
+# Errors of positions may be so many times those that the errors of the rotations cause at the
+# distance of the target: 1 to 5 of real arms, 1 to 4 of KinHEC's with noise. Beyond the first
+# number positions contradict if too much of them stays unexplained, beyond the second if it is
+# this share.
+_BY_NOISE = 4.0
+_BEYOND_NOISE = 12.0
+_CONTRADICTING = 0.08
 
 # A mistake is named if without it so many times less stays unexplained.
 _DECISIVE = 3.0
@@ -39,6 +51,9 @@ _ABOUT_EQUAL = 1.5
 
 # A hand or a target that rotates less than this between stops (rad) hardly rotates: 3 deg.
 _ROTATES = 0.05
+
+# Rotations between stops that differ by less than this share of it agree.
+_LEAST_APART = 0.2
 
 # A pose that is repeated differs from the one before by less than this (m, rad): by rounding.
 _REPEATED = 1e-6
@@ -54,12 +69,14 @@ _BLOCK = 0.15
 # Rounds of weights of a fit.
 _ROUNDS = 8
 
-# Positions spread over more than this (m) are not those of an arm: cm beyond it, then mm.
-_WIDEST_M = 10.0
-_WIDEST_CM = 60.0
+# Positions spread over more than this (m) are not those of an arm. They are mm if their median
+# distance from their origin is above the second number, otherwise cm.
+_WIDEST_M = 3.0
+_FARTHEST_CM = 200.0
 
-# A factor between the lengths of both sides is a unit if it is within this share of it.
-_UNIT_WITHIN = 0.03
+# What is left of a factor between the lengths of both sides once its unit is divided out: the size
+# of a target is not wrong by more.
+_LARGEST_LEFT = 3.0
 
 _CENTIMETRE = 0.01
 _MILLIMETRE = 0.001
@@ -128,18 +145,28 @@ class RoughFit:
     ----------
     turning, placing : float
         Shares of the rotations and of the positions that stay unexplained.
+    beyond : float
+        Median error of the positions over that which the errors of the rotations cause.
     scale : float or None
         Factor of the child's lengths; None if the stops do not determine it.
     """
 
     turning: float
     placing: float
-    scale: float | None
+    beyond: float = 0.0
+    scale: float | None = None
 
     @property
     def unexplained(self) -> float:
         """The larger one of both shares."""
         return max(self.turning, self.placing)
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether nothing contradicts beyond noise that the rotations have as well."""
+        is_rough = max(self.turning / _HOLDS, self.placing / _UNRELATED) > 1.0
+        is_beyond = self.placing > _EXPLAINED and self.beyond > _BY_NOISE
+        return not (is_rough or is_beyond)
 
 
 @dataclass(frozen=True)
@@ -183,9 +210,13 @@ def examine(given: GivenStops) -> Examination:
         # The rotations do not determine where the positions belong.
         return _of_lengths(few, None, [], [])
     mistakes, fit, rivals = _explained(few)
-    if fit.unexplained >= _HOLDS:
-        return Examination(tuple(_disagreeing(few, fit)))
     findings, repairs = _named(given, mistakes, rivals)
+    if axes := _axes(few, fit):
+        return Examination((axes,))
+    if not (findings or repairs):
+        findings += _disagreeing(fit)
+    if any(found.makes_unusable for found in findings):
+        return Examination(tuple(findings), tuple(repairs))
     return _of_lengths(few, fit.scale, findings, repairs)
 
 
@@ -307,23 +338,24 @@ def _agreeing(of_parent: FloatArray, of_child: FloatArray) -> BoolArray:
 
 # ------------------------------------------------------------------ angles read as others
 
-_Triple: TypeAlias = Callable[[FloatArray], FloatArray]
+_Numbers: TypeAlias = Callable[[FloatArray], FloatArray]
 
 
 def _moving_axes(angles: FloatArray) -> FloatArray:
     """Rotations of angles about the moving axes x, y, z in this order."""
-    about_x, about_y, about_z = (
-        se3.rotation_exp(angles[:, axis, None] * np.eye(3)[axis]) for axis in range(3)
-    )
-    return np.asarray(about_x @ about_y @ about_z)
+    return np.swapaxes(se3.rotation_from_rpy(-angles), 1, 2)
+
+
+def _angles_of_moving_axes(rotations: FloatArray) -> FloatArray:
+    return -se3.rotation_to_rpy(np.swapaxes(rotations, 1, 2))
 
 
 def _reversed_angles(angles: FloatArray) -> FloatArray:
     return se3.rotation_from_rpy(angles[:, ::-1])
 
 
-def _vectors(rotations: FloatArray) -> FloatArray:
-    return se3.rotation_log(rotations)
+def _angles_in_reverse(rotations: FloatArray) -> FloatArray:
+    return se3.rotation_to_rpy(rotations)[:, ::-1]
 
 
 def _long_vectors(rotations: FloatArray) -> FloatArray:
@@ -333,64 +365,83 @@ def _long_vectors(rotations: FloatArray) -> FloatArray:
     return np.asarray(vectors * (1.0 - 2.0 * np.pi / lengths))
 
 
+def _vectors_of_one_side(rotations: FloatArray) -> FloatArray:
+    """Rotation vectors on one side of their main axis: a tool that points down has angles near half
+    a turn of one sign.
+    """
+    vectors = se3.rotation_log(rotations)
+    axis = int(np.argmax(medians(np.abs(vectors.T))))
+    is_other = vectors[:, axis] < 0.0
+    return np.where(is_other[:, None], _long_vectors(rotations), vectors)
+
+
+_VECTORS = "rotation vectors"
 _FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
 _MOVING = "angles about the moving axes x, y, z"
-_REVERSED = "angles about z, y, x in the order of the columns (A, B, C or yaw, pitch, roll)"
-_OF_VECTORS: dict[str, _Triple] = {
+_REVERSED = "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
+
+# Rotations of three numbers, and the numbers that rotations were made of if they were read so.
+_ROTATIONS_OF: dict[str, _Numbers] = {
+    _VECTORS: se3.rotation_exp,
     _FIXED: se3.rotation_from_rpy,
     _MOVING: _moving_axes,
     _REVERSED: _reversed_angles,
 }
-_OF_ANGLES: dict[str, _Triple] = {
-    "rotation vectors": se3.rotation_exp,
-    _MOVING: _moving_axes,
-    _REVERSED: _reversed_angles,
-}
+_NUMBERS_OF: tuple[tuple[str, _Numbers], ...] = (
+    (_VECTORS, se3.rotation_log),
+    (_VECTORS, _long_vectors),
+    (_VECTORS, _vectors_of_one_side),
+    (_FIXED, se3.rotation_to_rpy),
+    (_MOVING, _angles_of_moving_axes),
+    (_REVERSED, _angles_in_reverse),
+)
 
 
 def _angles(given: GivenStops) -> Iterator[Finding]:
     """Rotations that agree once their three numbers are taken for other angles."""
     few = given[_spread_over(len(given))]
-    given_angles = {"parent": angles_between(few.parent), "child": angles_between(few.child)}
-    apart = median(np.abs(_upper(given_angles["parent"] - given_angles["child"])))
-    spread = max(median(_upper(given_angles["parent"])), median(_upper(given_angles["child"])))
-    if apart < 0.5 * _ROTATES or apart < 0.05 * spread:
+    angles = {"parent": angles_between(few.parent), "child": angles_between(few.child)}
+    apart = median(np.abs(_upper(angles["parent"] - angles["child"])))
+    spread = max(median(_upper(angles["parent"])), median(_upper(angles["child"])))
+    if apart < _LEAST_APART * _ROTATES or apart < _EXPLAINED * spread:
         return
-    best, least = None, min(apart / _DECISIVE, _HOLDS * spread)
-    for detail, of_parent in _read_otherwise(few.parent):
-        left = median(np.abs(_upper(of_parent - given_angles["child"])))
-        if left < least:
-            best, least = ("parent", detail), left
-    for detail, of_child in _read_otherwise(few.child):
-        left = median(np.abs(_upper(given_angles["parent"] - of_child)))
-        if left < least:
-            best, least = ("child", detail), left
-    if best:
-        yield finding("angles", best[0], detail=best[1])
-    elif apart > max(_ROTATES, _UNRELATED * spread / 2.0) and _is_unrelated(given_angles):
+    least = min(apart / _DECISIVE, _HOLDS * spread)
+    agreeing = []
+    for stream, other in (("parent", "child"), ("child", "parent")):
+        for detail, rotations in _read_otherwise(getattr(few, stream)):
+            left = median(np.abs(_upper(angles_between(rotations) - angles[other])))
+            if left < least:
+                agreeing.append((left, stream, detail, rotations))
+    if agreeing:
+        smallest = min(left for left, *_ in agreeing)
+        alike = [each for each in agreeing if each[0] <= _ABOUT_EQUAL * smallest]
+        _, stream, detail, _ = min(alike, key=lambda reading: _left_by(few, *reading[1::2]))
+        yield finding("angles", stream, detail=detail)
+    elif apart > _ROTATES and _is_unrelated(angles):
         yield finding("unrelated_stops", off_deg=float(np.degrees(apart)))
 
 
+def _left_by(few: GivenStops, stream: str, rotations: FloatArray) -> float:
+    """The share that stays unexplained with other rotations (N, 3, 3) of a stream."""
+    other = _with_poses(few, stream, rotations, getattr(few, stream)[:, :3, 3])
+    return min(rough_fit(other, Mistakes(is_inverse=way)).unexplained for way in (False, True))
+
+
+def _with_poses(
+    given: GivenStops, stream: str, rotations: FloatArray, positions: FloatArray
+) -> GivenStops:
+    """The stops with other poses of a stream."""
+    poses = se3.from_rotation_translation(rotations, positions)
+    return replace(given, parent=poses) if stream == "parent" else replace(given, child=poses)
+
+
 def _read_otherwise(Ts: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Other readings of the three numbers behind rotations, and the angles between stops then."""
-    rotations = Ts[:, :3, :3]
-    for numbers in (_vectors(rotations), _long_vectors(rotations), _usual_vectors(rotations)):
-        for detail, rotation_of in _OF_VECTORS.items():
-            yield f"{detail}, not rotation vectors", angles_between(rotation_of(numbers))
-    numbers = se3.rotation_to_rpy(rotations)
-    for detail, rotation_of in _OF_ANGLES.items():
-        text = f"{detail}, not angles about the fixed axes x, y, z"
-        yield text, angles_between(rotation_of(numbers))
-
-
-def _usual_vectors(rotations: FloatArray) -> FloatArray:
-    """Rotation vectors on the side of their median, so that a tool that points down has angles near
-    half a turn of one sign.
-    """
-    vectors, others = _vectors(rotations), _long_vectors(rotations)
-    axis = int(np.argmax(medians(np.abs(vectors.T))))
-    is_other = vectors[:, axis] < 0.0
-    return np.where(is_other[:, None], others, vectors)
+    """Other readings of the three numbers behind rotations, and the rotations (N, 3, 3) then."""
+    for read_as, numbers_of in _NUMBERS_OF:
+        numbers = numbers_of(Ts[:, :3, :3])
+        for meant, rotation_of in _ROTATIONS_OF.items():
+            if meant != read_as:
+                yield f"{meant}, not {read_as}", rotation_of(numbers)
 
 
 def _is_unrelated(angles: dict[str, FloatArray]) -> bool:
@@ -420,7 +471,7 @@ def _explained(few: GivenStops) -> tuple[Mistakes, RoughFit, list[Mistakes]]:
     """
     plain = [Mistakes()] + [Mistakes(is_inverse=True)] * few.is_arm
     chosen, fit = min(((each, rough_fit(few, each)) for each in plain), key=_badness)
-    if fit.unexplained < _EXPLAINED:
+    if fit.is_noise:
         return chosen, fit, []
     tried = []
     for parent in _WAYS:
@@ -455,13 +506,17 @@ def rough_fit(given: GivenStops, mistakes: Mistakes) -> RoughFit:
     # Rotations of a few degrees are not judged: noise may be as large.
     turning = median(left) / max(spread, _ROTATES)
     if not given.has_positions:
-        return RoughFit(turning, 0.0, None)
-    placing, scale = _placed(A, B, Z)
-    return RoughFit(turning, placing, scale)
+        return RoughFit(turning, 0.0)
+    placing, position, scale = _placed(A, B, Z)
+    distance = (scale or 1.0) * median(np.linalg.norm(B[:, :3, 3], axis=1))
+    beyond = position / max(median(left) * distance, 1e-12)
+    return RoughFit(turning, placing, beyond, scale)
 
 
-def _placed(A: FloatArray, B: FloatArray, Z: FloatArray) -> tuple[float, float | None]:
-    """Share of the positions that stays unexplained, and the factor of the child's lengths."""
+def _placed(A: FloatArray, B: FloatArray, Z: FloatArray) -> tuple[float, float, float | None]:
+    """Share of the positions that stays unexplained, their median error, and the factor of the
+    child's lengths.
+    """
     ones = np.broadcast_to(-np.eye(3), (len(A), 3, 3))
     of_child = B[:, :3, 3] @ Z.T
     levers = np.concatenate([A[:, :3, :3], ones], axis=2)
@@ -471,10 +526,10 @@ def _placed(A: FloatArray, B: FloatArray, Z: FloatArray) -> tuple[float, float |
     spreads = [_spread(A[:, :3, 3]), _spread(of_child)]
     scale = float(values[6])
     if scale > 0.0 and left < without / _DECISIVE:
-        return left / max(min(spreads[0], scale * spreads[1]), 1e-12), scale
+        return left / max(min(spreads[0], scale * spreads[1]), 1e-12), left, scale
     # A hand that moves about one point, or a fault: one unit of length.
     left, _ = _least(levers, A[:, :3, 3] - of_child)
-    return left / max(*spreads, 1e-12), None
+    return left / max(*spreads, 1e-12), left, None
 
 
 def _spread(positions: FloatArray) -> float:
@@ -520,11 +575,53 @@ def _streams(mistakes: Mistakes) -> list[tuple[str, str]]:
     return [(code, stream) for code, stream in pairs if code]
 
 
-def _disagreeing(few: GivenStops, fit: RoughFit) -> Iterator[Finding]:
-    """Stops that no usual mistake explains."""
+def _disagreeing(fit: RoughFit) -> list[Finding]:
+    """A finding if no usual mistake explains the stops."""
+    if fit.is_noise:
+        return []
+    is_far = fit.placing > _CONTRADICTING and fit.beyond > _BEYOND_NOISE
+    severity = Severity.WARNING
+    if fit.unexplained > _HOLDS or is_far:
+        severity = Severity.ERROR
+    elif fit.unexplained < _DOUBTFUL:
+        return []
     part = "rotations" if fit.turning > fit.placing else "positions"
     share = min(fit.unexplained, 1.0)
-    yield finding("disagreeing_stops", part=part, share=share)
+    return [finding("disagreeing_stops", severity=severity, part=part, share=share)]
+
+
+def _axes(few: GivenStops, fit: RoughFit) -> Finding | None:
+    """A finding if the positions of one side are clearly in other axes: that explains more than the
+    best of the other mistakes, whose fit is given.
+    """
+    if fit.is_noise:
+        return None
+    best: tuple[str, str] | None = None
+    least = min(fit.unexplained / _DECISIVE, _HOLDS)
+    for is_inverse in (False, True) if few.is_arm else (False,):
+        mistakes = Mistakes(is_inverse=is_inverse)
+        if rough_fit(few, mistakes).turning > least:
+            continue
+        for detail, matrix in _signed_axes():
+            for stream in ("child", "parent"):
+                poses = getattr(few, stream)
+                moved = _with_poses(few, stream, poses[:, :3, :3], poses[:, :3, 3] @ matrix.T)
+                other = rough_fit(moved, mistakes).unexplained
+                if other < least:
+                    best, least = (stream, detail), other
+    return finding("axes", best[0], detail=best[1]) if best else None
+
+
+def _signed_axes() -> Iterator[tuple[str, FloatArray]]:
+    """All permutations and flips of the axes but the identity."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            matrix = np.diag(signs) @ np.eye(3)[list(order)]
+            if not np.array_equal(matrix, np.eye(3)):
+                names = []
+                for sign, axis in zip(signs, order, strict=True):
+                    names.append("xyz"[axis] if sign > 0 else f"-{'xyz'[axis]}")
+                yield " ".join(names), matrix
 
 
 # ------------------------------------------------------------------ lengths
@@ -532,13 +629,15 @@ def _disagreeing(few: GivenStops, fit: RoughFit) -> Iterator[Finding]:
 
 def _units(few: GivenStops, scale: float | None) -> tuple[list[Finding], float | None]:
     """Findings of sides whose lengths are in other units, and the scale that is left then."""
-    of_parent = _unit_of_size(_spread(few.parent[:, :3, 3]))
-    of_child = _unit_of_size(_spread(few.child[:, :3, 3]))
+    of_parent = _unit_of_size(few.parent[:, :3, 3])
+    of_child = _unit_of_size(few.child[:, :3, 3])
     if scale is not None:
-        left = scale * of_parent
-        by_ratio = [unit for unit in (1.0, *_UNITS) if abs(left / unit - 1.0) < _UNIT_WITHIN]
-        of_child = by_ratio[0] if by_ratio else of_child
-        scale = left / of_child
+        needed = scale * of_parent
+        units = (1.0, *_UNITS)
+        left = [abs(np.log(needed / unit)) for unit in units]
+        nearest = int(np.argmin(left))
+        of_child = units[nearest] if left[nearest] < np.log(_LARGEST_LEFT) else 1.0
+        scale = needed / of_child
     findings = []
     for stream, unit, option in (
         ("parent", of_parent, "parent_scale"),
@@ -551,11 +650,12 @@ def _units(few: GivenStops, scale: float | None) -> tuple[list[Finding], float |
     return findings, scale
 
 
-def _unit_of_size(spread: float) -> float:
-    """The unit of positions that spread this far: 1 for metres."""
-    if spread <= _WIDEST_M:
+def _unit_of_size(positions: FloatArray) -> float:
+    """The unit of positions (N, 3) by their size: 1 for metres."""
+    if _spread(positions) <= _WIDEST_M:
         return 1.0
-    return _CENTIMETRE if spread <= _WIDEST_CM else _MILLIMETRE
+    is_cm = median(np.linalg.norm(positions, axis=1)) < _FARTHEST_CM
+    return _CENTIMETRE if is_cm else _MILLIMETRE
 
 
 def scale_finding(scale: float, sigma: float, is_used: bool) -> Finding:

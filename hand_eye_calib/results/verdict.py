@@ -206,7 +206,11 @@ def target_of(axis: str, result: Result) -> float:
 
 
 def _not_converged(result: Result) -> Iterator[_Found]:
-    if result.status is SolveStatus.NOT_CONVERGED:
+    # Stops that contradict each other have no solution: the finding says why.
+    is_explained = result.reference == "stops" and any(
+        finding.makes_unusable for finding in result.findings
+    )
+    if result.status is SolveStatus.NOT_CONVERGED and not is_explained:
         yield "the solver did not converge", "record more varied motion", (), {}
 
 
