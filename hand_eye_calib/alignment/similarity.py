@@ -169,6 +169,10 @@ def fit_similarity(
 def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
+    Noise of the child makes the factor too small, as that of any regressor does, and the standard
+    deviation does not contain that. With the streams exchanged it is too large. The child has a
+    unit of its own only if both fits say so.
+
     Parameters
     ----------
     pose_pairs : PosePairs
@@ -181,11 +185,26 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
     NotEnoughDataError
         If there are too few poses.
     """
+    best = _best_scale(pose_pairs, known)
+    if not best.has_own_unit:
+        return best
+    exchanged = replace(pose_pairs, Ts_pw_p=pose_pairs.Ts_cw_c, Ts_cw_c=pose_pairs.Ts_pw_p)
+    T_child_parent = se3.inverse(best.T_parent_child)
+    T_child_parent[:3, 3] /= best.scale
+    start = replace(best, T_parent_child=T_child_parent, scale=1.0 / best.scale)
+    of_exchanged = _best_scale(exchanged, (), start)
+    return replace(best, has_own_unit=of_exchanged.has_own_unit)
+
+
+def _best_scale(
+    pose_pairs: PosePairs, known: Sequence[SimilarityFit], start: SimilarityFit | None = None
+) -> SimilarityFit:
+    """Return the fit whose scale has the smallest relative standard deviation."""
     fits = [*known]
     for lag_s in _SCALE_LAGS_S[len(fits) :]:
         pairs = pairs_over(pose_pairs, lag_s)
         if len(pairs) >= MIN_PAIRS:
-            fits.append(fit_similarity(pairs, start=fits[-1] if fits else None))
+            fits.append(fit_similarity(pairs, start=fits[-1] if fits else start))
     if not fits:
         raise NotEnoughDataError(
             f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "

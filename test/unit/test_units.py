@@ -5,8 +5,10 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
+from hand_eye_calib.alignment.similarity import estimate_scale
 from hand_eye_calib.checks.check import in_other_units
 from hand_eye_calib.checks.streams import is_too_fast, is_too_slow
+from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
@@ -145,3 +147,31 @@ def test_positions_are_asked_about_as_poses_are():
     expected = drive.T_parent_child[:3, 3]
     np.testing.assert_allclose(centimetres.T_parent_child[:3, 3], expected, atol=0.02)
     assert centimetres.verdict is hec.Verdict.USE_WITH_CARE
+
+
+class TestNoisyChild:
+    """Noise of the child beside short motion looks like a scale below 1."""
+
+    @staticmethod
+    def recorded(noise_m, noise_rad, scale=1.0):
+        poses = wandering_poses(80, seed=6).copy()
+        poses[:, :3, 3] *= 0.07
+        child = disturbed(child_of(poses), 7, noise_m, noise_rad)
+        return as_trajectory(poses), as_trajectory(child).scaled(1.0 / scale)
+
+    def fit(self, *streams):
+        return estimate_scale(whole_snapshot(*streams, {}).pose_pairs)
+
+    def test_the_child_has_no_unit_of_its_own(self):
+        fit = self.fit(*self.recorded(0.01, 0.02))
+        assert 1.0 - fit.scale > 5.0 * fit.scale_sigma
+        assert not fit.has_own_unit
+
+    def test_a_true_scale_of_that_size_is_found(self):
+        fit = self.fit(*self.recorded(0.0005, 0.001, scale=0.914))
+        assert fit.scale == pytest.approx(0.914, abs=0.005)
+        assert fit.has_own_unit
+
+    def test_the_lengths_of_the_child_are_kept(self):
+        result = hec.calibrate(*self.recorded(0.01, 0.02), method="dnlo")
+        assert result.scale == 1.0
