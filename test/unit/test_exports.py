@@ -62,7 +62,7 @@ def result(parent="imu", child="camera", **changes):
 
 def unknown(*axes):
     """What makes some axes unobservable."""
-    return {"status": SolveStatus.UNOBSERVABLE, "observability": dofs([0.001] * 6, axes)}
+    return {"status": SolveStatus.UNOBSERVABLE, "observability_measured": dofs([0.001] * 6, axes)}
 
 
 def document(text):
