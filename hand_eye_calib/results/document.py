@@ -362,12 +362,21 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
         result = replace(result, cross_check=_with_allowance(result))
     if tuple(dof.name for dof in result.observability) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
+    if data["version"] != 1:
+        _require_sigmas(result, data["observability"])
     for name in ("contradictions", "target_axes", "cross_check"):
         if not {*(getattr(result, name) or {})} <= {*AXES}:
             raise ValueError(f"{name} has other axes than {', '.join(AXES)}")
     if result.method not in METHODS:
         raise ValueError(f"method {result.method} is not known")
     return result
+
+
+def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Raise ValueError unless the standard deviations are those of their two parts."""
+    sigmas = [from_plain(float, row["sigma"]) for row in rows]
+    if not np.allclose(sigmas, result.sigmas, rtol=1e-6, atol=1e-300):
+        raise ValueError("sigma is not that of sigma_measured and the allowance")
 
 
 def _with_allowance(result: Result) -> CrossCheck:

@@ -23,7 +23,7 @@ T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
 def calibration(covariance, **changes):
     named = {"child_frame": "camera", "stamp_ns": 1_700_000_000_123_456_789}
-    changes |= named | {"T_parent_child": T_PARENT_CHILD, "covariance": covariance}
+    changes |= named | {"T_parent_child": T_PARENT_CHILD, "covariance_measured": covariance}
     return good_calibration(**changes)
 
 

@@ -94,7 +94,7 @@ def saved(tmp_path_factory):
         {"target_axes": {"up": 0.1}},
         {"contradictions": {"w": 5.0}},
         {"method": "guess"},
-        {"floor": {"matrix": [[None] * 6] * 6}},
+        {"covariance_allowance": {"matrix": [[None] * 6] * 6}},
         {"covariance": {"matrix": [[1e18, *[0.0] * 5], *[[0.0] * 6] * 5]}},
         {"covariance": {"matrix": [[0.0, 5.0, *[0.0] * 4], *[[0.0] * 6] * 5]}},
         *({"cross_check": {"x": SCATTER | {"of_halves": value}}} for value in (INF, NAN)),

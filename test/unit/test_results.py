@@ -346,6 +346,14 @@ def test_a_document_of_version_1_is_read_with_its_covariance_as_the_measured_par
     assert read.cross_check["x"].sigma == pytest.approx(np.hypot(0.003, 0.001))
 
 
+def test_a_document_whose_sigma_is_not_that_of_its_parts_is_refused():
+    document = calibration().to_dict()
+    first, *others = document["observability"]
+    changed = document | {"observability": [first | {"sigma": 0.5}, *others]}
+    with pytest.raises(InputError, match="sigma is not that of sigma_measured and the allowance"):
+        Calibration.from_dict(changed)
+
+
 def test_a_document_whose_covariance_is_not_the_sum_of_its_parts_is_refused():
     document = calibration().to_dict()
     changed = document | {"covariance": {"matrix": (1e-4 * np.eye(6)).tolist()}}
