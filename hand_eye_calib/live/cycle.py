@@ -193,6 +193,8 @@ class SolveCycle:
         # Why every solve since the result has failed, and since when (steady time, s).
         self._failing: Failure | None = None
         self._failing_since_s = 0.0
+        # Reasons in the log as warnings, by their rules.
+        self._warned: dict[str, str] = {}
         self._certain: Options = {}
         self._told: tuple[str, ...] = ()
         self._is_unchecked, self._check_due_s = False, 0.0
@@ -394,6 +396,7 @@ class SolveCycle:
             kept = f"{kept}: {describe(newest)}"
             self._log.info(kept, ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, kept))
+            result = _with_halves_of(newest, result)
         self._set_result(self._with_findings(result))
         if not progress.is_faulty and progress.sentence:
             write = self._log.warning if progress.will_not_get_there else self._log.info
@@ -414,6 +417,10 @@ class SolveCycle:
             said.append(f"{reason.sentence}; {reason.what_to_do}")
             if is_final and not reason.is_finding:  # which are in the log already
                 self._log.warning(f"{reason.verdict.value}: {said[-1]}")
+                self._warned[reason.rule] = reason.sentence
+        rules = {reason.rule for reason in calibration.reasons}
+        for rule in self._warned.keys() - rules:
+            self._log.info(f"no longer found: {self._warned.pop(rule)}")
         return "; ".join((text, *said, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
@@ -528,6 +535,18 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Lev
         level = Level.WARN
     remedy = "start its source again" if level > Level.OK else "go on driving, or save"
     return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
+
+
+def _with_halves_of(newest: Calibration, kept: Calibration) -> Calibration:
+    """The result that is kept, with the comparison of both halves of the whole drive."""
+    if newest.cross_check is None or kept.cross_check is None:
+        return kept
+    rows = {}
+    for axis, row in kept.cross_check.items():
+        newer = newest.cross_check[axis]
+        excess = newer.excess_of_halves
+        rows[axis] = replace(row, of_halves=newer.of_halves, excess_of_halves=excess)
+    return replace(kept, cross_check=rows)
 
 
 def is_refuted(result: Calibration) -> bool:

@@ -23,7 +23,7 @@ from hand_eye_calib.live.solving import Answer
 from hand_eye_calib.live.state import Broadcast, Level, NodeState
 from hand_eye_calib.plain import plain
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.records import AXES
+from hand_eye_calib.results.records import AXES, AxisScatter
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 
@@ -191,3 +191,25 @@ def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
     text = "\n".join(["```text", *wrapped, "```"])
     page = (ROOT / "docs" / "node.md").read_text()
     assert text in page, f"docs/node.md must have this text:\n{text}"
+
+
+def scatter(of_halves):
+    """A cross-check in which both halves differ about the rotation about x."""
+    row = AxisScatter(sigma=0.001, of_methods=0.0, of_halves=0.0, excess_of_halves=0.0)
+    apart = dataclasses.replace(row, of_halves=of_halves, excess_of_halves=1000.0 * of_halves)
+    return dict.fromkeys(AXES, row) | {"roll": apart}
+
+
+def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(cycle, lines):
+    for motion_s in (40.0, 42.0, 44.0):
+        answered(cycle, motion_s, cross_check=scatter(0.7))
+    assert [reason.rule for reason in cycle.result.reasons] == ["halves"]
+    said = "the two halves of the recording disagree about the rotation about x"
+    assert "warning" in {level for level, text in lines if said in text}
+    # The newest result is worse, and the one before is kept.
+    _, text = answered(cycle, 60.0, (0.005, 0.01, 0.005), 200, cross_check=scatter(0.0))
+    assert "kept is the result of 100 poses" in text
+    assert cycle.result.verdict is Verdict.USE
+    taken_back = [(level, text) for level, text in lines if text.startswith("no longer found")]
+    assert [level for level, _ in taken_back] == ["info"]
+    assert said in taken_back[0][1]
