@@ -301,6 +301,11 @@ def _hidden(result: Result) -> Iterator[_Found]:
 
 def _few_inliers(result: Result) -> Iterator[_Found]:
     share = result.n_inliers / max(result.n_pairs, 1)
+    if result.reference == "stops":
+        if share < FEWEST_INLIERS:
+            text = f"{1 - share:.0%} of the stops do not fit the others"
+            yield text, "look at these stops: is the target seen well, does the arm stand?", (), {}
+        return
     uses_reference = METHODS[result.method].uses_reference
     if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
@@ -487,8 +492,8 @@ RULES = (
     Rule(
         "outliers",
         _CARE,
-        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs are outliers; more than "
-        f"{1 - FEWEST_OF_MODEL:.0%} with method adaptive",
+        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs, or of the stops, are outliers; "
+        f"more than {1 - FEWEST_OF_MODEL:.0%} with method adaptive",
         _few_inliers,
     ),
     Rule(

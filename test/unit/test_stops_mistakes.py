@@ -1,0 +1,304 @@
+"""Usual mistakes in the stops of an arm: the right answer, or a refusal that names the cause."""
+
+import json
+
+import numpy as np
+import pytest
+
+import hand_eye_calib as hec
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
+from hand_eye_calib.errors import ConfigError, InputError
+from hand_eye_calib.geometry import se3
+
+# Errors of twenty stops; five standard deviations.
+WITHIN_M = 0.006
+WITHIN_RAD = 0.005
+
+ON_HAND = "on the hand"
+BESIDE = "beside the robot"
+
+
+def pose(position, rotation_vector):
+    rotation = se3.rotation_exp(np.array(rotation_vector))
+    return se3.from_rotation_translation(rotation, np.array(position))
+
+
+def arm(place, seed=0, n=20, noise_m=0.0005):
+    """Poses of the hand in the base, of the target in the camera, and where the camera is."""
+    random = np.random.default_rng(seed)
+    turns = se3.rotation_exp(random.normal(size=(n, 3)) * 0.35)
+    down = se3.rotation_exp(np.array([3.0, 0.05, 0.1]))
+    positions = np.array([0.45, 0.0, 0.4]) + random.normal(size=(n, 3)) * 0.1
+    robot = se3.from_rotation_translation(down @ turns, positions)
+    noise = se3.exp(random.normal(size=(n, 6)) * noise_m * np.repeat([1.0, 2.0], 3))
+    if place == ON_HAND:
+        camera = pose((0.06, -0.03, 0.09), (0.1, -0.05, 1.5))
+        target = pose((0.5, 0.05, 0.02), (0.0, 0.0, 0.4))
+        return robot, se3.inverse(robot @ camera) @ target @ noise, camera
+    camera = pose((1.1, 0.2, 0.8), (-1.2, 1.4, -0.6))
+    target = pose((0.02, 0.0, 0.1), (0.1, 0.2, 0.3))
+    return robot, se3.inverse(camera) @ robot @ target @ noise, camera
+
+
+def scaled(Ts, factor):
+    return se3.from_rotation_translation(Ts[:, :3, :3], factor * Ts[:, :3, 3])
+
+
+def scalar_first(Ts):
+    """Poses as they are read if quaternions w x y z are taken for x y z w."""
+    rows = se3.to_rows(Ts)
+    return se3.from_quat_xyzw(rows[:, :3], np.roll(rows[:, 3:], 1, axis=1))
+
+
+def with_rotations(Ts, rotations):
+    return se3.from_rotation_translation(rotations, Ts[:, :3, 3])
+
+
+def transposed_rotations(Ts):
+    return with_rotations(Ts, np.swapaxes(Ts[:, :3, :3], 1, 2))
+
+
+def angles_as_vectors(Ts):
+    return with_rotations(Ts, se3.rotation_exp(se3.rotation_to_rpy(Ts[:, :3, :3])))
+
+
+def flipped(Ts):
+    return se3.from_rotation_translation(Ts[:, :3, :3], Ts[:, :3, 3] * [1.0, -1.0, 1.0])
+
+
+def without_middle(Ts):
+    return np.delete(Ts, len(Ts) // 2, axis=0)
+
+
+def never_moved(Ts):
+    return np.repeat(Ts[:1], len(Ts), axis=0)
+
+
+def stale(Ts):
+    Ts = Ts.copy()
+    Ts[5::5] = Ts[4:-1:5]
+    return Ts
+
+
+def same(Ts):
+    return Ts
+
+
+# Mistakes of the robot's side and of the target's that are repaired, and what is said of them.
+REPAIRED = {
+    "scalar first, both": (scalar_first, scalar_first, "w x y z"),
+    "scalar first, robot": (scalar_first, same, "w x y z"),
+    "scalar first, target": (same, scalar_first, "w x y z"),
+    "rotations inverted, robot": (transposed_rotations, same, "seem to be inverted"),
+    "rotations inverted, target": (same, transposed_rotations, "seem to be inverted"),
+    "millimetres, robot": (lambda Ts: scaled(Ts, 1e3), same, "lengths are millimetres"),
+    "millimetres, target": (same, lambda Ts: scaled(Ts, 1e3), "lengths are millimetres"),
+    "millimetres, both": (
+        lambda Ts: scaled(Ts, 1e3),
+        lambda Ts: scaled(Ts, 1e3),
+        "lengths are millimetres",
+    ),
+    "centimetres, both": (
+        lambda Ts: scaled(Ts, 1e2),
+        lambda Ts: scaled(Ts, 1e2),
+        "lengths are centimetres",
+    ),
+    "target of twice the size": (same, lambda Ts: scaled(Ts, 2.0), "times as long"),
+    "target of 1.1 times the size": (same, lambda Ts: scaled(Ts, 1.1), "times as long"),
+    "millimetres, and another size": (same, lambda Ts: scaled(Ts, 1500.0), "multiplied by"),
+}
+
+# Mistakes that are refused, and the code of the finding.
+REFUSED = {
+    "shifted by one": (lambda Ts: Ts[1:], lambda Ts: Ts[:-1], "rows"),
+    "shifted by two": (lambda Ts: Ts[:-2], lambda Ts: Ts[2:], "rows"),
+    "a row missing in the middle": (without_middle, lambda Ts: Ts[:-1], "rows"),
+    "reversed": (same, lambda Ts: Ts[::-1], "rows"),
+    "sorted by name": (
+        same,
+        lambda Ts: Ts[np.argsort([str(row) for row in range(len(Ts))], kind="stable")],
+        "rows",
+    ),
+    "angles as rotation vectors": (angles_as_vectors, same, "angles"),
+    "robot that never moved": (never_moved, same, "frozen"),
+    "poses that were stored too early": (stale, same, "frozen"),
+    "y of the target flipped": (same, flipped, "axes"),
+    "inverse on both sides": (se3.inverse, se3.inverse, "inverse"),
+    "inverse robot": (se3.inverse, same, "inverse"),
+}
+
+
+def words(result):
+    return " ".join([*(found.what for found in result.findings), *result.warnings])
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("name", REPAIRED)
+def test_what_is_certain_is_repaired_and_said(name, place):
+    of_robot, of_target, text = REPAIRED[name]
+    robot, tracking, truth = arm(place)
+    result = calibrate_arm(of_robot(robot), of_target(tracking))
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[:3]) < WITHIN_M
+    assert np.linalg.norm(error[3:]) < WITHIN_RAD
+    assert text in words(result)
+    assert f"read as a camera {place}" in words(result)
+    assert result.verdict is not hec.Verdict.DO_NOT_USE
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_contradicts_is_refused_with_its_cause(name, place):
+    of_robot, of_target, code = REFUSED[name]
+    robot, tracking, _ = arm(place)
+    result = calibrate_arm(of_robot(robot), of_target(tracking))
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    assert result.findings[0].code == code
+    assert result.findings[0].what in result.headline
+    assert "limit of the recording" not in result.headline
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize(("n", "noise_m"), [(10, 0.0005), (30, 0.002), (60, 0.0001), (40, 0.004)])
+def test_clean_stops_have_no_findings(place, n, noise_m):
+    robot, tracking, truth = arm(place, seed=n, n=n, noise_m=noise_m)
+    result = calibrate_arm(robot, tracking)
+    assert result.findings == ()
+    assert result.scale == 1.0
+    assert [text for text in result.warnings if "read as" not in text] == []
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.abs(error[:3]).max() < 4.0 * result.sigmas[:3].max()
+
+
+class TestOptions:
+    @pytest.mark.parametrize(
+        ("option", "value"),
+        [("method", "dnlo"), ("reference", "B1"), ("time_offset", 1.0), ("max_gap", 2.0)],
+    )
+    def test_what_means_nothing_for_stops_is_refused(self, option, value):
+        robot, tracking, _ = arm(ON_HAND)
+        with pytest.raises(ConfigError, match=f"{option} {value} has no meaning for stops"):
+            calibrate_arm(robot, tracking, CalibratorConfig(**{option: value}))
+
+    @pytest.mark.parametrize(
+        ("of_robot", "of_target", "options"),
+        [
+            (scalar_first, same, {"parent_quaternion": "wxyz"}),
+            (same, transposed_rotations, {"child_invert": "orientations"}),
+            (se3.inverse, se3.inverse, {"parent_invert": "poses", "child_invert": "poses"}),
+            (lambda Ts: scaled(Ts, 1e3), same, {"parent_scale": 0.001}),
+            (same, lambda Ts: scaled(Ts, 2.0), {"scale": 0.5}),
+            (same, lambda Ts: scaled(Ts, 2.0), {"scale": "estimate"}),
+        ],
+    )
+    def test_an_option_puts_right_what_it_says(self, of_robot, of_target, options):
+        robot, tracking, truth = arm(ON_HAND)
+        config = CalibratorConfig(**options)
+        result = calibrate_arm(of_robot(robot), of_target(tracking), config)
+        error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+        assert np.linalg.norm(error[:3]) < WITHIN_M
+        assert result.findings == ()
+
+    @pytest.mark.parametrize(
+        ("of_robot", "of_target", "options", "code"),
+        [
+            (scalar_first, scalar_first, {"parent_quaternion": "xyzw"}, "quaternion_order"),
+            (lambda Ts: scaled(Ts, 1e3), same, {"parent_scale": 1.0}, "units"),
+            (same, lambda Ts: scaled(Ts, 2.0), {"scale": "none"}, "scale"),
+            (same, same, {"scale": 2.0}, "scale"),
+        ],
+    )
+    def test_what_the_user_has_settled_is_not_repaired(self, of_robot, of_target, options, code):
+        robot, tracking, _ = arm(ON_HAND)
+        config = CalibratorConfig(**options)
+        result = calibrate_arm(of_robot(robot), of_target(tracking), config)
+        assert [found.code for found in result.findings] == [code]
+        assert result.verdict is hec.Verdict.DO_NOT_USE
+
+
+class TestInput:
+    def test_rows_and_pairs_as_opencv_has_them_are_poses(self):
+        robot, tracking, _ = arm(ON_HAND)
+        expected = calibrate_arm(robot, tracking).T_parent_child
+        of_opencv = [(Ts[:, :3, :3], Ts[:, :3, 3:]) for Ts in (robot, tracking)]
+        vectors = [(se3.rotation_log(Ts[:, :3, :3]), Ts[:, :3, 3]) for Ts in (robot, tracking)]
+        rows = [se3.to_rows(Ts) for Ts in (robot, tracking)]
+        lists = [[T.tolist() for T in Ts] for Ts in (robot, tracking)]
+        for first, second in (of_opencv, vectors, rows, lists):
+            np.testing.assert_allclose(
+                calibrate_arm(first, second).T_parent_child, expected, atol=1e-9
+            )
+
+    def test_four_arrays_of_opencv_are_refused_with_the_right_call(self):
+        robot, tracking, _ = arm(ON_HAND)
+        arrays = [robot[:, :3, :3], robot[:, :3, 3], tracking[:, :3, :3], tracking[:, :3, 3]]
+        with pytest.raises(InputError, match=r"\(R_gripper2base, t_gripper2base\)"):
+            calibrate_arm(*arrays)
+
+    @pytest.mark.parametrize("solve", [calibrate_arm, calibrate_stops])
+    def test_what_is_no_pose_is_named_in_one_line(self, solve):
+        robot, tracking, _ = arm(ON_HAND)
+        holed = tracking.copy()
+        holed[3, 0, 3] = np.nan
+        cases = {
+            "20 poses of .*, 18 of": (robot, tracking[:18]),
+            "row 4: a number is not finite": (robot, holed),
+            "the matrix is transposed": (np.swapaxes(robot, 1, 2), tracking),
+            r"expected poses as \(N, 4, 4\)": (robot[:, :2], tracking),
+            "rows of different shapes": ([[1.0, 2.0], [3.0]], tracking),
+            "20 rotations, 18 translations": ((robot[:, :3, :3], robot[:18, :3, 3]), tracking),
+        }
+        for message, (first, second) in cases.items():
+            with pytest.raises(InputError, match=message) as raised:
+                solve(first, second)
+            assert "\n" not in str(raised.value)
+
+
+def test_stops_that_turn_about_two_axes_are_not_said_to_lack_them():
+    robot, tracking, _ = arm(ON_HAND, noise_m=0.0005)
+    config = CalibratorConfig(parent_scale=1.0, scale="none")
+    result = calibrate_arm(scaled(robot, 1e3), tracking, config)
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    assert "two axes" not in " ".join(reason.sentence for reason in result.reasons)
+
+
+def test_two_files_need_no_stamps(tmp_path, capsys):
+    robot, tracking, truth = arm(ON_HAND)
+    files = []
+    for name, Ts in (("hand", robot), ("camera", se3.inverse(tracking))):
+        vectors = np.c_[Ts[:, :3, 3], se3.rotation_log(Ts[:, :3, :3])]
+        files.append(str(tmp_path / f"{name}.csv"))
+        np.savetxt(files[-1], vectors, delimiter=",", header="x,y,z,rx,ry,rz", comments="")
+    assert main(["calibrate", *files, "--order", "none", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(
+        np.array(document["T_parent_child"]["matrix"])[:3, 3], truth[:3, 3], atol=WITHIN_M
+    )
+
+
+def test_rotations_alone_give_no_position():
+    robot, tracking, truth = arm(ON_HAND)
+    config = CalibratorConfig(parent_measures="rotations")
+    result = calibrate_arm(robot, tracking, config)
+    assert result.out_of_reach == ("x", "y", "z")
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[3:]) < WITHIN_RAD
+
+
+def test_degrees_under_names_of_rotation_vectors_are_refused(tmp_path, capsys):
+    robot, tracking, _ = arm(ON_HAND)
+    angles = np.degrees(se3.rotation_to_rpy(robot[:, :3, :3]))
+    np.savetxt(
+        tmp_path / "hand.csv",
+        np.c_[robot[:, :3, 3], angles],
+        delimiter=",",
+        header="x,y,z,rx,ry,rz",
+        comments="",
+    )
+    stamps_ns = np.arange(len(tracking)) * 10**9
+    hec.write_trajectory(tmp_path / "camera.tum", hec.Trajectory(stamps_ns, tracking))
+    files = [str(tmp_path / name) for name in ("hand.csv", "camera.tum")]
+    assert main(["calibrate", *files, "--order", "none"]) == 1
+    assert "angles in degrees" in capsys.readouterr().err
