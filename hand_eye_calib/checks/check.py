@@ -139,6 +139,8 @@ def check_streams(
     findings += frozen
     if flat := check_flat(aligned.parent, aligned.child):
         return CheckResult(gravest_first([*findings, *flat]))
+    if turned := agreement.check_parts(aligned.synchronised):
+        return CheckResult(gravest_first([*findings, *turned]))
     if not explanation:
         start = known[0] if known else None
         explanation, found = _explained(aligned, at.correlation, start, is_frozen=bool(frozen))

@@ -368,6 +368,12 @@ _ROWS = {
         severity=_NOTE,
         code="one_axis",
     ),
+    "parts_turned": _Row(
+        "two parts of the recording are sound by themselves, and their rotations differ by {size}",
+        "calibrate the parts before and after on their own",
+        "a source that started anew with other axes, or streams that were swapped",
+        code="mount_moved",
+    ),
     "mount_moved": _Row(
         "the extrinsic changes {at_s:.0f} s after the start by {size}",
         "tighten it and record again, or calibrate the parts before and after on their own",

@@ -332,3 +332,42 @@ def test_only_what_is_more_than_recordings_scatter_is_said_to_have_moved():
     scattered = np.where(np.arange(20)[:, None] < 8, 0.0, 0.3 * SHIFT)
     spread, warnings = possible_shift(products_of(scattered, sigma=1e-3), 1.0)
     assert (spread.max() > 0.0, warnings) == (True, ())
+
+
+class TestGraveAgain:
+    """Faults that spoil the answer by many standard deviations are errors, not warnings."""
+
+    @staticmethod
+    def errors(code, severity):
+        sound = drive()
+        fault = next(fault for fault in (*FAULTS, *LATER, *SILENT) if fault.code == code)
+        random = np.random.default_rng(5)
+        parent, child = fault.damage(sound.parent, sound.child, fault.severities[severity], random)
+        result = hec.calibrate(parent, child, max_pairs=400, **fault.options)
+        return [each.code for each in result.findings if each.severity.value == "error"]
+
+    @pytest.mark.parametrize(
+        ("code", "severity", "name"),
+        [
+            ("S2", 0, "same_position"),  # positions of the parent with 1 cm of noise
+            ("S4", 1, "position_clock"),  # low-passed by 100 ms
+            ("V1", 1, "position_clock"),  # the parent's positions 50 ms late
+            ("V2", 2, "position_clock"),  # orientations 100 ms late
+        ],
+    )
+    def test_a_fault_is_an_error(self, code, severity, name):
+        assert name in self.errors(code, severity)
+
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    @pytest.mark.parametrize("share", [0.5, 0.4])
+    def test_a_child_that_starts_anew_with_left_handed_axes_is_an_error(self, axis, share):
+        sound = drive(1)
+        poses = sound.child.poses.copy()
+        first = int(share * len(poses))
+        mirror = np.diag(np.where(np.arange(4) == axis, -1.0, 1.0))
+        mirrored = mirror @ poses[first:] @ mirror
+        poses[first:] = se3.inverse(mirrored[0]) @ mirrored
+        child = dataclasses.replace(sound.child, poses=poses)
+        result = hec.calibrate(sound.parent, child, max_pairs=400)
+        assert "mount_moved" in [each.code for each in result.findings]
+        assert result.verdict is hec.Verdict.DO_NOT_USE
