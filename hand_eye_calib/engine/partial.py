@@ -88,7 +88,8 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
     offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
-    allowance = 2.0 * _POINT_M**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    kind = config.parent_kind if is_child else config.child_kind
+    allowance = _allowance(stamps_ns, poses, kind)
     return estimation.calibration_of(
         solution,
         fused,
@@ -106,6 +107,15 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         scale_sigma=solution.scale_sigma * scale**2,
         findings=findings,
     )
+
+
+def _allowance(stamps_ns: IntArray, poses: FloatArray, kind: str) -> FloatArray:
+    """Covariance (6, 6) of what no recording shows: the points that both sensors measure, and the
+    travel of an odometry in ``FLOOR_TRAVEL_S``, as for poses.
+    """
+    speed_m_s = covariance.usual_speed(stamps_ns, poses[:, :3, 3]) if kind == "odometry" else 0.0
+    variance = 2.0 * _POINT_M**2 + (covariance.FLOOR_TRAVEL_S * speed_m_s) ** 2
+    return variance * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def _steps(

@@ -5,6 +5,7 @@ import pytest
 from motions import geodetic, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
+from hand_eye_calib.assessment.covariance import usual_speed
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.engine.run import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
@@ -165,6 +166,15 @@ class TestLeverArm:
         known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)}, checks=False)
         assert known.status is hec.SolveStatus.OK
         assert "z of the child sensor: mostly from the prior, not the motion" in known.warnings
+
+    @pytest.mark.parametrize(("kind", "travel_s"), [("odometry", 0.005), ("exact", 0.0)])
+    def test_the_allowance_grows_with_the_speed_of_an_odometry(self, kind, travel_s):
+        parent, child, _ = simulated_positions("car", seed=4)
+        found = hec.calibrate(parent, child, parent_kind=kind, checks=False)
+        speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
+        assert speed_m_s > 5.0
+        expected_m = np.sqrt(2.0 * 0.005**2 + (travel_s * speed_m_s) ** 2)
+        assert found.allowance[:3] == pytest.approx(expected_m, rel=0.1)
 
     def test_positions_of_another_body_are_not_to_be_used(self, streams):
         found = hec.calibrate(streams[0], recorded(seed=8)[1])
