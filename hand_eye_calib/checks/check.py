@@ -143,7 +143,8 @@ def check_streams(
         return CheckResult(gravest_first([*findings, *turned]))
     if not explanation:
         start = known[0] if known else None
-        explanation, found = _explained(aligned, at.correlation, start, is_frozen=bool(frozen))
+        is_frozen = any(found.makes_unusable for found in frozen)
+        explanation, found = _explained(aligned, at.correlation, start, is_frozen)
         findings += found
     if not explanation:
         return CheckResult(gravest_first(findings))
@@ -154,12 +155,19 @@ def check_streams(
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right, explanation, offset.fit, scale)
     findings = _in_metres(findings, [*lengths, *sizes], scale)
-    is_sound = not any(found.makes_unusable for found in findings)
+    # Whether both are inverse is not decided yet: streams as they are may be right.
+    is_open = explanation.readings is not None and explanation.readings.hypotheses[0].is_upright
+    of_reading = explanation.findings if is_open else ()
+    is_sound = not any(found.makes_unusable for found in findings if found not in of_reading)
     findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
+    if is_sound and is_open and known and not explanation.hypothesis.is_upright:
+        right = streams.shifted(offset.seconds)
+        motions = _motions(right.synchronised, hypotheses.MAX_PAIRS)
+        fit = similarity.fit_similarity(motions, start=known[0])
     if is_sound and not lengths:
-        findings += _check_agreeing(
-            right, given, fit, known, time_offset_s + offset.seconds, are_exact
-        )
+        offset_s = time_offset_s + offset.seconds
+        is_one_axis = any(found.code == "one_axis" for found in sizes)
+        findings += _check_agreeing(right, given, fit, known, offset_s, are_exact, is_one_axis)
     return CheckResult(gravest_first(findings), explanation.fit, offset, explanation.readings)
 
 
@@ -300,6 +308,7 @@ def _check_agreeing(
     known: Known | None,
     offset_s: float,
     are_exact: bool,
+    is_one_axis: bool,
 ) -> list[Finding]:
     """What else there is to say of streams that agree as they are, on one clock, and of the same
     streams as they were given.
@@ -313,7 +322,7 @@ def _check_agreeing(
     findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
     if findings or are_exact:
         return findings
-    return independence.check_fusion(pose_pairs, best[0])
+    return independence.check_fusion(pose_pairs, best[0], is_one_axis)
 
 
 def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:

@@ -47,8 +47,8 @@ _ROWS = {
         severity=_WARNING,
     ),
     "frozen": _Row(
-        "the {stream} stream repeats the same pose for {share:.0%} of the time while the other "
-        "sensor moves",
+        "the {stream} stream repeats the same pose for {frozen_s:.1f} s ({share:.1%} of the time) "
+        "while the other sensor moves",
         "find out why its source stopped, and cut that part out",
     ),
     "interleaved": _Row(
@@ -390,7 +390,8 @@ LIMITS = {
     "time_offset": (5.0, 0.005, 0.01, 0.1),  # s
     "scale": (0.0, 0.01, 0.01, 0.03),  # of the factor, less 1; the fit knows more
     "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
-    "frozen": (0.0, 0.02, 0.02, 0.02),  # share of the time
+    # Share of the time; a second or more is at least a note.
+    "frozen": (0.0, 1e-9, 0.02, 0.02),
     "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m
     # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
     # smoothing does not contain noise of the columns. Both by the shift of positions, m.

@@ -90,7 +90,7 @@ def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> lis
     return []
 
 
-def check_fusion(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
+def check_fusion(pose_pairs: PosePairs, X: FloatArray, is_one_axis: bool) -> list[Finding]:
     """Find out whether one of two odometries follows the other through an assumed transform.
 
     Parameters
@@ -99,9 +99,12 @@ def check_fusion(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
         On one clock, in one unit of length.
     X : (4, 4) array
         The extrinsic.
+    is_one_axis : bool
+        The sensors rotate about one axis only: their rotations do not show the mount.
     """
-    findings = (_other_mount(pose_pairs), _no_drift(pose_pairs, X))
-    return [*filter(None, findings)][:1]
+    other_mount = None if is_one_axis else _other_mount(pose_pairs)
+    found = other_mount or _no_drift(pose_pairs, X)
+    return [found] if found else []
 
 
 def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Finding:

@@ -190,7 +190,11 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Findings about streams that repeat their pose while the other moves, on one clock."""
     shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
-    findings = (graded("frozen", name, share, share=share) for name, share in shares.items())
+    durations_s = {"parent": parent.duration_s, "child": child.duration_s}
+    findings = (
+        graded("frozen", name, share, share=share, frozen_s=share * durations_s[name])
+        for name, share in shares.items()
+    )
     return [*filter(None, findings)]
 
 

@@ -240,10 +240,19 @@ class TestParentFusedFromTheChild:
         truth = make(kind, 901)
         inside = slice(2, -2)
         parent = fused(truth.parent[inside], truth.child, truth.T_parent_child @ self.WRONG, tau_s)
-        codes = {found.code for found in check_streams(parent, truth.child).findings}
+        result = hec.calibrate(parent, truth.child)
+        assert result.verdict is not Verdict.USE
+        codes = {found.code for found in result.findings}
         # Positions that are turned against orientations show the longest times.
         assert codes & {"not_independent", "worlds_turned"}
-        assert check_streams(truth.parent, truth.child).findings == ()
+        clean = hec.calibrate(truth.parent, truth.child)
+        assert (clean.verdict, clean.findings) == (Verdict.USE, ())
+
+    @pytest.mark.parametrize("seed", [61, 62])
+    def test_rotations_about_one_axis_show_no_other_mount(self, seed):
+        flat = make("flat_agv", seed)
+        codes = [found.code for found in check_streams(flat.parent, flat.child).findings]
+        assert codes == ["one_axis"]
 
     @pytest.mark.parametrize("kind", ["car_ins_lidar", "agv_long"])
     def test_streams_that_never_drift_apart_on_a_long_path_are_questioned(self, kind):
