@@ -21,7 +21,7 @@ from hand_eye_calib.alignment.similarity import SimilarityFit
 from hand_eye_calib.alignment.time_offset import Correlation, TimeOffset
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
-from hand_eye_calib.checks import agreement, hypotheses, independence
+from hand_eye_calib.checks import agreement, hypotheses, independence, misread
 from hand_eye_calib.checks.agreement import Known
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.checks.hypotheses import Explanation, Readings, StreamPair
@@ -144,7 +144,7 @@ def check_streams(
     if not explanation:
         start = known[0] if known else None
         is_frozen = any(found.makes_unusable for found in frozen)
-        explanation, found = _explained(aligned, at.correlation, start, is_frozen)
+        explanation, found = _explained_or_misread(streams, aligned, at, start, is_frozen)
         findings += found
     if not explanation:
         return CheckResult(gravest_first(findings))
@@ -246,6 +246,20 @@ def _of_slow(
             return found, replace(correlation, offset_s=0.0)
     from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
+
+
+def _explained_or_misread(
+    given: StreamPair, aligned: StreamPair, at: TimeOffset, start: FloatArray | None, frozen: bool
+) -> tuple[Explanation | None, list[Finding]]:
+    """The explanation that holds, if there is one, or what the streams are in truth, and findings.
+    ``given`` are the streams with the clock offset that is known, ``aligned`` with all of it.
+    """
+    if found := misread.earth_centred(aligned):
+        return None, found
+    explanation, found = _explained(aligned, at.correlation, start, frozen)
+    if not explanation:
+        found = misread.misreadings(given, aligned) or found
+    return explanation, found
 
 
 def _explained(

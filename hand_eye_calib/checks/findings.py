@@ -132,6 +132,27 @@ _ROWS = {
         "write positions and orientations in the same right-handed axes; of angles in a file name "
         "the column heading if they are clockwise from north, otherwise yaw",
     ),
+    "euler_order": _Row(
+        "{whose} orientations seem to be angles in the other order: roll about x first, in turning "
+        "axes, and read as about fixed axes",
+        "write quaternions, or roll, pitch and yaw about the fixed axes x, y and z (REP 103)",
+    ),
+    "motions": _Row(
+        "the {stream} stream holds motions since the pose before, not poses: chained, they agree "
+        "with the other stream",
+        "write the poses in one world; of motions, the product of all up to each",
+        "such as odometry or scan matching that writes increments",
+    ),
+    "positions_turned": _Row(
+        "{whose} positions are in other axes than its orientations, turned by {turned_deg:.0f} deg",
+        "write positions and orientations in one and the same world",
+    ),
+    "earth_centred": _Row(
+        "{whose} positions count from the centre of the earth (ECEF), its orientations do not: "
+        "they are relative to local axes such as east, north, up",
+        "write both in local axes, such as east, north, up (ENU), or both earth-centred; or give "
+        "latitude, longitude and height in place of the positions",
+    ),
     "ambiguous": _Row(
         "this motion fits another explanation as well: {whose} positions are in other axes, "
         "(x, y, z) for ({detail}). That gives another rotation",

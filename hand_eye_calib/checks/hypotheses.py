@@ -123,6 +123,7 @@ class StreamPair:
 
 #: Codes of the conventions that a stream breaks.
 _Way: TypeAlias = tuple[str, ...]
+_EULER_ORDER: _Way = ("euler_order",)
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,9 @@ class Hypothesis:
         way = self.child if stream == "child" else self.parent
         if way and self.axes is not None:
             return se3.from_rotation_translation(poses[:, :3, :3], poses[:, :3, 3] @ self.axes.T)
+        if way == _EULER_ORDER:
+            rotations = se3.in_other_order(poses[:, :3, :3])
+            return se3.from_rotation_translation(rotations, poses[:, :3, 3])
         return se3.put_right(poses, **dict(map(CONVENTIONS.__getitem__, way)))
 
     def undo(self, streams: StreamPair) -> StreamPair:
@@ -271,6 +275,8 @@ _USUAL = [
     *(each for each in _ALL_WAYS[1:] if ("inverse", "both") not in each.mistakes),
     Hypothesis(child=("left_handed",), axes=_MIRROR),
     Hypothesis(parent=("left_handed",), axes=_MIRROR),
+    Hypothesis(child=_EULER_ORDER),
+    Hypothesis(parent=_EULER_ORDER),
 ]
 
 
@@ -319,7 +325,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         if chosen.holds:
             doubts: list[Finding] = []
             hypothesis = chosen.hypothesis
-            if hypothesis.axes is None and {*dict(hypothesis.mistakes)} - {"inverse"}:
+            if {*dict(hypothesis.mistakes)} - {"inverse", "axes"}:
                 chosen, doubts = _or_axes(chosen, streams, lag_s)
             found = attributed(chosen, streams, lag_s)
             return replace(found, findings=(*found.findings, *doubts))
@@ -401,7 +407,7 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
     """The explanation, or one that holds, too, with which both sensors move in a steady direction
     of their own, as those of vehicles do; and whether they do.
     """
-    if chosen.hypothesis.axes is not None:
+    if chosen.hypothesis.axes is not None or _EULER_ORDER in chosen.hypothesis.ways:
         return chosen, True
     both = streams.parent, streams.child
     few = [stream.poses[:: 1 + len(stream) // MAX_PAIRS] for stream in both]

@@ -118,6 +118,17 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
     return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
 
 
+def in_other_order(rotations: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) whose roll, pitch and yaw were applied in this order about turning axes,
+    but read as those about fixed axes.
+    """
+    angles = rotation_to_rpy(rotations)
+    roll, pitch, yaw = (
+        rotation_exp(angles[..., axis, None] * np.eye(3)[axis]) for axis in range(3)
+    )
+    return roll @ pitch @ yaw
+
+
 def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm.
 

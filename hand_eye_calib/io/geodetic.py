@@ -9,7 +9,11 @@ import numpy as np
 from hand_eye_calib.arrays import FloatArray
 
 # Equatorial radius (m) and flattening.
-_RADIUS_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+_RADIUS_M = 6_378_137.0
+_FLATTENING = 1.0 / 298.257223563
+# Distance (m) from the centre of the earth of places on it, and of aircraft.
+_LEAST_M = 6.3e6
+_MOST_M = 6.45e6
 
 
 class LocalOrigin:
@@ -30,6 +34,27 @@ class LocalOrigin:
         # than many.
         terms = from_origin[:, :, None] * _axes(*origin[:2])
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
+
+
+def are_earth_centred(positions: FloatArray) -> bool:
+    """Whether all positions (N, 3), m, may count from the centre of the earth."""
+    distances = np.linalg.norm(positions, axis=1)
+    return bool(((distances > _LEAST_M) & (distances < _MOST_M)).all())
+
+
+def axes_of_places(positions: FloatArray) -> FloatArray:
+    """East, north and up (N, 3, 3), as columns, of positions (N, 3), m, from the centre of the
+    earth. The latitude is that of Bowring 1976, to 1e-9 rad on the ground.
+    """
+    x, y, z = positions.T
+    from_axis = np.hypot(x, y)
+    polar_radius = _RADIUS_M * (1.0 - _FLATTENING)
+    eccentricity_2 = _FLATTENING * (2.0 - _FLATTENING)
+    second_2 = eccentricity_2 / (1.0 - eccentricity_2)
+    reduced = np.arctan2(z * _RADIUS_M, from_axis * polar_radius)
+    up = z + second_2 * polar_radius * np.sin(reduced) ** 3
+    out = from_axis - eccentricity_2 * _RADIUS_M * np.cos(reduced) ** 3
+    return _axes(np.arctan2(up, out), np.arctan2(y, x))
 
 
 def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:

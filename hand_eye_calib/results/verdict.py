@@ -435,7 +435,6 @@ _APART = (
 )
 
 RULES = (
-    Rule("not_converged", _NEVER, "the solver did not converge", _not_converged),
     Rule(
         "prior",
         _NEVER,
@@ -449,6 +448,8 @@ RULES = (
         "a stream check found an error",
         partial(_findings_of, Severity.ERROR),
     ),
+    # Behind the faults of the streams, which are often its cause.
+    Rule("not_converged", _NEVER, "the solver did not converge", _not_converged),
     Rule("nothing_known", _NEVER, "all six axes are unobservable; of stops, any", _nothing_known),
     Rule(
         "recordings_differ",

@@ -61,9 +61,9 @@ def several(kind):
 
 # Rule to a result in which it alone applies.
 CASES = {
-    "not_converged": dict(status=SolveStatus.NOT_CONVERGED),
     "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
     "error_finding": dict(findings=(FINDING,)),
+    "not_converged": dict(status=SolveStatus.NOT_CONVERGED),
     "nothing_known": dict(observability_measured=observed(np.inf, np.inf)),
     "recordings_differ": dict(together=several("differ")),
     "unobservable": dict(observability_measured=observed(z=np.inf)),

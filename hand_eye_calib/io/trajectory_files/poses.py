@@ -22,6 +22,7 @@ from hand_eye_calib.geometry.trajectory import (
     far_position,
     scatter_of_direction,
 )
+from hand_eye_calib.io.geodetic import are_earth_centred, axes_of_places
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     QUATERNION,
@@ -46,6 +47,9 @@ _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
 # The inverse rotation in roll, pitch and yaw, as pyboreas has it.
 _INVERSE = "that of the world in the sensor's frame"
+_OTHER_ORDER = "counterclockwise from x, about axes that roll and pitch have turned"
+# A sensor that stays as level as this scatters no more than noise: 1 minus the cosine of 2.5 deg.
+_LEVEL = 1e-3
 
 # ---- poses and rates
 
@@ -61,29 +65,51 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     )
     if table.measures == "rates":
         return (_in_si(table, RATES, "rate"),)
-    positions, to_first = np.zeros((len(table.line_numbers), 3)), None
+    if MATRIX[0] in table.at:
+        positions, quats_xyzw = _of_matrices(table)
+    else:
+        positions, to_first = _positions(table)
+        quats_xyzw = _orientations(table, positions, convention)
+        if to_first is not None:
+            in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
+            quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
+    if table.measures == "poses" and are_earth_centred(positions):
+        quats_xyzw = _in_axes_of_earth(table, positions, quats_xyzw)
+    return positions, quats_xyzw
+
+
+def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
+    """Positions (N, 3), m, and, of latitudes, the rotations (N, 3, 3) from the axes of each
+    position to those of the first.
+    """
+    positions = np.zeros((len(table.line_numbers), 3))
+    to_first = None
     up = [name for name in ("z", "height") if name in table.at][:1]
     if "lat" in table.at:
         positions, to_first = _on_earth(table, up)
     elif "x" in table.at:
         names = ("x", "y", *up)
         positions[:, : len(names)] = _in_si(table, names, "length")
-    elif MATRIX[0] in table.at:
-        matrices = table.values(MATRIX).reshape(-1, 3, 4)
-        positions = matrices[:, :, 3]
     if not up and {"x", "lat"} & table.at.keys():
         table.guess("no column of heights: taken as 0")
+    _refuse_far(table, positions)
+    return positions, to_first
+
+
+def _refuse_far(table: Table, positions: FloatArray) -> None:
     table.refuse(
         np.asarray(np.abs(positions).max(axis=1) > FARTHEST_M),
         lambda row: f"{far_position(*positions[row])}; check its unit",
     )
-    if MATRIX[0] not in table.at:
-        quats_xyzw = _orientations(table, positions, convention)
-        if to_first is not None:
-            in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
-            quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
-        return positions, quats_xyzw
-    # The nearest rotations: files have few digits.
+
+
+def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
+    """Positions (N, 3), m, and quaternions (N, 4), scalar last, of matrices: those of the nearest
+    rotations, as files have few digits.
+    """
+    matrices = table.values(MATRIX).reshape(-1, 3, 4)
+    positions = matrices[:, :, 3]
+    _refuse_far(table, positions)
     nearest = se3.nearest_rotation(matrices[:, :, :3])
     table.refuse(
         np.asarray(np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2)) > ROTATION_TOLERANCE),
@@ -92,7 +118,55 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
             "of the values"
         ),
     )
-    return positions, se3.to_quat_xyzw(nearest)
+    if not table.is_transposable:
+        return positions, se3.to_quat_xyzw(nearest)
+    ways = {
+        "row by row": se3.to_quat_xyzw(nearest),
+        "column by column": se3.to_quat_xyzw(np.swapaxes(nearest, 1, 2)),
+    }
+    fitting = _fitting(positions, ways)
+    reason = ", because the motion fits that" if len(fitting) == 1 else ""
+    table.guess(f"rotations are not beside the translations; read {fitting[0]}{reason}")
+    return positions, ways[fitting[0]]
+
+
+_EARTH = "the axes of the earth, too"
+_EAST = "east, north and up of each place (ENU)"
+_NORTH = "north, east and down of each place (NED)"
+# Axes north, east and down in those east, north and up.
+_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArray) -> FloatArray:
+    """Quaternions (N, 4) in the axes of positions (N, 3) from the centre of the earth: those of the
+    file may be in the axes of each place. The motion tells, or else that a vehicle stays level.
+    """
+    axes = axes_of_places(positions)
+    rotations = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
+    ways = {
+        _EARTH: quats_xyzw,
+        _EAST: se3.to_quat_xyzw(axes @ rotations),
+        _NORTH: se3.to_quat_xyzw(axes @ _NED @ rotations),
+    }
+    fitting = _fitting(positions, ways)
+    if len(fitting) > 1:
+        up = axes[:, :, 2]
+        tilts = {way: _tilt(ways[way], up) for way in fitting}
+        most = CLEARLY * min(tilts.values())
+        fitting = [way for way in fitting if tilts[way] <= max(most, _LEVEL)]
+    reason = ", because the motion fits that" if len(fitting) < len(ways) else ""
+    table.guess(
+        "positions count from the centre of the earth (ECEF); orientations read as relative to "
+        f"{fitting[0]}{reason}"
+    )
+    return ways[fitting[0]]
+
+
+def _tilt(quats_xyzw: FloatArray, up: FloatArray) -> float:
+    """How much directions (N, 3) scatter in the axes of a sensor: 0 if they are always the same."""
+    rotations = se3.from_quat_xyzw(np.zeros((len(up), 3)), quats_xyzw)[:, :3, :3]
+    in_sensor = np.einsum("nji,nj->ni", rotations, up)
+    return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
 def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
@@ -221,10 +295,18 @@ def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatA
         for rpy in ((roll, -pitch, np.pi / 2 - angle), (roll, pitch, angle))
     )
     inverse = np.swapaxes(usual, 1, 2)
-    rotations = {_COMPASS: compass, _MATHEMATICAL: usual, _INVERSE: inverse}
+    other_order = se3.in_other_order(usual)
+    rotations = {
+        _COMPASS: compass,
+        _MATHEMATICAL: usual,
+        _INVERSE: inverse,
+        _OTHER_ORDER: other_order,
+    }
     ways = {way: se3.to_quat_xyzw(each) for way, each in rotations.items()}
     expected = _COMPASS if names[-1] == "heading" else _MATHEMATICAL
-    table.conventions = sorted(_fitting(positions, ways), key=lambda way: way != expected)
+    # In flat motion the order of angles does not matter.
+    unlikely = {expected: 0, _OTHER_ORDER: 2}
+    table.conventions = sorted(_fitting(positions, ways), key=lambda way: unlikely.get(way, 1))
     way = convention or table.conventions[0]
     if expected == _COMPASS or way != expected:
         why = "" if way == expected else ", because the motion fits that and not the usual"

@@ -1,0 +1,189 @@
+"""Streams that are not what they seem: each is named, whichever stream it is, and right streams are
+not: motions in place of poses, other orders of angles, positions in other axes than orientations.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    noisy_pair,
+    read_trajectory_file,
+    smooth_poses,
+    wandering_poses,
+)
+
+from hand_eye_calib.checks.check import check_streams
+from hand_eye_calib.geometry import se3
+from hand_eye_calib.io.geodetic import axes_of_places
+from hand_eye_calib.io.trajectory_files.reading import AUTO
+from hand_eye_calib.io.trajectory_files.table import write_trajectory
+
+# Place on the earth (m from its centre).
+HANNOVER_M = np.array([3_861_442.9, 660_048.4, 5_016_536.7])
+
+
+def hilly_drive(n_poses=900):
+    """(N, 4, 4) poses of a car: x forward, slopes and banks of some degrees, in loops."""
+    steps = np.arange(n_poses)
+    yaw = 0.01 * steps + 0.8 * np.sin(0.02 * steps)
+    pitch = 0.08 * np.sin(0.031 * steps)
+    roll = 0.06 * np.sin(0.043 * steps + 1.0)
+    rotations = se3.rotation_from_rpy(np.c_[roll, pitch, yaw])
+    positions = np.cumsum(0.8 * rotations[:, :, 0], axis=0)
+    return se3.from_rotation_translation(rotations, positions)
+
+
+PATHS = {"car": hilly_drive, "hand": lambda: wandering_poses(700)}
+
+
+def pair(path, seed=3):
+    return noisy_pair(PATHS[path](), seed, 0.003, 0.0005)
+
+
+def with_poses(stream, rotations, positions):
+    poses = se3.from_rotation_translation(rotations, positions)
+    return dataclasses.replace(stream, poses=poses)
+
+
+def of_motions(stream):
+    steps = se3.inverse(stream.poses[:-1]) @ stream.poses[1:]
+    return dataclasses.replace(stream, stamps_ns=stream.stamps_ns[1:], poses=steps)
+
+
+def of_backward_motions(stream):
+    steps = se3.inverse(stream.poses[1:]) @ stream.poses[:-1]
+    return dataclasses.replace(stream, stamps_ns=stream.stamps_ns[1:], poses=steps)
+
+
+def in_turning_axes(stream):
+    """Angles about turning axes, roll first, read as those about fixed axes."""
+    rotations = stream.poses[:, :3, :3]
+    pitch = np.arcsin(np.clip(rotations[:, 0, 2], -1.0, 1.0))
+    roll = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
+    yaw = np.arctan2(-rotations[:, 0, 1], rotations[:, 0, 0])
+    return with_poses(
+        stream, se3.rotation_from_rpy(np.c_[roll, pitch, yaw]), stream.poses[:, :3, 3]
+    )
+
+
+def turned(stream):
+    turn = se3.rotation_exp(np.array([0.7, -0.4, 1.1]))
+    return with_poses(stream, stream.poses[:, :3, :3], stream.poses[:, :3, 3] @ turn.T)
+
+
+def from_the_centre(stream):
+    """Positions from the centre of the earth with orientations in axes of the place."""
+    axes = axes_of_places(HANNOVER_M[None])[0]
+    positions = stream.poses[:, :3, 3] @ axes.T + HANNOVER_M
+    return with_poses(stream, stream.poses[:, :3, :3], positions)
+
+
+def mirrored_about_the_vertical(stream):
+    return with_poses(stream, stream.poses[:, :3, :3], stream.poses[:, :3, 3] * [-1.0, -1.0, 1.0])
+
+
+MISREAD = {
+    "motions": (of_motions, "motions"),
+    "backward motions": (of_backward_motions, "motions"),
+    "order of angles": (in_turning_axes, "euler_order"),
+    "turned positions": (turned, "positions_turned"),
+    "positions from the centre of the earth": (from_the_centre, "earth_centred"),
+    "-x -y": (mirrored_about_the_vertical, "axes"),
+}
+
+
+def errors(found):
+    return {(each.code, each.stream) for each in found.findings if each.severity.value == "error"}
+
+
+@pytest.mark.parametrize("stream", ["parent", "child"])
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("kind", MISREAD)
+def test_what_a_stream_is_in_truth_is_named(kind, path, stream):
+    spoil, code = MISREAD[kind]
+    parent, child = pair(path)
+    if stream == "parent":
+        found = check_streams(spoil(parent), child)
+    else:
+        found = check_streams(parent, spoil(child))
+    assert errors(found) == {(code, stream)}
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("seed", range(3))
+def test_right_streams_are_not_named(path, seed):
+    assert errors(check_streams(*pair(path, seed))) == set()
+
+
+def test_streams_of_two_bodies_stay_unrelated():
+    parent, _ = pair("hand", 1)
+    _, child = noisy_pair(smooth_poses(np.arange(700) / 10), 2, 0.003, 0.0005)
+    assert {code for code, _ in errors(check_streams(parent, child))} == {"unrelated"}
+
+
+# ---- files that the motion of the sensor tells
+
+
+def read(path):
+    reading = read_trajectory_file(path, AUTO)
+    return reading.trajectory, " ".join(reading.guesses)
+
+
+@pytest.mark.parametrize("by_columns", [False, True])
+@pytest.mark.parametrize("path", PATHS)
+def test_rotations_before_translations_are_read_by_rows_or_by_columns(tmp_path, by_columns, path):
+    truth = as_trajectory(PATHS[path]() @ T_PARENT_CHILD)
+    rotations = truth.poses[:, :3, :3]
+    written = np.swapaxes(rotations, 1, 2) if by_columns else rotations
+    rows = np.c_[truth.stamps_ns / 1e9, written.reshape(-1, 9), truth.poses[:, :3, 3]].tolist()
+    file = tmp_path / "poses.txt"
+    file.write_text("\n".join(" ".join(map(repr, row)) for row in rows))
+    found, guesses = read(file)
+    # The motion of what is held in hand does not tell, and the order is said.
+    is_by_columns = by_columns and path == "car"
+    order = "column by column" if is_by_columns else "row by row"
+    assert f"read {order}" in guesses
+    expected = rotations if is_by_columns or not by_columns else written
+    np.testing.assert_allclose(found.poses[:, :3, :3], expected, atol=1e-9)
+    np.testing.assert_allclose(found.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9)
+
+
+FRAMES = {
+    "axes of the earth": (lambda axes: axes, "the axes of the earth, too"),
+    "east, north, up": (lambda axes: np.eye(3), "east, north and up"),
+    "north, east, down": (
+        lambda axes: np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+        "north, east and down",
+    ),
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_orientations_of_positions_from_the_centre_of_the_earth(tmp_path, frame):
+    to_file, words = FRAMES[frame]
+    axes = axes_of_places(HANNOVER_M[None])[0]
+    truth = as_trajectory(hilly_drive())
+    positions = truth.poses[:, :3, 3] @ axes.T + HANNOVER_M
+    spoiled = with_poses(truth, to_file(axes) @ truth.poses[:, :3, :3], positions)
+    write_trajectory(tmp_path / "ecef.tum", spoiled)
+    found, guesses = read(tmp_path / "ecef.tum")
+    assert words in guesses
+    # Up of a place turns by 1 m / 6,378 km on the way to the next.
+    np.testing.assert_allclose(found.poses[:, :3, :3], axes @ truth.poses[:, :3, :3], atol=2e-4)
+
+
+def test_axes_of_places_are_those_of_their_latitude():
+    lat, lon = np.radians([[52.2, -33.5, 0.0], [9.7, -70.25, 0.0]])
+    eccentricity_2 = (2.0 - 1.0 / 298.257223563) / 298.257223563
+    normal = 6_378_137.0 / np.sqrt(1.0 - eccentricity_2 * np.sin(lat) ** 2)
+    positions = np.c_[
+        (normal + 600.0) * np.cos(lat) * np.cos(lon),
+        (normal + 600.0) * np.cos(lat) * np.sin(lon),
+        ((1.0 - eccentricity_2) * normal + 600.0) * np.sin(lat),
+    ]
+    up = axes_of_places(positions)[:, :, 2]
+    expected = np.c_[np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+    np.testing.assert_allclose(up, expected, atol=1e-9)
