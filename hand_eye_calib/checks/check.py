@@ -142,9 +142,7 @@ def check_streams(
     if turned := agreement.check_parts(aligned.synchronised):
         return CheckResult(gravest_first([*findings, *turned]))
     if not explanation:
-        start = known[0] if known else None
-        is_frozen = any(found.makes_unusable for found in frozen)
-        explanation, found = _explained_or_misread(streams, aligned, at, start, is_frozen)
+        explanation, found = _explained_or_misread(streams, aligned, at, known, frozen)
         findings += found
     if not explanation:
         return CheckResult(gravest_first(findings))
@@ -249,14 +247,20 @@ def _of_slow(
 
 
 def _explained_or_misread(
-    given: StreamPair, aligned: StreamPair, at: TimeOffset, start: FloatArray | None, frozen: bool
+    given: StreamPair,
+    aligned: StreamPair,
+    at: TimeOffset,
+    known: Known | None,
+    frozen: Sequence[Finding],
 ) -> tuple[Explanation | None, list[Finding]]:
     """The explanation that holds, if there is one, or what the streams are in truth, and findings.
     ``given`` are the streams with the clock offset that is known, ``aligned`` with all of it.
     """
+    start = known[0] if known else None
+    is_frozen = any(found.makes_unusable for found in frozen)
     if found := misread.earth_centred(aligned):
         return None, found
-    explanation, found = _explained(aligned, at.correlation, start, frozen)
+    explanation, found = _explained(aligned, at.correlation, start, is_frozen)
     if not explanation:
         found = misread.misreadings(given, aligned) or found
     return explanation, found
