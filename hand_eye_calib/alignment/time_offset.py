@@ -16,7 +16,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import Trajectory, repetitions
 from hand_eye_calib.pairing.motion_pairs import MAX_PAIRS, find_leap, pairs_over, synchronise
 from hand_eye_calib.results.records import ClockRate
 from hand_eye_calib.stats import quantile
@@ -40,6 +40,9 @@ _PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS = 2.0, 5.0
 # Streams of one body are 5 to 12 times better correlated at their offset than at any other,
 # unrelated streams at most 1.3 times (measured on sixteen real recordings).
 _DISTINCT, _CORRELATED = 2.0, 0.5
+
+# Poses that are repeated for so long (s) may be those of a stream that froze.
+_REPEATS_S = 1.0
 
 # Smallest standard deviation of the angular rate (rad/s) that can be correlated.
 MIN_VARIATION = 0.01
@@ -138,6 +141,36 @@ def correlate_rates(
     )
     if min(np.isfinite(each).sum() for each in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
         return Correlation()
+    start_s = float(parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
+    best = _best_correlation(of_parent, of_child, start_s, step_s, window_s)
+    if best.is_clear:
+        return best
+    # A stream that froze for a while hides the offset.
+    for stream, rates in ((parent, of_parent), (child, of_child)):
+        _leave_out_repetitions(stream, rates, step_s, window_s)
+    if min(np.isfinite(rates).sum() for rates in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
+        return best
+    without = _best_correlation(of_parent, of_child, start_s, step_s, window_s)
+    return without if without.is_clear else best
+
+
+def _leave_out_repetitions(
+    stream: Trajectory, rates: FloatArray, step_s: float, window_s: float
+) -> None:
+    """Set the rates (M,) of windows to NaN in which a stream repeats its pose for a second."""
+    start_ns = int(stream.stamps_ns[0])
+    for from_ns, until_ns in repetitions(stream, _REPEATS_S):
+        first = max(int(((from_ns - start_ns) * 1e-9 - window_s) / step_s) + 1, 0)
+        last = int((until_ns - start_ns) * 1e-9 / step_s) + 1
+        rates[first : last + 1] = np.nan
+
+
+def _best_correlation(
+    of_parent: FloatArray, of_child: FloatArray, start_s: float, step_s: float, window_s: float
+) -> Correlation:
+    """Return the best correlation of rates (M,), (N,) over all lags; ``start_s`` is the parent's
+    first stamp less the child's.
+    """
     lags, coefficients, overlaps, ratios = _masked_correlation(of_parent, of_child)
     durations = overlaps * step_s
     shorter_s = min(len(of_parent), len(of_child)) * step_s
@@ -152,7 +185,6 @@ def correlate_rates(
     below, top, above = coefficients[np.arange(best - 1, best + 2) % len(coefficients)]
     curvature = below - 2 * top + above
     beside = 0.0 if curvature >= 0 else np.clip(0.5 * (below - above) / curvature, -0.5, 0.5)
-    start_s = (parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
     return Correlation(
         offset_s=float(start_s + (lags[best] + beside) * step_s),
         correlation=float(top),

@@ -12,7 +12,7 @@ wrong with them.
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -146,26 +146,49 @@ def check_streams(
         findings += found
     if not explanation:
         return CheckResult(gravest_first(findings))
+    about = _Given(known, scale, time_offset_s, are_exact)
+    return _check_explained(given, streams, explanation, at, findings, about)
+
+
+class _Given(NamedTuple):
+    """Arguments of :func:`check_streams` beside the streams."""
+
+    known: Known | None
+    scale: float
+    time_offset_s: float
+    are_exact: bool
+
+
+def _check_explained(
+    given: StreamPair,
+    streams: StreamPair,
+    explanation: Explanation,
+    at: TimeOffset,
+    findings: list[Finding],
+    about: _Given,
+) -> CheckResult:
+    """Check streams that a hypothesis explains: ``streams`` have the known time offset, and
+    ``findings`` were found before.
+    """
     are_read_well = not any(found.makes_unusable for found in findings if found.code != _ROUNDED)
-    lengths = check_lengths(parent) if are_read_well else []
+    lengths = check_lengths(given.parent) if are_read_well else []
     right = explanation.hypothesis.undo(streams)
     offset = _fine_offset(right, at, explanation.fit)
     right = right.shifted(offset.seconds)
-    sizes, fit = _check_sizes(right, explanation, offset.fit, scale)
-    findings = _in_metres(findings, [*lengths, *sizes], scale)
+    sizes, fit = _check_sizes(right, explanation, offset.fit, about.scale)
+    findings = _in_metres(findings, [*lengths, *sizes], about.scale)
     # Whether both are inverse is not decided yet: streams as they are may be right.
-    is_open = explanation.readings is not None and explanation.readings.hypotheses[0].is_upright
-    of_reading = explanation.findings if is_open else ()
+    of_reading = explanation.findings if explanation.may_be_upright else ()
     is_sound = not any(found.makes_unusable for found in findings if found not in of_reading)
-    findings += [*lengths, *check_offset(offset, time_offset_s), *sizes]
-    if is_sound and is_open and known and not explanation.hypothesis.is_upright:
-        right = streams.shifted(offset.seconds)
-        motions = _motions(right.synchronised, hypotheses.MAX_PAIRS)
-        fit = similarity.fit_similarity(motions, start=known[0])
+    findings += [*lengths, *check_offset(offset, about.time_offset_s), *sizes]
     if is_sound and not lengths:
-        offset_s = time_offset_s + offset.seconds
+        if about.known and explanation.may_be_upright and not explanation.hypothesis.is_upright:
+            right = streams.shifted(offset.seconds)
+            motions = _motions(right.synchronised, hypotheses.MAX_PAIRS)
+            fit = similarity.fit_similarity(motions, start=about.known[0])
+        offset_s = about.time_offset_s + offset.seconds
         is_one_axis = any(found.code == "one_axis" for found in sizes)
-        findings += _check_agreeing(right, given, fit, known, offset_s, are_exact, is_one_axis)
+        findings += _check_agreeing(right, given, fit, about, offset_s, is_one_axis)
     return CheckResult(gravest_first(findings), explanation.fit, offset, explanation.readings)
 
 
@@ -323,22 +346,21 @@ def _check_agreeing(
     right: StreamPair,
     given: StreamPair,
     fit: SimilarityFit,
-    known: Known | None,
+    about: _Given,
     offset_s: float,
-    are_exact: bool,
     is_one_axis: bool,
 ) -> list[Finding]:
     """What else there is to say of streams that agree as they are, on one clock, and of the same
     streams as they were given.
     """
     of_fit = fit.T_parent_child, fit.sigmas[:6]
-    best = min(filter(None, (of_fit, known)), key=lambda extrinsic: extrinsic[1][:3].max())
-    if copied := independence.check_copies(given, right, are_exact):
+    best = min(filter(None, (of_fit, about.known)), key=lambda extrinsic: extrinsic[1][:3].max())
+    if copied := independence.check_copies(given, right, about.are_exact):
         return [*copied, *agreement.check_same(*best)]
     pose_pairs = right.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
     findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
-    if findings or are_exact:
+    if findings or about.are_exact:
         return findings
     return independence.check_fusion(pose_pairs, best[0], is_one_axis)
 

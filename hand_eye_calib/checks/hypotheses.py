@@ -245,6 +245,11 @@ class Explanation:
     readings: Readings | None = None
 
     @property
+    def may_be_upright(self) -> bool:
+        """Whether another reading is open, and the streams may be right as they are."""
+        return self.readings is not None and self.readings.hypotheses[0].is_upright
+
+    @property
     def holds(self) -> bool:
         """Whether the streams agree under the hypothesis."""
         return self.fit.unexplained < self.limit

@@ -9,7 +9,7 @@ from hand_eye_calib.assessment.covariance import usual_speed
 from hand_eye_calib.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.geometry.trajectory import Trajectory, repetitions
 from hand_eye_calib.pairing.motion_pairs import find_leap
 from hand_eye_calib.stats import median, quantile
 
@@ -210,7 +210,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
     """
     usual_m_s = usual_speed(other.stamps_ns, other.poses[:, :3, 3])
     frozen_ns = 0
-    for from_ns, until_ns in _repetitions(trajectory):
+    for from_ns, until_ns in repetitions(trajectory, _FROZEN_S):
         n_parts = max(1, round((until_ns - from_ns) * 1e-9 / _PART_S))
         edges_ns = np.linspace(from_ns, until_ns, n_parts + 1).astype(np.int64)
         for first_ns, last_ns in itertools.pairwise(edges_ns.tolist()):
@@ -218,15 +218,6 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
             if _moves(other[is_part], usual_m_s):
                 frozen_ns += last_ns - first_ns
     return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
-
-
-def _repetitions(trajectory: Trajectory) -> list[tuple[int, int]]:
-    """Return first and last stamp (ns) of the times in which a stream repeats its pose."""
-    same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME
-    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int)))
-    times_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
-    is_long = times_ns[:, 1] - times_ns[:, 0] >= _FROZEN_S * 1e9
-    return [(from_ns, until_ns) for from_ns, until_ns in times_ns[is_long].tolist()]
 
 
 def _moves(part: Trajectory, usual_m_s: float) -> bool:

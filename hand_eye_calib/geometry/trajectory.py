@@ -62,6 +62,9 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
+# Poses (m and entries of rotations) this close are the same, to rounding.
+_SAME_POSE = 1e-6
+
 # Range of stamps (ns).
 _FIRST_NS = int(np.iinfo(np.int64).min)
 _LAST_NS = int(np.iinfo(np.int64).max)
@@ -437,3 +440,19 @@ def corners(
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
     missing = 0.5 * fraction * (1.0 - fraction) * (np.diff(stamps_ns)[start] * 1e-9) ** 2
     return -missing[:, None] * shares[start] * bend
+
+
+def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]:
+    """Return the times in which a stream repeats its pose: first and last stamp (ns) of each.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    least_s : float
+        Shortest such time, in seconds.
+    """
+    same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
+    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int)))
+    times_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
+    is_long = times_ns[:, 1] - times_ns[:, 0] >= least_s * 1e9
+    return [(from_ns, until_ns) for from_ns, until_ns in times_ns[is_long].tolist()]

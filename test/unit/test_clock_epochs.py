@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, wandering_poses, write_pair
+from motions import as_trajectory, child_of, disturbed, walked, wandering_poses, write_pair
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.results import load_result
 
@@ -68,3 +69,33 @@ def test_an_offset_beyond_64_bits_is_one_line():
     with pytest.raises(ConfigError, match="time_offset must be at most 9200000000.0 s"):
         CalibratorConfig(time_offset=1e10)
     assert CalibratorConfig(time_offset=1.7e9).time_offset == 1.7e9
+
+
+def figures_of_eight():
+    """Poses of a vehicle whose turns repeat nearly every 14 s, ten a second."""
+    seconds = np.arange(549) / 10.0
+    sizes = 1.0 + 0.7 * np.sin(seconds / 9.0 + 0.3 * np.sin(seconds / 5.0))
+    steps = np.zeros((549, 6))
+    steps[:, 0] = 0.2
+    steps[:, 3] = 0.004 * np.sin(seconds)
+    steps[:, 4] = 0.004 * np.cos(1.3 * seconds)
+    steps[:, 5] = 0.04 * sizes * np.sin(2.0 * np.pi * seconds / 14.0)
+    return walked(se3.exp(steps))
+
+
+@pytest.mark.parametrize("frozen", ["parent", "child"])
+def test_a_stream_that_froze_does_not_hide_the_offset(frozen):
+    """As long as it repeats its pose, its angular rate says nothing of the clock."""
+    offset_s = EPOCHS["unix and start of the computer"]
+    poses = figures_of_eight()
+    parent = as_trajectory(disturbed(poses, 1, 0.002, 0.001))
+    child = as_trajectory(disturbed(child_of(poses), 2, 0.002, 0.001)).shifted(-offset_s)
+    streams = {"parent": parent, "child": child}
+    held = streams[frozen].poses.copy()
+    held[200:255] = held[200]
+    streams[frozen] = Trajectory(streams[frozen].stamps_ns, held)
+    result = hec.calibrate(**streams, time_offset="estimate")
+    assert result.time_offset_s == pytest.approx(offset_s, abs=0.02)
+    assert result.verdict.value == "DO NOT USE"
+    found = [finding for finding in result.findings if finding.code == "frozen"]
+    assert [(finding.stream, finding.severity.value) for finding in found] == [(frozen, "error")]
