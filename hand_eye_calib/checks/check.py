@@ -137,10 +137,10 @@ def check_streams(
     aligned = streams.shifted(at.seconds)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
-    if flat := check_flat(aligned.parent, aligned.child):
-        return CheckResult(gravest_first([*findings, *flat]))
-    if turned := agreement.check_parts(aligned.synchronised):
-        return CheckResult(gravest_first([*findings, *turned]))
+    of_parts = check_flat(aligned.parent, aligned.child)
+    of_parts = of_parts or agreement.check_parts(aligned.synchronised)
+    if of_parts:
+        return CheckResult(gravest_first([*findings, *of_parts]))
     if not explanation:
         explanation, found = _explained_or_misread(streams, aligned, at, known, frozen)
         findings += found

@@ -12,7 +12,6 @@ from hand_eye_calib.geometry import se3
 # Translation (m) and roll, pitch, yaw (deg) of the child in the parent.
 ON_CAMERA = ([0.42, -0.11, 0.25], [-88.0, 3.0, -92.0])
 ON_LIDAR = ([-1.2, 0.3, -0.4], [0.5, -0.8, 2.0])
-TO_ITSELF = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 RIGHT = [
     ("p.tum", "nan.tum", ON_CAMERA),
@@ -21,7 +20,15 @@ RIGHT = [
     ("p.tum", "lamar_nocov.txt", ON_CAMERA),
     ("p.tum", "plotjuggler.csv", ON_CAMERA),
     ("p.tum", "r_then_t_13.txt", ON_CAMERA),
-    ("lidar.tum", "week_sow.csv", ON_LIDAR),
+    ("lidar.tum", "ecef_pos_enu_quat.tum", ON_LIDAR),
+]
+# With the offset of the clocks: of GPS time, of the start of a recording, of a week.
+RIGHT_WITH_OFFSET = [
+    ("lidar.tum", "week_sow.csv", ON_LIDAR, -18.0),
+    ("lidar.tum", "sow.csv", ON_LIDAR, 1_699_747_182.0),
+    ("lidar.tum", "ie_geo.txt", ON_LIDAR, 1_699_747_182.0),
+    ("p.tum", "pos_log.txt", ON_CAMERA, 1_700_000_000.215),
+    ("cam.tum", "motive.csv", ON_CAMERA, 1_700_000_000.215),
 ]
 CAUSES = [
     ("p.tum", "sci.tum", "the timestamps have whole seconds only"),
@@ -45,17 +52,34 @@ def calibrated(capsys):
     return run
 
 
-@pytest.mark.parametrize(("parent", "child", "truth"), RIGHT)
-def test_the_truth_is_found(calibrated, parent, child, truth):
-    estimate = ["--time-offset", "estimate"] if parent == "lidar.tum" else []
-    code, document, _ = calibrated(parent, child, *estimate)
+def assert_is(document, truth):
     translation, rpy_deg = truth
     T = np.array(document["T_parent_child"]["matrix"])
     R = se3.rotation_from_rpy(np.radians([rpy_deg]))[0]
-    assert code == 0
-    assert document["verdict"] != "DO NOT USE"
+    assert document["verdict"] != "DO_NOT_USE"
     np.testing.assert_allclose(T[:3, 3], translation, atol=0.02)
     assert np.degrees(se3.rotation_angle(R.T @ T[:3, :3])) < 0.2
+
+
+@pytest.mark.parametrize(("parent", "child", "truth"), RIGHT)
+def test_the_truth_is_found(calibrated, parent, child, truth):
+    code, document, _ = calibrated(parent, child)
+    assert code == 0
+    assert_is(document, truth)
+
+
+@pytest.mark.parametrize(("parent", "child", "truth", "offset_s"), RIGHT_WITH_OFFSET)
+def test_the_truth_is_found_with_clocks_of_other_epochs(calibrated, parent, child, truth, offset_s):
+    code, document, _ = calibrated(parent, child, "--time-offset", "estimate")
+    assert code == 0
+    assert_is(document, truth)
+    assert document["time_offset_s"] == pytest.approx(offset_s, abs=0.01)
+
+
+def test_motions_in_place_of_poses_are_named(calibrated):
+    _, document, _ = calibrated("p.tum", "relative.tum")
+    assert document["verdict"] == "DO_NOT_USE"
+    assert "motions since the pose before" in document["reasons"][0]["sentence"]
 
 
 @pytest.mark.parametrize(("parent", "child", "cause"), CAUSES)
