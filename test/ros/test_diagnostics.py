@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from faults import inverted
+from motions import disturbed
 from ros_harness import LATCHED, RELIABLE_INPUTS, drive, message, values_of
 from std_msgs.msg import String
 
@@ -205,6 +206,8 @@ class TestStreamChecks:
     ):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250, sigma_rad=7e-4)
+        # Both are noisy, as odometries are: noise of one alone leaves open which is inverse.
+        Ts_pw_p = disturbed(Ts_pw_p, 9, 5e-5, 7e-4)
         child = damage(Trajectory(stamps_ns, Ts_cw_c)).poses
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, child)
 
