@@ -48,6 +48,9 @@ _ZERO_M, _ZERO_SIGMAS, _HOUSINGS_M = 0.005, 3.0, (0.03, 0.06)
 _COPIED_M = 5e-5
 _COPIED_SHARE = 0.01
 
+# The same for rotations (rad): quaternions with five digits.
+_COPIED_RAD = 2e-5
+
 # Codes of findings about positions alone.
 _OF_POSITIONS = ("axis_scale", "axis_lag", "smoothed_positions")
 
@@ -67,6 +70,9 @@ _MOST_RAD = 2.8
 # Rates are about left-handed axes if a reflection leaves less than this share of what the best
 # rotation leaves. Noise makes both about equal.
 _MIRRORED = 0.5
+# The rotation leaves more than this share of the rotations then. Where all of them are about one
+# axis, a mirror only turns over the noise of the others.
+_UNMIRRORED = 0.1
 
 # A coordinate with less than this factor has the wrong sign.
 _MIRRORED_FACTOR = -0.5
@@ -95,28 +101,55 @@ def check_solved(
     least_share : float
         The share of the squared residuals that a fault of positions must explain.
     """
-    priors = {*config.prior()}
-    sigmas = calibration.sigmas_measured
-    T_parent_child = calibration.T_parent_child
     child = child.shifted(calibration.time_offset_s)
     pairs = synchronise(parent, child, config.max_gap).child_scaled(calibration.scale)
     if len(pairs) < MIN_PAIRS:
         return []
-    kind = calibration.measured
     stream = "parent" if child.measures == "poses" else "child"
-    if kind == "rotations":
-        return (
-            check_rotation(T_parent_child[:3, :3], sigmas[3:], priors)
-            or _check_handedness(pairs, stream)
-            or check_rotations(_without_bias(pairs, calibration), T_parent_child, stream)
-        )
+    priors = {*config.prior()}
+    if calibration.measured == "rotations":
+        has_rates = "rates" in (parent.measures, child.measures)
+        return _check_turning(pairs, calibration, stream, priors, has_rates)
     measured = {"parent": parent, "child": child}[stream]
-    findings = check_interpolated(measured.poses[:, :3, 3], stream)
-    same = check_position(T_parent_child[:3, 3], sigmas[:3], priors)
+    interpolated = check_interpolated(measured.poses[:, :3, 3], stream)
+    return _check_moving(pairs, calibration, stream, priors, least_share, interpolated)
+
+
+def _check_turning(
+    pairs: PosePairs,
+    calibration: Calibration,
+    stream: str,
+    priors: Collection[str],
+    has_rates: bool,
+) -> list[Finding]:
+    """Findings about rotations or rates, the first kind that there is."""
+    T_parent_child = calibration.T_parent_child
+    sigmas = calibration.sigmas_measured[3:]
+    same = check_rotation(T_parent_child[:3, :3], sigmas, priors, has_rates)
+    if copied := _copied_rotations(pairs, T_parent_child):
+        return [replace(found, severity=Severity.ERROR) for found in same] or copied
+    if found := same or _check_handedness(pairs, stream):
+        return found
+    return check_rotations(_without_bias(pairs, calibration), T_parent_child, stream, has_rates)
+
+
+def _check_moving(
+    pairs: PosePairs,
+    calibration: Calibration,
+    stream: str,
+    priors: Collection[str],
+    least_share: float,
+    interpolated: list[Finding],
+) -> list[Finding]:
+    """Findings about positions, the first kind that there is."""
+    T_parent_child = calibration.T_parent_child
+    same = check_position(T_parent_child[:3, 3], calibration.sigmas_measured[:3], priors)
     pairs = _with_orientations(pairs, T_parent_child, stream)
     if copied := _copied_positions(pairs, T_parent_child):
-        return [replace(each, severity=Severity.ERROR) for each in same] or copied
-    return [*findings, *same] or check_positions(pairs, T_parent_child, stream, least_share)
+        return [replace(found, severity=Severity.ERROR) for found in same] or copied
+    if found := [*interpolated, *same]:
+        return found
+    return check_positions(pairs, T_parent_child, stream, least_share)
 
 
 def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
@@ -160,7 +193,7 @@ def check_position(
 
 
 def check_rotation(
-    rotation: FloatArray, sigmas: FloatArray, given: Collection[str]
+    rotation: FloatArray, sigmas: FloatArray, given: Collection[str], has_rates: bool
 ) -> list[Finding]:
     """Finding about a rotation of zero: rates or rotations of the other sensor itself.
 
@@ -171,6 +204,8 @@ def check_rotation(
         rad; the standard deviation of an axis is infinite if the motion does not show it.
     given : collection of str
         Axes with a prior, which the user has measured.
+    has_rates : bool
+        Whether a stream has rates: that is an error then. Two cameras may well be parallel.
     """
     limit_rad = agreement.MAX_SIGMA_RAD
     # Two level sensors that rotate about a single axis look alike, and yaw is unknown.
@@ -180,7 +215,8 @@ def check_rotation(
     if (turned > np.maximum(agreement.SAME_RAD, _ZERO_SIGMAS * sigmas)).any():
         return []
     angle_rad = float(np.linalg.norm(turned))
-    return [finding("parallel_axes", size=angle(angle_rad), angle_rad=angle_rad)]
+    severity = Severity.ERROR if has_rates else Severity.WARNING
+    return [finding("parallel_axes", "both", severity, size=angle(angle_rad), angle_rad=angle_rad)]
 
 
 def check_positions(
@@ -287,7 +323,24 @@ def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
     return [finding("interpolated", stream, share=share)] if share > _STRAIGHT_SHARE else []
 
 
-def check_rotations(pairs: PosePairs, T_parent_child: FloatArray, stream: str) -> list[Finding]:
+def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:
+    """Finding about rotations that were computed from the others: only rounding differs."""
+    of_parent, of_child = _rotation_vectors(pairs)
+    if len(of_parent) < MIN_PAIRS:
+        return []
+    remaining = np.linalg.norm(of_child @ T_parent_child[:3, :3].T - of_parent, axis=1)
+    left_rad = median(remaining)
+    if left_rad > min(_COPIED_RAD, _COPIED_SHARE * median(np.linalg.norm(of_parent, axis=1))):
+        return []
+    text = "The rotations of both streams agree to rounding"
+    return [
+        finding("not_independent", "both", Severity.ERROR, evidence=text, residual_rad=left_rad)
+    ]
+
+
+def check_rotations(
+    pairs: PosePairs, T_parent_child: FloatArray, stream: str, has_rates: bool
+) -> list[Finding]:
     """Findings about rotations that agree, on one clock and without the bias of a gyroscope.
 
     Parameters
@@ -297,12 +350,17 @@ def check_rotations(pairs: PosePairs, T_parent_child: FloatArray, stream: str) -
     T_parent_child : (4, 4) array
     stream : {"parent", "child"}
         The stream that findings name: the one with rates.
+    has_rates : bool
+        Orientations come from an odometry or a filter, which has no axes to misalign: only
+        a mount that moves is looked for then.
     """
     rotation = T_parent_child[:3, :3]
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < BLOCKS * MIN_PAIRS:
         return []
-    suspects = _matrix_suspects(of_parent, of_child @ rotation.T, stream)
+    suspects: list[Finding | None] = []
+    if has_rates:
+        suspects = _matrix_suspects(of_parent, of_child @ rotation.T, stream)
     still = np.zeros((len(pairs), 3))
     turning = PosePairs(
         pairs.stamps_ns,
@@ -342,7 +400,8 @@ def _check_handedness(pairs: PosePairs, stream: str) -> list[Finding]:
         median(np.linalg.norm(of_child @ left @ signs @ right - of_parent, axis=1))
         for signs in (rotating, mirroring)
     )
-    is_mirrored = by_mirror < _MIRRORED * by_rotation
+    usual = median(np.linalg.norm(of_parent, axis=1))
+    is_mirrored = by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
     return [finding("mirrored_rates", stream)] if is_mirrored else []
 
 

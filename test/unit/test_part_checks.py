@@ -37,7 +37,6 @@ NAMED = [
     ("positions", "scale 1.05", "scale"),
     ("positions", "height in feet", "axis_scale"),
     ("rates", "own rates", "same_frame"),
-    ("rates", "axis misaligned 3 deg", "misaligned"),
     ("rates", "mount moved 2 deg", "mount_moved"),
 ]
 
@@ -59,6 +58,13 @@ def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(kind, faul
 )
 def test_a_fault_that_a_lively_motion_shows_is_named(fault, platform, code):
     assert code in codes(solved("positions", fault, platform))
+
+
+@pytest.mark.parametrize("platform", ["drone", "excavator"])
+def test_a_misaligned_axis_of_a_gyroscope_is_named(platform):
+    result = solved("rates", "axis misaligned 3 deg", platform)
+    assert "misaligned" in [*codes(result), *codes(result, "warning")]
+    assert result.verdict is not hec.Verdict.USE
 
 
 @pytest.mark.parametrize("fault", ["two axes swapped", "sign of an axis"])
@@ -121,11 +127,36 @@ def test_parallel_axes_and_an_antenna_at_the_origin_may_be_said_by_priors():
     assert "same_position" not in codes(result)
 
 
-def test_orientations_alone_of_the_parent_itself_are_named():
-    recording = part_faults.rates("drone", "clean", SEED)
-    own = dataclasses.replace(recording.parent, measures="rotations", sensor_frame="imu")
-    result = hec.calibrate(recording.parent, own, **part_faults.WIDE)
-    assert codes(result) == ["same_frame"]
+@pytest.mark.parametrize(
+    ("turned_rad", "noise_rad", "code", "severity"),
+    [
+        (0.0, 0.0, "same_frame", "error"),
+        (0.7, 0.0, "not_independent", "error"),
+        (0.0, 0.002, "same_frame", "warning"),
+    ],
+)
+def test_orientations_alone_of_the_parent_itself_are_named(turned_rad, noise_rad, code, severity):
+    parent = part_faults.rates("drone", "clean", SEED).parent
+    noise = noise_rad * np.random.default_rng(2).standard_normal((len(parent), 3))
+    turns = se3.rotation_exp(noise) @ se3.rotation_exp([0.0, turned_rad, 0.0])
+    poses = parent.poses @ se3.from_rotation_translation(turns, np.zeros(3))
+    own = dataclasses.replace(parent, poses=poses, measures="rotations", sensor_frame="imu")
+    result = hec.calibrate(parent, own, **part_faults.WIDE)
+    assert code in codes(result, severity)
+    assert result.verdict is not hec.Verdict.USE
+
+
+def test_rotations_about_one_axis_are_not_mirrored_by_the_noise_of_the_others():
+    stamps_ns = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(1200)
+    random = np.random.default_rng(4)
+    yaw = 0.8 * np.sin(0.05 * np.arange(1200))
+    noise = 0.002 * random.standard_normal((1200, 3))
+    turns = se3.rotation_exp(np.column_stack([noise[:, :2], yaw]))
+    opposite = se3.rotation_exp(np.column_stack([noise[:, 0], -noise[:, 1], yaw]))
+    parent = Trajectory(stamps_ns, se3.from_rotation_translation(turns, np.zeros(3)), "ins")
+    child = Trajectory(stamps_ns, se3.from_rotation_translation(opposite, np.zeros(3)), "imu")
+    result = hec.calibrate(parent, dataclasses.replace(child, measures="rotations"))
+    assert "left_handed" not in codes(result)
 
 
 def test_positions_of_a_short_recording_do_not_end_in_a_traceback():
