@@ -365,6 +365,17 @@ _ROWS = {
         "say with options which of both it is",
         code="ambiguous",
     ),
+    "both_readings": _Row(
+        "a camera on the hand and one beside the robot fit these stops equally well",
+        "record more stops, with rotations about two axes: 15 or more are good",
+        code="ambiguous",
+    ),
+    "copied_stops": _Row(
+        "the poses of the target are those of the robot: the camera and the target would be at the "
+        "origins of hand and base",
+        "give the poses of the target as the camera measured them",
+        code="same_frame",
+    ),
     "stop_units": _Row(
         "{whose} lengths are {unit}",
         "convert them to metres, or solve with",

@@ -55,6 +55,16 @@ _WRONG_SCALE = 10.0
 _SCALE_ROUNDS = 10
 _SMALL_STEP = 0.02
 
+# Readings whose objectives differ by less than this fit equally well: a factor of 1100 between
+# their likelihoods. Simulated arms of four stops or more have 95 at least, of three stops 0.0.
+_READING_LEAD = 7.0
+
+# Mounts are the identity, and one side a copy of the other, within so many standard deviations
+# and these lengths (m) and angles (rad).
+_IDENTITY_SIGMAS = 3.0
+_IDENTITY_M = 0.001
+_IDENTITY_RAD = 0.001
+
 # What is on a hand is nearer to it than this (m), or than twice the way from the base to what is
 # fixed there.
 _ON_HAND_M = 0.3
@@ -73,6 +83,8 @@ class _Solved:
     scale_sigma: float
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
+    # How much larger the objective of the other way round is.
+    lead: float = np.inf
 
 
 def calibrate_stops(
@@ -179,6 +191,7 @@ def calibrate_arm(
     given = _given(robot, tracking, config, ("robot", "tracking"), is_arm=True)
     solved = _solved(given, config)
     parent, world = ("base", "hand") if solved.is_inverse else ("hand", "base")
+    solved = replace(solved, findings=gravest_first((*solved.findings, *_contradictions(solved))))
     is_unusable = any(found.makes_unusable for found in solved.findings)
     if not is_unusable and not {"parent_invert", "child_invert"} <= config.given:
         doubts, warnings = _reading(solved, named)
@@ -316,7 +329,7 @@ def _with_scale(
     if wants_scale and not given.has_positions:
         raise ConfigError("scale estimate needs positions; both sides have rotations alone")
     start = rough_scale or 1.0
-    fit, stops, is_inverse = _fit(given, start)
+    fit, stops, is_inverse, lead = _fit(given, start)
     is_unusable = any(found.makes_unusable for found in findings)
     scale, sigma = 1.0, 0.0
     if wants_scale or (rough_scale and not is_unusable):
@@ -340,7 +353,7 @@ def _with_scale(
         else:
             scale, sigma = 1.0, 0.0
     if scale == 1.0 and start != 1.0:
-        fit, stops, is_inverse = _fit(given, 1.0)
+        fit, stops, is_inverse, lead = _fit(given, 1.0)
     if given.has_positions and not turns_about_two_axes(given.parent):
         findings = [*findings, finding("turning_about_one_axis")]
     return _Solved(
@@ -352,6 +365,7 @@ def _with_scale(
         scale_sigma=base * sigma,
         findings=gravest_first(findings),
         warnings=tuple(warnings),
+        lead=lead,
     )
 
 
@@ -362,13 +376,15 @@ def _is_clear(scale: float, sigma: float, n_stops: int) -> bool:
     return abs(np.log(scale)) > max(_SCALE_SIGMAS * share + by_noise, _SCALE_SHARE)
 
 
-def _fit(given: GivenStops, scale: float) -> tuple[RobotWorld, Stops, bool]:
-    """The likelier solution of both ways round, if both are possible."""
+def _fit(given: GivenStops, scale: float) -> tuple[RobotWorld, Stops, bool, float]:
+    """The likelier solution of both ways round, if both are possible, and its lead."""
     fits = []
     for is_inverse in (False, True) if given.is_arm else (False,):
         stops = _stops(given, scale, is_inverse)
         fits.append((solve(stops), stops, is_inverse))
-    return min(fits, key=lambda fit: fit[0].objective)
+    fits.sort(key=lambda fit: fit[0].objective)
+    lead = fits[1][0].objective - fits[0][0].objective if given.is_arm else np.inf
+    return *fits[0], lead
 
 
 def _stops(given: GivenStops, scale: float, is_inverse: bool) -> Stops:
@@ -392,6 +408,28 @@ def _with_free_scale(
 
 
 # ------------------------------------------------------------------ the result
+
+
+def _contradictions(solved: _Solved) -> list[Finding]:
+    """Findings on an arm whose stops fit both readings, or whose sides are the same poses."""
+    if solved.fit.undetermined().size:
+        return []
+    if _is_copy(solved):
+        return [finding("copied_stops")]
+    if solved.lead < _READING_LEAD:
+        return [finding("both_readings")]
+    return []
+
+
+def _is_copy(solved: _Solved) -> bool:
+    """Whether both mounts are the identity: no camera is at the origin of a hand or base, and no
+    target at that of the other, with the same axes.
+    """
+    fit = solved.fit
+    steps = np.r_[se3.log(fit.Ts_parent_child[0]), se3.log(fit.Ts_world_world[0])]
+    least = np.tile(np.repeat([_IDENTITY_M, _IDENTITY_RAD], 3), 2)
+    sigmas = np.sqrt(np.diag(fit.covariance))
+    return bool(np.all(np.abs(steps) < np.maximum(least, _IDENTITY_SIGMAS * sigmas)))
 
 
 def _reading(solved: _Solved, named: Mapping[str, str]) -> tuple[list[Finding], list[str]]:

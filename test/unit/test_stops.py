@@ -342,3 +342,26 @@ class TestUndetermined:
         assert (unknown.shape == (6, 1)) == (motion == "one_axis")
         assert result.reasons[0].rule == "nothing_known"
         assert {"x", "y", "z"} & {*result.unobservable()}
+
+
+# ------------------------------------------------------------------ arms that say too little
+
+
+@pytest.mark.parametrize("is_in_hand", [True, False])
+def test_three_stops_do_not_say_where_the_camera_is(random, is_in_hand):
+    robot, tracking, *_ = arm(random, n=3, is_in_hand=is_in_hand)
+
+    result = calibrate_arm(robot, tracking)
+
+    assert result.verdict.value == "DO NOT USE"
+    assert "fit these stops equally well" in result.findings[0].what
+
+
+@pytest.mark.parametrize("convert", [lambda Ts: Ts, se3.inverse], ids=["same", "inverse"])
+def test_a_target_with_the_poses_of_the_robot_is_a_copy(random, convert):
+    robot, *_ = arm(random)
+
+    result = calibrate_arm(robot, convert(robot))
+
+    assert result.verdict.value == "DO NOT USE"
+    assert result.findings[0].code == "same_frame"
