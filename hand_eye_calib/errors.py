@@ -68,12 +68,17 @@ def located(where: object) -> Iterator[None]:
         raise type(error)(f"{where}: {error}") from None
 
 
-def required(module: str, purpose: str, install: str) -> Any:
-    """A module that few need; a MissingDependencyError if it is not installed."""
+def installing(extra: str) -> str:
+    """The command that installs an extra of this package, which is on no index."""
+    return f"pip install '.[{extra}]' in the source folder of hand_eye_calib"
+
+
+def required(module: str, purpose: str, extra: str) -> Any:
+    """A module that few need, of an extra; a MissingDependencyError if it is not installed."""
     try:
         return import_module(module)
     except ImportError:
         raise MissingDependencyError(
-            f"{purpose} needs {module.partition('.')[0]}, which is not installed: pip install "
-            f"'{install}'"
+            f"{purpose} needs {module.partition('.')[0]}, which is not installed: "
+            f"{installing(extra)}"
         ) from None

@@ -103,7 +103,7 @@ def _add_rare(parser: argparse.ArgumentParser) -> None:
     camera = "intrinsics: YAML of camera_info, Kalibr or OpenCV; a bag may have its own camera_info"
     add("--camera", metavar="FILE", type=Path, help=camera)
     add = parser.add_argument_group("many recordings").add_argument
-    batch = "bags, or patterns of bags in quotes, such as 'fleet/**'"
+    batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
     add("--batch", metavar="BAG", nargs="+", help=batch)
     vehicle = (
         "the vehicle's name, or its place in the paths of --batch, such as 'fleet/{vehicle}/*': "

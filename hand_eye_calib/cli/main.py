@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from hand_eye_calib.cli.options import Exit, as_typed, fail
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError, installing
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.option import did_you_mean
 from hand_eye_calib.text import shown_value
@@ -88,7 +88,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
         if package.endswith(_OF_ROS):
             text = (
                 f"this needs ROS 2's Python packages ({name} is missing): source the setup file of "
-                "a ROS 2 installation, or pip install 'hand_eye_calib[ros]'"
+                f"a ROS 2 installation, or {installing('ros')}"
             )
         return fail(text)
     except BrokenPipeError:

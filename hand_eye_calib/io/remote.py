@@ -12,7 +12,12 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from hand_eye_calib.errors import HandEyeCalibError, InputError, MissingDependencyError
+from hand_eye_calib.errors import (
+    HandEyeCalibError,
+    InputError,
+    MissingDependencyError,
+    installing,
+)
 
 AsGiven = Callable[[Any], Any]
 
@@ -123,7 +128,7 @@ def _reached(url: str) -> Iterator[tuple[Any, str]]:
     except ImportError as error:
         raise MissingDependencyError(
             f"{public(url)} needs a package that is not installed: {error}; "
-            "pip install 'hand_eye_calib[fleet]', and that of the store"
+            f"{installing('fleet')}, and that of the store"
         ) from None
     except HandEyeCalibError as error:
         raise InputError(f"cannot read {public(url)}: {error}") from None

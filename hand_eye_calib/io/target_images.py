@@ -10,7 +10,13 @@ from typing import Any, Self
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError, required
+from hand_eye_calib.errors import (
+    ConfigError,
+    InputError,
+    MissingDependencyError,
+    installing,
+    required,
+)
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.files import read_bytes
 from hand_eye_calib.io.yaml_files import read_yaml
@@ -287,10 +293,9 @@ class TargetFinder:
 def _opencv() -> Any:
     # A file of 1 MB may unpack to more memory than there is. OpenCV reads this when it is imported.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MOST_PIXELS))
-    cv2 = required("cv2", "finding a target in images", "hand_eye_calib[camera]")
+    cv2 = required("cv2", "finding a target in images", "camera")
     if not hasattr(cv2.aruco, "CharucoDetector"):
         raise MissingDependencyError(
-            "poses from images of a target need OpenCV 4.7 or newer: pip install "
-            "'hand_eye_calib[camera]'"
+            f"poses from images of a target need OpenCV 4.7 or newer: {installing('camera')}"
         )
     return cv2

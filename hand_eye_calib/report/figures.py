@@ -405,9 +405,11 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
                 turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
                 ellipse = Ellipse((at[0], at[1]), wide, high, angle=turned, color=CHILD, alpha=0.3)
                 panel.add_patch(ellipse)
-            for line, k in ((panel.axhline, 1), (panel.axvline, 0)):
-                if not is_known[k]:
-                    line(at[k], color=CHILD, ls="--", lw=1.0)
+            # A line along the axis that is unknown, through what is known of the other.
+            if not is_known[0]:
+                panel.axhline(at[1], color=CHILD, ls="--", lw=1.0)
+            if not is_known[1]:
+                panel.axvline(at[0], color=CHILD, ls="--", lw=1.0)
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.3)

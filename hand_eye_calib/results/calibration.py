@@ -28,7 +28,7 @@ def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
     """A DataFrame of rows with equal names, one of which is the index; a MissingDependencyError
     without pandas.
     """
-    pandas = required("pandas", "a table", "hand_eye_calib[notebook]")
+    pandas = required("pandas", "a table", "notebook")
     return pandas.DataFrame(rows).set_index(index)
 
 

@@ -139,7 +139,7 @@ def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
     code, out, err = run(*fleet, "--dask", "tcp://127.0.0.1:1")
     assert (code, out) == (1, "")
-    assert "pip install 'hand_eye_calib[cluster]'" in err
+    assert "pip install '.[cluster]'" in err
 
 
 def test_a_defect_in_one_bag_leaves_the_others_alone(monkeypatch):
@@ -338,7 +338,7 @@ def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     _, (found,) = outcomes_of("s3://fleet/run.mcap")
     assert found["error"].startswith("s3://fleet/run.mcap needs a package that is not installed")
-    assert "pip install 'hand_eye_calib[fleet]'" in found["error"]
+    assert "pip install '.[fleet]'" in found["error"]
 
 
 @pytest.mark.parametrize(
@@ -407,6 +407,8 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
             (tmp_path / "fleet" / place / "metadata.yaml").touch()
             (tmp_path / "fleet" / place / "a.mcap").touch()
     groups = [[bag] for bag in matching(f"{tmp_path}/fleet/**")]
+    assert groups == [[bag] for bag in matching(f"{tmp_path}/fleet")]
+    assert matching(f"{tmp_path}/fleet/truck_2/monday") == [f"{tmp_path}/fleet/truck_2/monday"]
     assert [(task.name, task.vehicle) for task in tasks_of(groups, "fleet/{vehicle}/*")] == [
         ("truck_1_monday", "truck_1"),
         ("truck_1_tuesday", "truck_1"),
@@ -414,5 +416,6 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
     ]
     assert {task.vehicle for task in tasks_of(groups, "other/{vehicle}/*")} == {""}
     assert {task.vehicle for task in tasks_of([["/x/../bag"]], "/x/{vehicle}/bag")} == {""}
-    with pytest.raises(ConfigError, match="no bag matches"):
-        matching(f"{tmp_path}/none/**")
+    for path in ("none/**", "fleet/notes"):
+        with pytest.raises(ConfigError, match="no bag matches"):
+            matching(f"{tmp_path}/{path}")

@@ -15,6 +15,9 @@ from motions import child_of, disturbed, wandering_poses, write_pair
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
+from matplotlib.lines import Line2D
+from result_making import NAMES, calibration, dofs
+
 import hand_eye_calib as hec
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
@@ -401,3 +404,29 @@ def test_views_are_named_by_where_one_looks_from():
     for (across, up), name in _VIEWS.items():
         axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
         assert np.cross(*axes).tolist() == from_where[name]
+
+
+@pytest.mark.parametrize("unknown", ["x", "y", "z"])
+def test_an_unknown_axis_is_a_line_along_that_axis(unknown):
+    sigmas = np.where([name == unknown for name in NAMES], np.inf, 1e-3)
+    covariance = np.diag(np.full(6, 1e-6))
+    covariance["xyz".index(unknown)] = np.inf
+    result = calibration(
+        T_parent_child=se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])),
+        covariance_measured=covariance,
+        observability_measured=dofs(sigmas, unknown),
+    )
+    for panel, axes in zip(hec.plot(result).axes, _VIEWS, strict=True):
+        place = dict(zip("xyz", result.translation, strict=True))
+        spans = {
+            axis: [
+                line for line in panel.lines if len({*data(line)}) == 2 and line.get_ls() == "--"
+            ]
+            for axis, data in ((axes[0], Line2D.get_xdata), (axes[1], Line2D.get_ydata))
+        }
+        assert {axis for axis, lines in spans.items() if lines} == {*axes} & {unknown}
+        for axis, lines in spans.items():
+            other = axes.replace(axis, "")
+            for line in lines:
+                across = line.get_ydata() if axis == axes[0] else line.get_xdata()
+                np.testing.assert_allclose(across, place[other])

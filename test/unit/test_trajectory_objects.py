@@ -107,7 +107,7 @@ class TestTables:
 
     def test_without_pandas_one_line_says_so(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "pandas", None)
-        with pytest.raises(MissingDependencyError, match=r"pip install 'hand_eye_calib\[notebook"):
+        with pytest.raises(MissingDependencyError, match=r"pip install '\.\[notebook"):
             calibration().to_frame()
 
     def test_stamps_keep_their_digits_and_whole_numbers_are_in_the_unit_of_their_size(self):

@@ -113,10 +113,12 @@ def _without_suffix(path: Path) -> Path:
 
 
 def matching(pattern: str) -> list[str]:
-    """The bags that a pattern stands for, or a ConfigError; a path stands for itself. ``**`` finds
-    bags alone.
+    """The bags that a pattern stands for, or a ConfigError; a bag stands for itself, another folder
+    for all bags below it. ``**`` finds bags alone.
     """
     found = [pattern]
+    if not remote.is_url(pattern) and _is_folder_of_bags(Path(pattern)):
+        pattern = str(Path(pattern) / "**")
     if remote.is_url(pattern):  # a question mark begins its query
         found = remote.expanded(pattern) if "*" in pattern else found
     elif has_magic(pattern) and not Path(pattern).exists():
@@ -126,6 +128,13 @@ def matching(pattern: str) -> list[str]:
     if not found:
         raise ConfigError(f"no bag matches {pattern}")
     return found
+
+
+def _is_folder_of_bags(path: Path) -> bool:
+    """Whether a path is a folder that is no bag itself."""
+    return path.is_dir() and not any(
+        file.name == "metadata.yaml" or file.suffix in _BAGS for file in path.iterdir()
+    )
 
 
 def _is_recording(path: Path) -> bool:
@@ -298,7 +307,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    distributed = required("dask.distributed", "--dask", "hand_eye_calib[cluster]")
+    distributed = required("dask.distributed", "--dask", "cluster")
     try:
         client = distributed.Client(address, timeout="10s")
     except (OSError, ValueError) as error:

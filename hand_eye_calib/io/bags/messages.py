@@ -284,7 +284,7 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
         )
     try:
         if kind.encoding == "protobuf":
-            reading = required("mcap_protobuf.decoder", name, "hand_eye_calib[foxglove]")
+            reading = required("mcap_protobuf.decoder", name, "foxglove")
             schema = SimpleNamespace(id=0, name=name, encoding=language, data=content)
             return reading.DecoderFactory().decoder_for(kind.encoding, schema)
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore

@@ -140,9 +140,7 @@ class ScanReading(Reading):
             if np.array_equal(kept["bag_files"], self._state):
                 self._kept, self.topics = [kept[name] for name in _KEPT], ()
                 return
-        self._gicp = required(
-            "small_gicp", "odometry from the points of a lidar", "hand_eye_calib[lidar]"
-        )
+        self._gicp = required("small_gicp", "odometry from the points of a lidar", "lidar")
         self._voxel_m, self._has_failed = 0.0, [False]
         self._maps: list[Any] = []
         # Of all scans, and the newest three of them.

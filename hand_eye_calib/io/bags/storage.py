@@ -445,7 +445,11 @@ def _files_of(path: Path) -> list[Path]:
         below = next((folder for folder in near if any(map(_suffix, folder.iterdir()))), "")
         raise InputError(
             f"no bag in {path}: expected files that end in {', '.join(_REPAIRS)}; "
-            + (f"give {below} (--batch takes all below a folder)" if below else "check the path")
+            + (
+                f"give {below}, or all below it with calibrate --batch {path}"
+                if below
+                else "check the path"
+            )
         )
     return sorted(found)
 

@@ -307,7 +307,7 @@ def _of_pcd(data: bytes, _: str | None) -> _Rows:
 
 def _of_ulog(data: bytes, _: str | None) -> _Rows:
     """A log of PX4: the odometry of its estimator, or local positions with attitudes."""
-    reading = required("pyulog", "a log of PX4", "hand_eye_calib[px4]")
+    reading = required("pyulog", "a log of PX4", "px4")
     quaternion = [f"q[{k}]" for k in (1, 2, 3, 0)]
     try:
         topics = ["vehicle_odometry", "vehicle_local_position", "vehicle_attitude"]
