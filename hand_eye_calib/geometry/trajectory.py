@@ -270,7 +270,7 @@ class Trajectory(Columns):
         InputError
             If a stamp would not fit 64 bits.
         """
-        if not (offset_s or rate):
+        if not len(self) or not (offset_s or rate):
             return self
         offset_ns = round(offset_s * 1e9)
         ends_ns = [int(stamp_ns) + offset_ns for stamp_ns in self.stamps_ns[[0, -1]]]

@@ -453,3 +453,17 @@ def test_text_that_is_made_to_take_long_takes_seconds_at_most(tmp_path, kind):
     assert time.process_time() - began < 3.0
     assert "\n" not in message
     assert len(message) < 2_000
+
+
+def test_a_stamp_is_preferred_to_milliseconds_of_a_week_of_gps(tmp_path):
+    """Messages of a receiver in a csv: the time of the recording, and the week in the header."""
+    path = tmp_path / "inspvax.csv"
+    rows = [
+        f"{1_636_524_445_180_543_531 + 20_000_000 * k},2183,{269_353_560 + 20 * k},{k},0,0,0,0,0,1"
+        for k in range(30)
+    ]
+    names = "time,.header.gps_week,.header.gps_week_seconds,x,y,z,qx,qy,qz,qw"
+    path.write_text("\n".join([names, *rows, ""]))
+    trajectory = hec.read_trajectory(path, AUTO)
+    assert trajectory.stamps_ns[0] == 1_636_524_445_180_543_531
+    assert trajectory.interval_s == pytest.approx(0.02)

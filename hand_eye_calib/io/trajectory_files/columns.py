@@ -216,7 +216,12 @@ _STAMPS = (
 
 
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
-    """The quantities that give the stamp; none if there are none."""
+    """Return the quantities that give the stamp; none if there are none.
+
+    A stamp beside a week of GPS and its second is on the clock of the recording.
+    """
+    if {"week", "sow", "t"} <= columns.keys():
+        return ("t",)
     return next(way for way in _STAMPS if {*way} <= columns.keys())
 
 
