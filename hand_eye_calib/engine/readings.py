@@ -104,17 +104,27 @@ def decide(readings: Readings, difference: float) -> int | None:
     by_noise = 0
     if abs(difference) > CLEAR_NOISE:
         by_noise = -int(np.sign(difference))
+    can_be_right = readings.hypotheses[0].is_upright
     if by_noise and readings.is_small and by_noise != by_shape:
-        is_supported = by_noise * readings.paths > _CLEAR_PATHS
-        is_usual = by_noise < 0 and by_shape == 0
-        choice = by_noise if is_supported or is_usual else 0
+        choice = _in_a_small_space(readings, by_noise)
     elif by_noise:
         choice = by_noise
     else:
         choice = by_shape if readings.is_clear else 0
-    if choice == 0 and readings.hypotheses[0].is_upright and readings.shape < 0.0:
+    if choice == 0 and can_be_right and readings.shape < 0.0 and by_noise <= 0:
         choice = -1
     return {1: 1, -1: 0}.get(choice)
+
+
+def _in_a_small_space(readings: Readings, by_noise: int) -> int:
+    """Return the choice of the noise in a small space without the shape's support, or another."""
+    by_shape = readings.by_shape
+    if by_noise * readings.paths > _CLEAR_PATHS:
+        return by_noise
+    if not readings.hypotheses[0].is_upright:
+        return by_shape or by_noise
+    is_usual = by_noise < 0 and by_shape == 0
+    return by_noise if is_usual else 0
 
 
 def _difference(first: PosePairs, second: PosePairs) -> float:

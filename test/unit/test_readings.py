@@ -84,7 +84,7 @@ class TestDecision:
             # Near an arm, the noise of a camera that sees a target is that of inverse poses.
             (-19.0, 1.5, 0.3, True, None),
             (-21.0, 1.5, 0.3, True, 1),
-            (-500.0, -0.1, -0.1, True, 0),
+            (-500.0, -0.1, 0.0, True, None),
             (500.0, 1.5, 0.3, True, None),
             (500.0, 0.5, -0.4, True, 0),
             (500.0, 0.1, 0.1, True, 0),
@@ -103,6 +103,10 @@ class TestDecision:
         assert decide(readings, 0.0) == 1
         assert decide(replace(readings, shape=-0.6), 0.0) == 0
         assert decide(replace(readings, shape=0.3), 0.0) is None
+        assert decide(replace(readings, shape=0.3, paths=0.0), 500.0) == 0
+        # The noise of a camera that sees a target is that of the wrong reading.
+        assert decide(replace(readings, paths=0.05), 500.0) == 1
+        assert decide(replace(readings, paths=-0.4), 500.0) == 0
 
 
 class TestInverse:
