@@ -1,13 +1,12 @@
 """Checks of two streams of which one has only positions, only rotations or only angular rates.
 
-Positions beside poses: the sensor that measures positions borrows the orientations of the other
-one, aligned to the world of the positions in windows. Then both streams are poses, and the
-regressions of :mod:`~hand_eye_calib.checks.response` look for a coordinate of another scale or
-delay and for smoothing.
+A stream of positions borrows the orientations of the other stream, aligned to the world frame of
+the positions window by window. Both streams are poses then. The regressions of
+:mod:`~hand_eye_calib.checks.response` detect a wrong scale of a coordinate, a delay and smoothing.
 
-Rotations: the rotation vectors of one stream are regressed on those of the other. The
-antisymmetric part of the matrix between them is the extrinsic. The symmetric part is a fault: a
-gain on the diagonal, axes that are not perpendicular beside it.
+For rotations and rates, the rotation vectors of one stream are regressed on those of the other.
+The antisymmetric part of the matrix is a correction of the extrinsic rotation. The symmetric part
+is a fault: gains on the diagonal, misaligned axes off the diagonal.
 """
 
 from collections.abc import Collection
@@ -31,53 +30,63 @@ from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.stats import median, robust_sigma
 from hand_eye_calib.text import angle, length
 
-# Duration of the windows that positions are aligned in (s). An odometry turns little in it, and
-# most motions of 3 s lie within one window.
+# Duration of a window in which positions are aligned (s). The heading of an odometry drifts little
+# in 30 s, and most motions of 3 s lie within one window.
 _WINDOW_S = 30.0
 
-# Fewest positions that are aligned by themselves.
+# Fewest positions of a window that is aligned without its neighbours.
 _LEAST_ALIGNED = 10
 
-# A lever arm is zero if each axis is within this distance (m), or within so many standard
-# deviations. Two housings hardly fit closer than the first of these (m). It is an error if two
-# axes have an upper bound (two standard deviations) below that, and the third below the second.
-_ZERO_M, _ZERO_SIGMAS, _HOUSINGS_M = 0.005, 3.0, (0.03, 0.06)
+# A lever arm is zero if every axis is below one of two limits: this distance (m) ...
+_ZERO_M = 0.005
+# ... or this many standard deviations. The limit serves rotations, too.
+_ZERO_SIGMAS = 3.0
 
-# Positions that follow the other stream to this distance (m), and to this share of a step, are
-# computed from it: no receiver or total station measures to a twentieth of a millimetre.
+# A zero lever arm is an error if the upper bounds of two axes are below this distance (m): two
+# housings hardly fit closer. An upper bound is the value plus two standard deviations.
+_HOUSING_M = 0.03
+# Limit of the upper bound of the third axis (m). Without two axes below this limit, the lever arm
+# is unknown rather than zero.
+_UNKNOWN_M = 0.06
+
+# Median residual (m) below which positions were computed from the poses: no receiver or total
+# station measures to a twentieth of a millimetre.
 _COPIED_M = 5e-5
+# The same limit as a share of the median motion, for slow streams.
 _COPIED_SHARE = 0.01
 
-# The same for rotations (rad): quaternions with five digits.
+# Median residual (rad) below which rotations were computed from those of the other stream. It
+# corresponds to quaternions with five digits.
 _COPIED_RAD = 2e-5
 
-# Codes of findings about positions alone.
-_OF_POSITIONS = ("axis_scale", "axis_lag", "smoothed_positions")
+# Codes of findings about positions, rather than about both streams.
+_POSITION_CODES = ("axis_scale", "axis_lag", "smoothed_positions")
 
-# Positions are interpolated if at least this share of them lies on a straight line through both
-# neighbours, within this distance (m). Recorded positions scatter by more, also on a motorway.
-_STRAIGHT_SHARE, _STRAIGHT_M = 0.5, 1e-5
+# Positions are interpolated if more than this share lies on the line through both neighbours.
+_STRAIGHT_SHARE = 0.5
+# Largest distance from that line (m). Recorded positions scatter more, also on a motorway.
+_STRAIGHT_M = 1e-5
 
-# Shorter steps (m) show no direction.
+# Shortest step that has a direction (m).
 _MOVES_M = 1e-3
 
-# Most motions of a regression of rotations.
+# Largest number of motions in a regression of rotations.
 _MOST_MOTIONS = 3000
 
-# Rotation vectors near half a turn may point either way (rad).
+# Largest angle of a rotation vector (rad). Near half a turn its sign is ambiguous.
 _MOST_RAD = 2.8
 
-# Rates are about left-handed axes if a reflection leaves less than this share of what the best
-# rotation leaves. Noise makes both about equal.
+# Rates have left-handed axes if the residual of the best reflection is below this share of the
+# residual of the best rotation. Noise alone makes both about equal.
 _MIRRORED = 0.5
-# The rotation leaves more than this share of the rotations then. Where all of them are about one
-# axis, a mirror only turns over the noise of the others.
+# Least residual of the best rotation of such rates, as a share of the rotation vectors. If all
+# motion is about one axis, a reflection only changes the sign of the noise about the others.
 _UNMIRRORED = 0.1
 
-# A coordinate with less than this factor has the wrong sign.
+# Scale factor of a coordinate below which its sign is wrong.
 _MIRRORED_FACTOR = -0.5
 
-# Planes of two principal axes.
+# Index pairs of the planes between two principal axes.
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
@@ -88,18 +97,22 @@ def check_solved(
     config: CalibratorConfig,
     least_share: float = 0.0,
 ) -> list[Finding]:
-    """Findings about two streams, at least one of which has only a part of its poses, and the
-    result from them.
+    """Check two streams against their result if one stream does not measure full poses.
 
     Parameters
     ----------
     parent, child : Trajectory
         Each on its own clock.
     calibration : Calibration
+        The result from both streams.
     config : CalibratorConfig
-        The options that the result was made with.
+        The options of that result.
     least_share : float
-        The share of the squared residuals that a fault of positions must explain.
+        Share of the squared residuals that a fault of positions must explain, to be reported.
+
+    Returns
+    -------
+    list of Finding
     """
     child = child.shifted(calibration.time_offset_s)
     pairs = synchronise(parent, child, config.max_gap).child_scaled(calibration.scale)
@@ -122,7 +135,7 @@ def _check_turning(
     priors: Collection[str],
     has_rates: bool,
 ) -> list[Finding]:
-    """Findings about rotations or rates, the first kind that there is."""
+    """Check rotations or rates; return the findings of the first check that has any."""
     T_parent_child = calibration.T_parent_child
     sigmas = calibration.sigmas_measured[3:]
     same = check_rotation(T_parent_child[:3, :3], sigmas, priors, has_rates)
@@ -141,7 +154,7 @@ def _check_moving(
     least_share: float,
     interpolated: list[Finding],
 ) -> list[Finding]:
-    """Findings about positions, the first kind that there is."""
+    """Check positions; return the findings of the first check that has any."""
     T_parent_child = calibration.T_parent_child
     same = check_position(T_parent_child[:3, 3], calibration.sigmas_measured[:3], priors)
     pairs = _with_orientations(pairs, T_parent_child, stream)
@@ -153,39 +166,39 @@ def _check_moving(
 
 
 def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
-    """The pose pairs without the bias of a gyroscope."""
+    """Remove the estimated gyroscope bias from pose pairs."""
     if not calibration.rate_bias:
         return pairs
     bias = np.array(calibration.rate_bias.rad_per_s)
     if calibration.rate_bias.of == "parent":
-        freed = without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias)
-        return replace(pairs, Ts_pw_p=freed)
+        return replace(pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias))
     return replace(pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias))
 
 
 def check_position(
     lever_arm: FloatArray, sigmas: FloatArray, given: Collection[str]
 ) -> list[Finding]:
-    """Finding about a lever arm of zero: positions that were copied from the other stream.
+    """Detect a lever arm of zero, which suggests that positions were copied between the streams.
 
     Parameters
     ----------
     lever_arm, sigmas : (3,) array
-        m; the standard deviation of an axis is infinite if the motion does not show it.
+        Lever arm and its standard deviations (m), infinite for unobservable axes.
     given : collection of str
-        Axes with a prior, which the user has measured.
+        Axes with a prior; these are not checked.
     """
     axes = [k for k, axis in enumerate("xyz") if np.isfinite(sigmas[k]) and axis not in given]
     if len(axes) < 2:
         return []
-    sizes, spreads = np.abs(lever_arm[axes]), sigmas[axes]
+    sizes = np.abs(lever_arm[axes])
+    spreads = sigmas[axes]
     if (sizes > np.maximum(_ZERO_M, _ZERO_SIGMAS * spreads)).any():
         return []
     uppers_m = np.sort(sizes + 2.0 * spreads)
-    if uppers_m[1] > _HOUSINGS_M[1]:  # unknown rather than zero
+    if uppers_m[1] > _UNKNOWN_M:
         return []
-    # An antenna may be right above the other sensor.
-    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSINGS_M[0] and uppers_m[2] < _HOUSINGS_M[1]
+    # Two axes are not enough for an error: an antenna may be right above the other sensor.
+    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNKNOWN_M
     severity = Severity.ERROR if is_sure else Severity.WARNING
     distance_m = float(np.linalg.norm(sizes))
     size = f"{length(distance_m)} +/- {length(float(spreads.max()))}"
@@ -195,20 +208,22 @@ def check_position(
 def check_rotation(
     rotation: FloatArray, sigmas: FloatArray, given: Collection[str], has_rates: bool
 ) -> list[Finding]:
-    """Finding about a rotation of zero: rates or rotations of the other sensor itself.
+    """Detect a rotation of zero, which suggests that both streams come from one sensor.
 
     Parameters
     ----------
     rotation : (3, 3) array
     sigmas : (3,) array
-        rad; the standard deviation of an axis is infinite if the motion does not show it.
+        Standard deviations (rad), infinite for unobservable axes.
     given : collection of str
-        Axes with a prior, which the user has measured.
+        Axes with a prior; with one about a rotation, nothing is checked.
     has_rates : bool
-        Whether a stream has rates: that is an error then. Two cameras may well be parallel.
+        Whether a stream has rates. The finding is an error then, otherwise a warning: the axes of
+        two cameras may well be parallel.
     """
     limit_rad = agreement.MAX_SIGMA_RAD
-    # Two level sensors that rotate about a single axis look alike, and yaw is unknown.
+    # The standard deviations must be small on all axes: if two level sensors turn only about the
+    # vertical, yaw is unobservable, and roll and pitch are zero for any two sensors.
     if {"roll", "pitch", "yaw"} & {*given} or not sigmas.max() < limit_rad:
         return []
     turned = np.abs(se3.rotation_log(rotation))
@@ -222,18 +237,23 @@ def check_rotation(
 def check_positions(
     pairs: PosePairs, T_parent_child: FloatArray, stream: str, least_share: float = 0.0
 ) -> list[Finding]:
-    """Findings about positions beside poses, on one clock and in one unit of length.
+    """Check a stream of positions against poses, on one clock and in one unit of length.
 
     Parameters
     ----------
     pairs : PosePairs
-        The stream with positions has the orientations of the other one.
+        The stream of positions has the orientations of the other stream.
     T_parent_child : (4, 4) array
         The lever arm, without a rotation.
     stream : {"parent", "child"}
-        The stream that has positions.
+        The stream of positions.
     least_share : float
-        The share of the squared residuals that a fault must explain.
+        Share of the squared residuals that a fault must explain, to be reported.
+
+    Returns
+    -------
+    list of Finding
+        At most one finding.
     """
     motions = pairs_over(pairs, LAGS_S[0], agreement.MOST_SHORT)
     if len(motions) < MIN_PAIRS:
@@ -242,7 +262,7 @@ def check_positions(
     other = {"child": "parent", "parent": "child"}[stream]
     suspects = [
         (slow.share(f"axes_{stream}"), agreement.axis_gain(slow, stream)),
-        # A large factor shows better as its inverse, in the columns of the poses.
+        # A large factor fits better as its inverse, a factor of the other stream.
         (slow.share(f"axes_{other}"), agreement.axis_gain(slow, other, stream)),
     ]
     short = pairs_over(pairs, agreement.SHORT_S, agreement.MOST_SHORT)
@@ -251,21 +271,21 @@ def check_positions(
         interval_s = median(np.diff(pairs.stamps_ns)) * 1e-9
         suspects += agreement.delay_suspects(fast, pairs, speed, 0.0)
         suspects += agreement.smoothing_suspects(fast, interval_s, speed)
-    named = [
-        (suspect.code == "smoothed_positions", share, _of_positions_alone(suspect))
+    candidates = [
+        (suspect.code == "smoothed_positions", share, _for_positions(suspect))
         for share, suspect in suspects
         if suspect and share > least_share and suspect.stream == stream
-        if suspect.code in _OF_POSITIONS
+        if suspect.code in _POSITION_CODES
     ]
-    # Smoothing makes a coordinate shorter that changes fast: it is the cause.
-    return [max(named, key=lambda suspect: suspect[:2])[2]] if named else []
+    # Smoothing comes first: it also shrinks a coordinate that changes fast, like a wrong scale.
+    return [max(candidates, key=lambda candidate: candidate[:2])[2]] if candidates else []
 
 
-def _of_positions_alone(suspect: Finding) -> Finding:
-    """The finding as it is about positions alone.
+def _for_positions(suspect: Finding) -> Finding:
+    """Return a finding about poses as it applies to positions.
 
-    Smoothed positions are an error: the lever arm depends on little else. A negative scale is a
-    mirror.
+    Smoothed positions are an error, because the lever arm follows from the positions in turns.
+    A negative scale factor is a mirrored axis.
     """
     if suspect.code == "smoothed_positions":
         return replace(suspect, severity=Severity.ERROR)
@@ -275,8 +295,9 @@ def _of_positions_alone(suspect: Finding) -> Finding:
 
 
 def _with_orientations(pairs: PosePairs, T_parent_child: FloatArray, stream: str) -> PosePairs:
-    """Pose pairs whose stream with positions has the orientations of the other stream, in the
-    world of its positions.
+    """Replace the orientations in the stream of positions by those of the other stream.
+
+    They are rotated to the world frame of the positions, window by window.
     """
     if stream == "child":
         predicted, measured = pairs.Ts_pw_p @ T_parent_child, pairs.Ts_cw_c
@@ -296,26 +317,28 @@ def _with_orientations(pairs: PosePairs, T_parent_child: FloatArray, stream: str
 
 
 def _copied_positions(pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:
-    """Finding about positions that were computed from the poses: only rounding differs."""
+    """Detect positions that were computed from the poses: residuals are as small as rounding."""
     motions = pairs_over(pairs, 0.0, agreement.MOST_SHORT)
     if len(motions) < MIN_PAIRS:
         return []
-    left_m = median(np.linalg.norm(motions.residuals(T_parent_child)[0], axis=1))
+    residual_m = median(np.linalg.norm(motions.residuals(T_parent_child)[0], axis=1))
     moved_m = median(np.linalg.norm(motions.Ts_parenti_parentj[:, :3, 3], axis=1))
-    if left_m > min(_COPIED_M, _COPIED_SHARE * moved_m):
+    if residual_m > min(_COPIED_M, _COPIED_SHARE * moved_m):
         return []
     text = "The positions agree with the poses to rounding"
-    return [finding("not_independent", "both", Severity.ERROR, evidence=text, residual_m=left_m)]
+    return [
+        finding("not_independent", "both", Severity.ERROR, evidence=text, residual_m=residual_m)
+    ]
 
 
 def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
-    """Finding about positions (N, 3) that were interpolated between few measured ones."""
+    """Detect positions (N, 3) that were interpolated between few measured positions."""
     steps = np.diff(positions, axis=0)
     sizes = np.linalg.norm(steps, axis=1)
     moving = np.minimum(sizes[1:], sizes[:-1]) > _MOVES_M
     if moving.sum() < MIN_PAIRS:
         return []
-    # The middle of three positions, off the line through the other two.
+    # Distance of each position from the line through its two neighbours.
     chord = steps[1:] + steps[:-1]
     along = np.linalg.norm(chord, axis=1)
     off = np.linalg.norm(se3.cross(steps[:-1], chord), axis=1) / np.maximum(along, 1e-12)
@@ -324,7 +347,7 @@ def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
 
 
 def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:
-    """Finding about rotations that were computed from the others: only rounding differs."""
+    """Detect rotations that were computed from the other stream: only rounding differs."""
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < MIN_PAIRS:
         return []
@@ -341,18 +364,23 @@ def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Find
 def check_rotations(
     pairs: PosePairs, T_parent_child: FloatArray, stream: str, has_rates: bool
 ) -> list[Finding]:
-    """Findings about rotations that agree, on one clock and without the bias of a gyroscope.
+    """Check rotations for a moved mount and, with rates, for wrong gains and misaligned axes.
 
     Parameters
     ----------
     pairs : PosePairs
-        Positions are not looked at.
+        On one clock and without gyroscope bias. The positions are ignored.
     T_parent_child : (4, 4) array
     stream : {"parent", "child"}
-        The stream that findings name: the one with rates.
+        The stream of rotations or rates, which a finding names.
     has_rates : bool
-        Orientations come from an odometry or a filter, which has no axes to misalign: only
-        a mount that moves is looked for then.
+        Whether a stream has rates. Orientations come from an odometry or a filter, which has no
+        sensor axes to misalign: only a moved mount is checked then.
+
+    Returns
+    -------
+    list of Finding
+        At most one finding.
     """
     rotation = T_parent_child[:3, :3]
     of_parent, of_child = _rotation_vectors(pairs)
@@ -371,12 +399,12 @@ def check_rotations(
     moved = agreement.moved_mount(change, int(pairs.stamps_ns[0])) if change else None
     if moved:
         return [moved]
-    named = gravest_first([suspect for suspect in suspects if suspect])
-    return [*named[:1]]
+    findings = gravest_first([suspect for suspect in suspects if suspect])
+    return [*findings[:1]]
 
 
 def _rotation_vectors(pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors (K, 3) of parent and child over a second, each in its own axes."""
+    """Rotation vectors (K, 3) of parent and child over 1 s, each in its own sensor frame."""
     motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
     turns = [
         se3.rotation_log(Ts[:, :3, :3])
@@ -387,11 +415,11 @@ def _rotation_vectors(pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
 
 
 def _check_handedness(pairs: PosePairs, stream: str) -> list[Finding]:
-    """Finding about rates that a reflection explains far better than any rotation."""
+    """Detect rates about left-handed axes: a reflection fits far better than any rotation."""
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < BLOCKS * MIN_PAIRS:
         return []
-    # A bias is a mean. It is not known as long as the rotation is wrong.
+    # Subtract the mean, which contains the bias: a wrong rotation spoils the estimate of the bias.
     of_parent, of_child = (vectors - vectors.mean(axis=0) for vectors in (of_parent, of_child))
     left, _, right = np.linalg.svd(of_child.T @ of_parent)
     rotating = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
@@ -408,18 +436,28 @@ def _check_handedness(pairs: PosePairs, stream: str) -> list[Finding]:
 def _matrix_suspects(
     of_parent: FloatArray, of_child: FloatArray, stream: str
 ) -> list[Finding | None]:
-    """Gains and misaligned axes of the rates of a stream, from rotation vectors (K, 3) of both in
-    the parent's axes.
+    """Detect misaligned axes and wrong gains of a stream of rotations or rates.
 
-    Rates are the less noisy: their rotation vectors are the columns. These are small rotations of
-    the extrinsic, gains of the principal axes, and the symmetric part beside the diagonal.
+    Parameters
+    ----------
+    of_parent, of_child : (K, 3) array
+        Rotation vectors of both sensors, in the parent sensor's frame.
+    stream : {"parent", "child"}
+        The stream of rotations or rates. Its rotation vectors are the regressors, because a
+        gyroscope has less noise.
+
+    Notes
+    -----
+    The regression estimates 3 small rotations, which correct the extrinsic, 3 gains along the
+    principal axes of rotation, and 3 elements of the symmetric part off the diagonal.
     """
     if stream == "child":
         reference, measured = of_child, of_parent
     else:
         reference, measured = of_parent, of_child
     axes = np.linalg.eigh(reference.T @ reference)[1][:, ::-1]
-    x, y = reference @ axes, measured @ axes
+    x = reference @ axes
+    y = measured @ axes
     gains = x[:, None, :] * np.eye(3)
     shears = np.zeros((len(x), 3, 3))
     for column, (k, m) in enumerate(_PLANES):
@@ -434,13 +472,13 @@ def _matrix_suspects(
 
 
 def _shear(fit: Regression, stream: str) -> Finding | None:
-    """Axes of rotation that are not perpendicular."""
+    """Detect sensor axes that are not perpendicular."""
     values, sigmas = fit.fit("shear", "gain")
     limits = agreement.BIASES * fit.biases("shear")
-    known = np.where(
+    significant = np.where(
         np.abs(values) > np.maximum(LIMITS["misaligned"][0] * sigmas, limits), values, 0
     )
-    size = float(np.abs(known).max())
-    # A symmetric part of s is an angle between two axes that is off by 2 s.
+    size = float(np.abs(significant).max())
+    # If the symmetric part is s, the angle between two axes is wrong by 2 s.
     degrees = float(np.degrees(2.0 * size))
     return graded("misaligned", stream, size, degrees=degrees)
