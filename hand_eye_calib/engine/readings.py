@@ -1,10 +1,10 @@
-"""Which of two readings of both streams is right: as they are, or inverted besides.
+"""Choice between two readings of both streams: the second inverts every pose of the first.
 
-Both readings fit alike (:class:`~hand_eye_calib.checks.hypotheses.Readings`). Two kinds of evidence
-differ: the likelihood of the noise (:mod:`~hand_eye_calib.gls.readings`), and the shape of the
-motion. The noise is believed first. In a small space it needs the shape's support: there, the noise
-of a camera that sees a target is like that of inverse poses. Where neither decides, both answers
-are shown, and the result is not to be used.
+Both readings fit equally well (:class:`~hand_eye_calib.checks.hypotheses.Readings`). Two kinds of
+evidence differ: the likelihood of the noise (:mod:`~hand_eye_calib.gls.readings`) and the shape of
+the motion. The noise has priority. In a small space the shape must support it, because a camera
+that observes a target has the same noise there as inverted poses. If the evidence is not clear,
+both answers are reported, and the verdict is DO NOT USE.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -23,26 +23,26 @@ from hand_eye_calib.option import Options
 from hand_eye_calib.pairing.motion_pairs import PosePairs
 from hand_eye_calib.results.calibration import Calibration
 
-# Difference of the losses that decides. In 200 right recordings whose sensors are no cameras that
-# see a target, the difference was -9 or more.
+# Smallest difference of the losses that decides. In 200 recordings whose first reading is right and
+# that have no target cameras, the difference was never below -9.
 CLEAR_NOISE = 20.0
 
-# Logarithm of paths from which on they support the noise in a small space.
+# Smallest `Readings.paths` (a logarithm) that supports the noise in a small space.
 _CLEAR_PATHS = 0.06
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a check finds after the choice of a reading.
+    """Chosen reading of both streams.
 
     Attributes
     ----------
     findings : tuple of Finding
-        Those of the check, for the chosen reading.
+        Findings of the check for the chosen reading.
     doubts : tuple of Finding
-        To be added to the result with that reading.
+        Findings about the choice itself, to be added to the result.
     is_repair : bool
-        Whether the reading needs options.
+        Whether the chosen reading needs options, such as ``child_invert``.
     """
 
     findings: tuple[Finding, ...]
@@ -60,11 +60,11 @@ def choose(
     Parameters
     ----------
     result : CheckResult
-        A check that has readings.
+        A check whose ``readings`` are not None.
     pairs_of : callable
-        Returns the poses with some options, on one clock.
+        Returns the pose pairs for given options, on one clock.
     answer_with : callable
-        Returns the result with some options, on one clock.
+        Returns the result for given options, on one clock; None if the solve fails.
     """
     readings = result.readings
     assert readings is not None
@@ -75,15 +75,15 @@ def choose(
     can_be_right = readings.hypotheses[0].is_upright
     doubts: tuple[Finding, ...] = ()
     if index is None:
-        answers = [answer_with(each) for each in options]
+        answers = [answer_with(reading_options) for reading_options in options]
         doubts = (_unclear(options, answers, difference),)
         index = 0 if can_be_right else int(readings.shape > 0.0)
     elif index == 1 and can_be_right and readings.is_small:
         doubts = (finding("inverse_small", "both"),)
     codes = {"inverse_both"}
     for findings in of_both:
-        codes.update(each.code for each in findings)
-    others = [each for each in result.findings if each.code not in codes]
+        codes.update(suspect.code for suspect in findings)
+    others = [other for other in result.findings if other.code not in codes]
     return Choice(
         findings=gravest_first((*others, *of_both[index])),
         doubts=doubts,
@@ -128,8 +128,9 @@ def _in_a_small_space(readings: Readings, by_noise: int) -> int:
 
 
 def _difference(first: PosePairs, second: PosePairs) -> float:
-    """Return the loss of the second reading less that of the first, at the stamps of both; 0 if the
-    noise model fits neither.
+    """Return the loss of the second reading less that of the first, at their common stamps.
+
+    The difference is 0 if the scale or the noise model of a reading cannot be estimated.
     """
     _, of_first, of_second = np.intersect1d(
         first.stamps_ns, second.stamps_ns, assume_unique=True, return_indices=True
@@ -150,19 +151,20 @@ def _difference(first: PosePairs, second: PosePairs) -> float:
 
 
 def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
+    """Return the options of all findings."""
     options: dict[str, float | str] = {}
-    for each in findings:
-        options.update(each.options)
+    for suspect in findings:
+        options.update(suspect.options)
     return options
 
 
 def _unclear(
     options: Sequence[Options], answers: Sequence[Calibration | None], difference: float
 ) -> Finding:
-    """The finding that two readings are possible, with both answers."""
+    """Return the finding that two readings are possible, with both answers."""
     texts = []
-    for of_reading, answer in zip(options, answers, strict=True):
-        values = ", ".join(f"{name} {value}" for name, value in of_reading.items())
+    for reading_options, answer in zip(options, answers, strict=True):
+        values = ", ".join(f"{name} {value}" for name, value in reading_options.items())
         reading = f"with {values}" if values else "as the streams are"
         pose = _in_words(answer.T_parent_child) if answer else "no result"
         texts.append(f"{reading} ({pose})")
@@ -173,8 +175,8 @@ def _unclear(
 
 
 def _in_words(T_parent_child: np.ndarray) -> str:
-    """A pose as people read it."""
+    """Format a pose as position (m) and Euler angles (deg)."""
     x, y, z, *rpy = se3.xyz_rpy(T_parent_child)
     roll, pitch, yaw = np.degrees(rpy)
-    place = f"x {x:.3f}, y {y:.3f}, z {z:.3f} m"
-    return f"{place}, roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} deg"
+    position = f"x {x:.3f}, y {y:.3f}, z {z:.3f} m"
+    return f"{position}, roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} deg"

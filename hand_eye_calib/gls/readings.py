@@ -1,18 +1,19 @@
-"""Two readings of the same poses, compared by the likelihood of their noise.
+"""Comparison of two readings of the same poses by the likelihood of their noise.
 
-Two streams agree with each other as well if every pose of both is inverted: A Y = Y B then holds
-for the pose Y of one world in the other. No residual tells which reading is right. The noise tells:
-drift adds up in the frame of a sensor, and rotation errors turn about a sensor, or about the target
-that a camera sees. In the wrong reading the same errors grow with the distance from a world.
+If every pose of both streams is inverted, the streams agree just as well: A Y = Y B then holds for
+the pose Y of one world in the other. Residuals cannot decide between these two readings, but the
+noise can. In the right reading, drift accumulates in the sensor frame, and rotation errors turn
+about the sensor, or about the target of a camera. In the wrong reading, the same errors grow with
+the distance from the origin of a world.
 
 The losses of two readings are comparable under these conditions:
 
-- Motions, not poses, are the data. Inversion transforms motions by an adjoint of determinant 1, so
-  both readings have the same units of probability.
-- Both readings leave out the same jumps and outlier poses, and have no robust weights.
-- Both have the same parameters with the same prior standard deviations.
-- Each reading has the centre of rotation noise that suits it best. A camera's view of a target is
-  as good an explanation of white noise as the inverse of a tracker's poses.
+- The data are motions, not poses. Inverting the poses transforms the motions by an adjoint of
+  determinant 1, so the probability densities of both readings have the same unit.
+- Both readings skip the same jumps and outlier poses, and have no robust weights.
+- Both readings have the same parameters with the same prior standard deviations.
+- Each reading has its best centre of rotation noise: a camera that observes a target has the same
+  white noise as the inverted poses of a tracker.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from hand_eye_calib.gls.increments import PARAMETERS, SYSTEMATIC, Streams
 from hand_eye_calib.gls.noise_model import CENTRES
 from hand_eye_calib.gls.outliers import Outliers, bridged
 
-# Most poses that are compared, evenly spread: the search takes about 1 ms a pose and reading.
+# Largest number of poses to compare, evenly spread. The search takes about 1 ms for each pose and
+# reading.
 MOST_POSES = 1500
 
 
@@ -43,7 +45,7 @@ def loss_difference(
     ----------
     stamps_ns : (N,) int64 array
     first, second : tuples of two (N, 4, 4) arrays
-        Poses of parent and child at these stamps. The lengths of both sensors are in one unit.
+        Poses of parent and child at these stamps, in one unit of length.
 
     Returns
     -------
@@ -77,8 +79,9 @@ def loss_difference(
 
 
 def _least_loss(problem: stages.Problem, start: stages.Fit, outliers: Outliers) -> float:
-    """Return the least loss of a reading over the centres of rotation noise, with these outliers
-    and without weights.
+    """Return the smallest loss of a reading over all centres of rotation noise.
+
+    The fit has the given outliers and no robust weights.
     """
     n_poses = len(problem.streams)
     fits = []
@@ -102,6 +105,6 @@ def _least_loss(problem: stages.Problem, start: stages.Fit, outliers: Outliers) 
 
 
 def _loss(problem: stages.Problem, fit: stages.Fit) -> float:
-    """Return the restricted negative log likelihood, with the scale of the parameters' prior."""
+    """Return the restricted negative log likelihood, with the normalisation of the prior."""
     prior_sigmas = fit.sigmas[problem.columns]
     return problem.posterior(fit).loss + float(np.log(prior_sigmas).sum())
