@@ -1,8 +1,8 @@
-"""When to stop recording: how far each axis is from its target, how long it still takes, which
-motion helps most, and whether this motion gets there at all.
+"""Progress of a recording session: distance to the target on each axis, time left, most helpful
+motion, and whether the present motion can reach the target.
 
-A standard deviation that once falls below the target is no reason to stop: time-correlated errors
-have not shown yet in a short recording. The rule was measured on recordings with known truth,
+A single standard deviation below the target is no reason to stop, because a short recording does
+not contain the time-correlated errors yet. The rule was tuned on recordings with known truth, see
 docs/session.md.
 """
 
@@ -19,20 +19,22 @@ from hand_eye_calib.results.records import AXES
 from hand_eye_calib.results.verdict import what_is_known
 from hand_eye_calib.text import axes_in_words, duration
 
-# An axis is known if its standard deviation is below this share of its target ...
+# Share of its target that the standard deviation of an axis must reach, allowance included.
 _SHARE = 0.7
-# ... or what the allowance leaves of it, of the variance at least this share, ...
+# Least share of the wanted variance that remains for the measured variance if the allowance takes
+# the rest.
 _LEAST_ROOM = 0.25
-# ... at two results in a row, after so many seconds of motion, and so many correlation times of
-# time-correlated errors.
-_MIN_MOTION_S, _CORRELATION_TIMES = 30.0, 10.0
+# Least duration of motion (s) of the two results in a row that must reach the target.
+_MIN_MOTION_S = 30.0
+# The same in correlation times of the slowest time-correlated error.
+_CORRELATION_TIMES = 10.0
 
-# Times left (s) that a person is told: they only shrink, by one step at a result. A motion that
-# would take longer than the last of them will not get there.
+# Times left that are reported (s). They only decrease, by one step for each result. Beyond the last
+# finite step, the present motion cannot reach the target.
 _STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, np.inf])
 
-# Standard deviations are estimates too: a result with more motion replaces the best one unless its
-# own are larger by more than this factor.
+# Largest ratio of standard deviations at which a newer result replaces the best one: standard
+# deviations are estimates, and the newer result has more motion.
 _AS_GOOD = 1.25
 
 _NO_RESULT = "No result yet: move the sensors, with rotations."
@@ -40,7 +42,7 @@ _NO_RESULT = "No result yet: move the sensors, with rotations."
 
 @dataclass(frozen=True)
 class _Judged:
-    """A result of the session, the motion it comes from, and whether its streams were faulty."""
+    """Result of the session, its motion, and the faults of its streams."""
 
     calibration: Calibration
     seen: Excitation
@@ -48,21 +50,21 @@ class _Judged:
 
 
 class Goal:
-    """Judges the results of a session, one after the other.
+    """Goal of a session, compared with each new result.
 
-    Once the goal is reached, it stays reached, unless a result is refuted or the options change. Of
-    the results that reach it, the newest is kept, but not one that is clearly worse than the best.
+    Once the goal is reached, it stays reached, unless a result is refuted or the options change.
+    ``best`` is the newest result that reaches the goal, unless an earlier one is clearly better.
 
     Parameters
     ----------
     targets : (6,) array-like
-        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad); the goal is 0.7 of
-        each.
+        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad). The goal is 0.7 of
+        each target.
 
     Attributes
     ----------
     best : Calibration or None
-        The best result that reaches the goal; None before that.
+        Best result that reaches the goal; None before the goal is reached.
     progress : Progress
     """
 
@@ -72,28 +74,28 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        # The newest result, and the newest of those from less motion.
+        # The newest result, and the newest result with less motion.
         self._newest: _Judged | None = None
         self._before: _Judged | None = None
         self._motion_s = -1.0
         self._start_over(_NO_RESULT)
 
     def _start_over(self, sentence: str) -> None:
-        """Forget that the goal was reached, but not the results."""
+        """Reset the goal to not reached, and keep the results."""
         self.best: Calibration | None = None
         self._best_information = 0.0
         self._steps = np.full(6, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet(sentence)
 
     def wait(self, sentence: str) -> None:
-        """Take note that there is no result yet, and why."""
+        """Store the reason why there is no result yet; ignored once there is one."""
         if self._newest is None:
             self.progress = self._nothing_yet(sentence)
 
     def follow(self, targets: Sequence[float] | FloatArray) -> None:
         """Start over with these targets, because options have changed.
 
-        Earlier results still confirm the next one: a robot may be parked by now.
+        Earlier results still confirm the next one, because the robot may stand still by now.
         """
         self._targets = np.asarray(targets, dtype=float)
         if self._newest is not None:
@@ -102,7 +104,7 @@ class Goal:
             self._start_over(_NO_RESULT)
 
     def retarget(self, calibration: Calibration, targets: Sequence[float] | FloatArray) -> Progress:
-        """Judge the session's result again, because the targets, and nothing else, have changed.
+        """Compare the session's result with new targets; no other option has changed.
 
         Parameters
         ----------
@@ -118,21 +120,21 @@ class Goal:
     def add(
         self, calibration: Calibration, seen: Excitation, faults: Sequence[str] = ()
     ) -> Progress:
-        """Take the next result of the session.
+        """Add the next result of the session and update ``best`` and ``progress``.
 
         Parameters
         ----------
         calibration : Calibration
         seen : Excitation
-            The motion that it comes from.
+            The motion of the result.
         faults : sequence of str
-            What the stream checks found; the goal is not reached while there is something.
+            Findings of the stream checks. The goal is not reached while there are any.
         """
-        if not faults:  # errors that the result has of its own, as one of positions or rates
+        if not faults:  # a result from positions or rates has findings of its own
             findings = [reason for reason in calibration.reasons if reason.is_finding]
-            errors = [each for each in findings if each.verdict is Verdict.DO_NOT_USE]
+            errors = [reason for reason in findings if reason.verdict is Verdict.DO_NOT_USE]
             faults = [error.sentence for error in errors]
-        # Every result of a robot that stands still is the same result.
+        # A result without more motion cannot confirm the one before: the robot stands still.
         if seen.motion_s > self._motion_s:
             self._before = self._newest
             self._motion_s = seen.motion_s
@@ -141,7 +143,8 @@ class Goal:
             self._start_over(f"No usable result: {calibration.status.failure}.")
             return self.progress
         ratios = self._ratios(calibration, calibration)
-        worst, motion_s = int(np.argmax(ratios)), seen.motion_s
+        worst = int(np.argmax(ratios))
+        motion_s = seen.motion_s
         may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
         is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
         least_s = _least_motion_s(calibration)
@@ -151,28 +154,31 @@ class Goal:
         if is_within and may_end and information * _AS_GOOD**2 >= self._best_information:
             self.best = calibration
             self._best_information = max(information, self._best_information)
-        # Not 0 seconds of motion: an axis that was not seen at all takes for ever, not "nan".
+        # Variances decrease with 1 / time. An infinite ratio times 0 s would be NaN.
         left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
         left_s = np.maximum(left_s, max(least_s - motion_s, 0.0))
         is_done = self.best is not None
-        stuck = not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _STEPS_S[-2]
-        left_s = self._told(left_s)
-        known = self._ended(calibration, faults)
-        behind = AXES[worst] if stuck or ratios[worst] > 1.0 else ""
+        is_stuck = bool(not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _STEPS_S[-2])
+        left_s = self._in_steps(left_s)
+        limiting = AXES[worst] if is_stuck or ratios[worst] > 1.0 else ""
         self.progress = Progress(
-            sentence=known or _way_on(behind, left_s[worst], bool(stuck), seen),
+            sentence=(
+                self._reason_to_stop(calibration, faults)
+                or _advice(limiting, left_s[worst], is_stuck, seen)
+            ),
             done=is_done and not faults,
             is_faulty=bool(faults),
             limiting_axis="" if is_done else AXES[worst],
-            will_not_get_there=bool(stuck),
+            will_not_get_there=is_stuck,
             axes=self._by_axis(calibration.sigmas, np.zeros(6) if is_done else left_s),
         )
         return self.progress
 
     def _is_confirmed(self, newest: Calibration) -> bool:
-        """Whether the result before, from less motion, reaches the goal as the newest one does.
+        """Whether the previous result, from less motion, reaches the goal, too.
 
-        Options may have changed in between: allowance and priors are those of the newest result.
+        Its allowance and priors are replaced by those of the newest result, because options may
+        have changed in between.
         """
         before = self._before
         if before is None or before.faults:
@@ -183,39 +189,44 @@ class Goal:
         return bool(is_long and self._ratios(before.calibration, newest).max() <= 1.0)
 
     def _ratios(self, calibration: Calibration, newest: Calibration) -> FloatArray:
-        """Measured variances (6,) over what the allowance leaves of the targets: an allowance above
-        them cannot be driven away. Allowance and priors are those of the newest result.
+        """Ratios (6,) of the measured variances to the variances that are allowed for them.
+
+        The wanted variance includes the allowance, which no motion reduces: the rest is allowed for
+        the measured variance. Allowance and priors are those of the newest result.
         """
         wanted = _SHARE * self._targets
         room = np.maximum(wanted**2 - newest.allowance**2, _LEAST_ROOM * wanted**2)
-        # What somebody measured by hand, no motion would tell better; some streams never show all.
+        # Motion improves neither an axis with a prior nor one out of reach of the streams.
         exempt = np.isin(AXES, newest.out_of_reach)
         exempt |= [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
         return np.asarray(np.where(exempt, 0.0, calibration.sigmas_measured**2 / room))
 
-    def _told(self, left_s: FloatArray) -> FloatArray:
-        """The steps (6,) that are told of these times: estimates jump, and a person who is told 4
-        min, 5 s, 25 s believes none of them.
-        """
-        steps, before = np.searchsorted(_STEPS_S, 0.95 * left_s), self._steps
+    def _in_steps(self, left_s: FloatArray) -> FloatArray:
+        """Round times left (6,) to steps that decrease one by one, because estimates jump."""
+        before = self._steps
+        # 5 % tolerance: a time slightly above a step is rounded down to it.
+        steps = np.searchsorted(_STEPS_S, 0.95 * left_s)
         far = len(_STEPS_S) - 1
+        # To and from infinity and zero, a time may jump.
         is_new = (before == far) | (before == 0) | (steps == far) | (steps == 0)
         self._steps = np.where(is_new, steps, np.clip(steps, before - 1, before))
         return np.asarray(_STEPS_S[self._steps])
 
     def _nothing_yet(self, sentence: str) -> Progress:
+        """Progress without a result."""
         unknown = np.full(6, np.inf)
         return Progress(sentence=sentence, axes=self._by_axis(unknown, unknown))
 
     def _by_axis(self, sigmas: FloatArray, left_s: FloatArray) -> dict[str, AxisProgress]:
+        """Progress by axis from standard deviations (6,) and times left (6,)."""
         columns = zip(AXES, sigmas.tolist(), self._targets.tolist(), left_s.tolist(), strict=True)
         return {
             axis: AxisProgress(sigma=sigma, target=target, seconds_left=seconds)
             for axis, sigma, target, seconds in columns
         }
 
-    def _ended(self, calibration: Calibration, faults: Sequence[str]) -> str:
-        """What to do if more motion would not help, or is not needed; empty if it is."""
+    def _reason_to_stop(self, calibration: Calibration, faults: Sequence[str]) -> str:
+        """Sentence to stop if more motion is useless or not needed; empty otherwise."""
         if faults:
             return f"Stop: the streams are faulty: {faults[0]}."
         if calibration.status.failure:
@@ -226,20 +237,24 @@ class Goal:
 
 
 def _least_motion_s(calibration: Calibration) -> float:
-    """Seconds of motion below which a standard deviation is not believed."""
+    """Least duration of motion (s) before a standard deviation is trusted."""
     lasting = calibration.noise.lasting if calibration.noise else ()
     slowest_s = max((error.tau_s for error in lasting if error.kind != "path"), default=0.0)
     return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
 
 
-def _way_on(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
-    """Which motion helps most, for the axis that takes longest; there may be none."""
+def _advice(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
+    """Sentence with the most helpful motion for the axis that takes longest.
+
+    ``axis`` is empty if every axis is within its target.
+    """
     left = duration(np.clip(left_s, _STEPS_S[1], _STEPS_S[-2]))
     if not axis:
         return f"Go on for about {left}: every axis is good enough if the next results agree."
-    motion, called = helpful_motion([axis], seen), axes_in_words([axis])
+    motion = helpful_motion([axis], seen)
+    axis_text = axes_in_words([axis])
     if is_stuck:
-        return f"This motion will not determine {called} well enough: {motion}."
+        return f"This motion will not determine {axis_text} well enough: {motion}."
     if not np.isfinite(left_s):
-        return f"{called} is not determined yet: {motion}."
-    return f"Go on for about {left}: {called} takes longest, {motion}."
+        return f"{axis_text} is not determined yet: {motion}."
+    return f"Go on for about {left}: {axis_text} takes longest, {motion}."
