@@ -1,4 +1,4 @@
-"""When the node solves and checks the streams, what came of it, and who waits for the answer."""
+"""Solves and stream checks of the node: their schedule, their results, and the waiting callers."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -37,27 +37,26 @@ from hand_eye_calib.results.records import AXES
 from hand_eye_calib.session.goal import Goal
 from hand_eye_calib.text import duration, listing, parse_targets
 
-# Takes whether a solve was good, and a line about it.
+# Callback with the success of a solve and a line of text about it.
 OnSolved = Callable[[bool, str], None]
 
-# The streams are checked at most this often (s), which costs a second or two each time.
+# Least time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
 
-# Options that change how a result is judged, but not the result.
+# Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
 
-
-# Findings about the poses of one stream as they came in. Once poses are paired, and with that
-# interpolated, they do not show any more.
-_OF_RAW_POSES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
+# Codes of findings about the received poses of one stream. After pairing, which interpolates the
+# poses, a check cannot detect these faults.
+_RAW_POSE_CODES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
 
 
 class StreamChecks:
-    """Keeps the findings of stream checks.
+    """Findings of the stream checks of a session.
 
-    Errors count at once; warnings, and what is merely possible, only if two checks in a row have
-    them: over a short recording, odometry may well be off by some per cent. An error of the poses
-    as they came in stays for the session, because its poses do.
+    An error counts at once. Any other finding counts if two checks in a row report it, because
+    odometry may be wrong by some per cent over a short recording. An error of the received poses
+    lasts for the whole session, because the session keeps these poses.
     """
 
     def __init__(self, log: NodeLog) -> None:
@@ -65,7 +64,7 @@ class StreamChecks:
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new session: nothing is known yet."""
+        """Begin a new session without findings."""
         self._result: CheckResult | None = None
         self._checked_at_s = 0.0
         self._suspected: set[tuple[str, str]] = set()
@@ -73,7 +72,7 @@ class StreamChecks:
         self._lasting: dict[tuple[str, str], Finding] = {}
 
     def follow(self, config: CalibratorConfig) -> None:
-        """Forget lasting findings that the options answer."""
+        """Drop lasting findings that are no errors with the new options."""
         open_findings = {}
         for key, finding in self._lasting.items():
             (graded,) = answered([finding], config)
@@ -82,17 +81,25 @@ class StreamChecks:
         self._lasting = open_findings
 
     def take(self, result: CheckResult) -> None:
-        """Take what a check found; what is new, and what no longer holds, is logged."""
-        before, self._result, self._checked_at_s = self._faults, result, time.monotonic()
-        found = {(f.code, f.stream): f for f in result.findings if f.severity is not Severity.NOTE}
-        self._faults = {
-            key: f for key, f in found.items() if f.makes_unusable or key in self._suspected
+        """Store the result of a check, and log new findings and those that are gone."""
+        before = self._faults
+        self._result = result
+        self._checked_at_s = time.monotonic()
+        suspects = {
+            (finding.code, finding.stream): finding
+            for finding in result.findings
+            if finding.severity is not Severity.NOTE
         }
-        self._suspected = set(found)
+        self._faults = {
+            key: finding
+            for key, finding in suspects.items()
+            if finding.makes_unusable or key in self._suspected
+        }
+        self._suspected = set(suspects)
         for key, finding in self._faults.items():
-            if finding.makes_unusable and finding.code in _OF_RAW_POSES:
+            if finding.makes_unusable and finding.code in _RAW_POSE_CODES:
                 self._lasting[key] = finding
-        # Those of this check have the newest numbers.
+        # Findings of this check replace lasting ones: their values are newer.
         self._faults = {**self._lasting, **self._faults}
         for key in self._faults.keys() - before.keys():
             self._log.warning(_in_parameters(self._faults[key]))
@@ -101,65 +108,68 @@ class StreamChecks:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What speaks against calibrating with these streams, the gravest first."""
+        """Findings that count against these streams, the gravest first."""
         return tuple(self._faults.values())
 
-    def _unseen(self) -> list[Finding]:
-        """Lasting findings that the last check does not have."""
-        keys = {(each.code, each.stream) for each in self._result.findings} if self._result else ()
+    def _earlier_findings(self, result: CheckResult) -> list[Finding]:
+        """Lasting findings that this check does not report."""
+        keys = {(finding.code, finding.stream) for finding in result.findings}
         return [finding for key, finding in self._lasting.items() if key not in keys]
 
     def faults(self) -> tuple[str, ...]:
-        """The findings against calibrating, in a line each, with the parameters that help."""
+        """Text of the findings that count, one line each, with the parameters to set."""
         return tuple(map(_in_parameters, self.findings))
 
     def state(self) -> ChecksState:
-        """Findings of the last check."""
+        """Return the diagnostics of the last check, with lasting findings."""
         if self._result is None:
             text = (
                 f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
             return ChecksState(level=Level.WARN, text=text)
-        found = gravest_first([*self._result.findings, *self._unseen()])
+        findings = gravest_first([*self._result.findings, *self._earlier_findings(self._result)])
         return ChecksState(
             level=Level.WARN if self._faults else Level.OK,
             text="; ".join(self.faults()) or "both streams can be of one rigid body",
             age_s=time.monotonic() - self._checked_at_s,
-            findings=tuple(f"{each.severity.value}: {_in_parameters(each)}" for each in found),
+            findings=tuple(
+                f"{finding.severity.value}: {_in_parameters(finding)}" for finding in findings
+            ),
         )
 
 
 def _in_parameters(finding: Finding) -> str:
-    """A finding in one line, with what helps as parameters."""
-    helps = (f": set {name} to {value}" for name, value in finding.options.items())
-    return f"{finding}{''.join(helps)}"
+    """Text of a finding in one line, with the parameters to set."""
+    remedies = (f": set {name} to {value}" for name, value in finding.options.items())
+    return f"{finding}{''.join(remedies)}"
 
 
 class SolveCycle:
-    """Sends snapshots of the session to the solving process and takes the answers.
+    """Exchange of snapshots and answers with the solving process.
 
-    At most one job is under way; a result of an older session is dropped.
+    At most one job runs at a time. A result of an older session is dropped.
 
     Parameters
     ----------
     session : LiveSession
     log : NodeLog
     wake : callable
-        Called in another thread when :meth:`take_answers` has something to do.
-    complete, publish : callable
-        Called with each usable Calibration, which gives it with what there is to add; and when an
-        answer is taken, before who has asked is told.
+        Called in another thread when an answer arrives for :meth:`take_answers`.
+    complete : callable
+        Called with a usable Calibration; returns the Calibration with additions of the node.
+    publish : callable
+        Called after an answer is processed, before the callbacks of :meth:`ask`.
     targets : (6,) sequence
-        Standard deviations wanted, m and rad.
+        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
 
     Attributes
     ----------
     is_solving : bool
     result : Calibration or None
-        The session's result: the newest usable one; once the goal is reached, the one kept, whose
-        warnings say why the newest is not. A contradicted prior puts a result in its place that
-        says DO NOT USE.
+        Result of the session: the newest usable one, or, once the goal is reached, the one that the
+        goal keeps. The warnings explain why a newer result was not taken. If the motion contradicts
+        a prior, a result with the verdict DO NOT USE replaces it.
     """
 
     def __init__(
@@ -172,64 +182,80 @@ class SolveCycle:
         targets: Sequence[float],
     ) -> None:
         self.is_solving = False
-        self.checks, self.goal = StreamChecks(log), Goal(targets)
-        self._session, self._log = session, log
-        self._complete, self._publish = complete, publish
+        self.checks = StreamChecks(log)
+        self.goal = Goal(targets)
+        self._session = session
+        self._log = log
+        self._complete = complete
+        self._publish = publish
+        # Earliest start of the next solve (steady time, s).
         self._rest_until_s = 0.0
-        # Who waits, since when; in flight are those that the next answer is for.
+        # Callbacks that wait for a solve, with the time of the request (steady time, s).
         self._asked: dict[OnSolved, float] = {}
+        # Callbacks that the job under way answers.
         self._in_flight: tuple[OnSolved, ...] = ()
         self._process = SolvingProcess(wake)
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new session: no result yet."""
+        """Begin a new session without a result."""
         self.result: Calibration | None = None
-        self._told_result: ResultState | None = None
+        self._result_state: ResultState | None = None
+        # Copy of the calibrator that gave the result, and options that its checks set.
         self._solved: tuple[Calibrator, Options] | None = None
         self._solved_at_s = 0.0
+        # Motion of the session so far.
         self._seen = NO_MOTION
+        # Failure of the newest solve.
         self._failure: Failure | None = None
-        # Why every solve since the result has failed, and since when (steady time, s).
+        # Last failure if every solve since the result has failed, and the time of the first
+        # failure (steady time, s).
         self._failing: Failure | None = None
         self._failing_since_s = 0.0
-        # Reasons in the log as warnings, by their rules.
+        # Sentences of the reasons that were logged as warnings, by their rules.
         self._warned: dict[str, str] = {}
+        # Options that checks of this session set, and the warnings about them.
         self._certain: Options = {}
-        self._told: tuple[str, ...] = ()
-        self._is_unchecked, self._check_due_s = False, 0.0
+        self._option_warnings: tuple[str, ...] = ()
+        # Whether poses came in since the last check, and when the next is due (steady time, s).
+        self._is_unchecked = False
+        self._check_due_s = 0.0
         self.checks.restart()
         self.goal.restart()
 
     def follow(self, config: CalibratorConfig, before: CalibratorConfig) -> None:
         """Start over with other options than before, and check at once.
 
-        Targets alone do not change the result: it is judged again, also if nothing moves any more.
+        If only targets have changed, the result stays and gets a new verdict at once, because the
+        robot may stand still by now.
         """
-        self._certain, self._told = {}, ()
-        self._is_unchecked, self._check_due_s = True, 0.0
+        self._certain = {}
+        self._option_warnings = ()
+        self._is_unchecked = True
+        self._check_due_s = 0.0
         self.checks.follow(config)
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
-        others = before.given.difference(_TARGETS), config.given.difference(_TARGETS)
-        is_other = replace(before, **targets) != config or others[0] != others[1]
-        if result is None or is_other:
+        given_before = before.given.difference(_TARGETS)
+        given_now = config.given.difference(_TARGETS)
+        has_other_options = replace(before, **targets) != config or given_before != given_now
+        if result is None or has_other_options:
             self.goal.follow(config.targets)
             return
         targets["target_axes"] = parse_targets("target.axes", config.target_axes)
         result = replace(result, **targets)
         self.goal.retarget(result, config.targets)
         self.result = result
-        self._told_result = _result_state(result)
+        self._result_state = _state_of(result)
 
     @property
     def published(self) -> Calibration | None:
-        """The result for the topics; None without one that holds."""
+        """Result to publish; None without a result, or if it is refuted."""
         return None if self.result is None or is_refuted(self.result) else self.result
 
     @property
     def standing(self) -> Standing:
-        """Whether the result holds."""
+        """Validity of the result."""
         if self.result is None:
             return Standing.NONE
         if is_refuted(self.result):
@@ -238,8 +264,9 @@ class SolveCycle:
 
     @property
     def problem(self) -> str:
-        """Why the result does not hold, in one line; empty if it does."""
-        result, failing = self.result, self._failing
+        """Reason why the result is refuted or outdated, in one line; empty otherwise."""
+        result = self.result
+        failing = self._failing
         if result is not None and is_refuted(result):
             reason = result.reasons[0]
             remedy = ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
@@ -255,13 +282,13 @@ class SolveCycle:
         )
 
     def result_to_save(self) -> Calibration | None:
-        """The result, with a warning if every solve since has failed; None without one."""
+        """Return the result, with a warning if every solve since has failed; None without one."""
         if self.result is None or self.standing is not Standing.OUTDATED:
             return self.result
         return replace(self.result, warnings=(*self.result.warnings, self.problem))
 
     def snapshot(self) -> Snapshot | None:
-        """The poses and options that gave the result; None without one."""
+        """Return the poses and options that gave the result; None without a result."""
         if self._solved is None:
             return None
         calibrator, certain = self._solved
@@ -270,72 +297,80 @@ class SolveCycle:
     # ------------------------------------------------------------------ solving
 
     def ask(self, on_solved: OnSolved) -> None:
-        """Solve as soon as possible."""
+        """Solve as soon as possible, and call ``on_solved`` with the answer."""
         self._asked[on_solved] = time.monotonic()
         if not self.is_solving:
             self._start()
 
     def tell_who_waits(self) -> None:
-        """Tell those who have waited for long that the solve goes on; to be called often."""
+        """Answer callers that have waited too long: the solve goes on. To be called often."""
         long_ago_s = time.monotonic() - ANSWER_WITHIN_S
-        for on_solved in [each for each, since_s in self._asked.items() if since_s < long_ago_s]:
+        for on_solved, since_s in list(self._asked.items()):
+            if since_s >= long_ago_s:
+                continue
             del self._asked[on_solved]
             text = f"still solving after {ANSWER_WITHIN_S:g} s (do others use the processor?)"
             on_solved(False, f"{text}: the result will be in the log and on the topics")
 
     def start_if_due(self) -> None:
-        """Solve if there is something new and the last solve has left the processor a rest."""
+        """Start a solve or a check if there are new poses and the pause after the last is over."""
         now_s = time.monotonic()
         has_work = self._session.has_new_poses or self._must_check(now_s)
         if has_work and not self.is_solving and now_s >= self._rest_until_s:
             self._start()
 
     def take_answers(self) -> None:
-        """Take what the solving process has sent."""
+        """Process the answers of the solving process and call the waiting callbacks."""
         for answer in self._process.answers():
-            good, text = self.conclude(answer)
+            is_good, text = self.conclude(answer)
             self.is_solving = False
             self._publish()
             for on_solved in self._in_flight:
                 if self._asked.pop(on_solved, None) is not None:
-                    on_solved(good, text)
+                    on_solved(is_good, text)
             self._in_flight = ()
             if self._asked:
                 self._start()
 
     def stop(self, timeout_s: float) -> None:
-        """Wait so long for the solve under way, take its result, and end the process."""
+        """Wait up to ``timeout_s`` for the current solve, take its result, and end the process."""
         self._process.stop(timeout_s)
         for answer in self._process.answers():
             self.conclude(answer)
 
     def _must_check(self, now_s: float) -> bool:
+        """Whether a stream check is due."""
         return self._is_unchecked and now_s >= self._check_due_s
 
     def _start(self) -> None:
-        self.is_solving, now_s = True, time.monotonic()
+        """Submit a job to the solving process."""
+        now_s = time.monotonic()
+        self.is_solving = True
         self._is_unchecked |= self._session.has_new_poses
         self._in_flight = tuple(self._asked)
-        # What somebody asks for is told together with what speaks against it.
+        # A requested result needs up-to-date findings, even if no check is due.
         if check := self._must_check(now_s) or (self._is_unchecked and bool(self._in_flight)):
-            self._is_unchecked, self._check_due_s = False, now_s + _CHECK_PERIOD_S
+            self._is_unchecked = False
+            self._check_due_s = now_s + _CHECK_PERIOD_S
         self._submitted = self._session.copy_to_solve()
         self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
 
     # ------------------------------------------------------------------ answers
 
     def conclude(self, answer: Answer) -> tuple[bool, str]:
-        """Take an answer; whether it is good, and a line about it."""
+        """Process an answer; return whether it is good, and a line of text about it."""
         if answer.session != self._session.number:
             return False, "the session was reset during the solve: its result is dropped"
-        # Solves that take longer than their period leave the processor free for half the time.
+        # Pause as long as the solve took, so that half of the processor time stays free.
         self._rest_until_s = time.monotonic() + answer.seconds
-        # The most of each rotation so far: of more poses, it would fall while somebody drives on.
+        # Keep the largest rotation so far: the measured rotation can decrease with more poses.
         rotation = np.maximum(self._seen.rotation, answer.seen.rotation)
-        self._seen, self._failure = replace(answer.seen, rotation=rotation), answer.failure
+        self._seen = replace(answer.seen, rotation=rotation)
+        self._failure = answer.failure
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
-            self._certain, self._told = {**self._certain, **answer.options}, answer.told
+            self._certain = {**self._certain, **answer.options}
+            self._option_warnings = answer.told
         if answer.check is not None:
             self.checks.take(answer.check)
         elif answer.is_checked:
@@ -348,10 +383,10 @@ class SolveCycle:
                 self._keep_result(answer.failure)
                 return False, text
         assert answer.calibration is not None
-        told = tuple(dict.fromkeys((*self._told, *answer.calibration.warnings)))
-        for warning in told:
+        warnings = tuple(dict.fromkeys((*self._option_warnings, *answer.calibration.warnings)))
+        for warning in warnings:
             self._log.warning(warning)
-        newest = self._with_findings(replace(answer.calibration, warnings=told))
+        newest = self._with_findings(replace(answer.calibration, warnings=warnings))
         if newest.status is SolveStatus.CONTRADICTED:
             return self._refute(newest)
         if newest.status.failure:
@@ -362,14 +397,15 @@ class SolveCycle:
         return self._take(self._complete(newest))
 
     def _keep_result(self, failure: Failure) -> None:
-        """Keep the result although the newest solve has failed."""
+        """Keep the result after a failed solve, and mark it as outdated."""
         if self._failing is None:
             self._failing_since_s = time.monotonic()
         self._failing = failure
 
     def _refute(self, newest: Calibration) -> tuple[bool, str]:
-        """Take a calibration whose prior the motion contradicts: it replaces the result, so that
-        what was found before is neither published nor saved any more.
+        """Replace the result by a calibration whose prior the motion contradicts.
+
+        The earlier result is neither published nor saved any more.
         """
         self.goal.add(newest, self._seen, self.checks.faults())
         self._solved = self._submitted, self._certain
@@ -377,15 +413,14 @@ class SolveCycle:
         return False, self._say(newest)
 
     def _set_result(self, result: Calibration) -> None:
+        """Store the result of the session as current."""
         self.result = result
-        self._told_result = _result_state(result)
+        self._result_state = _state_of(result)
         self._solved_at_s = time.monotonic()
         self._failing = None
 
     def _take(self, newest: Calibration) -> tuple[bool, str]:
-        """Take a usable calibration: it becomes the session's result, unless a better one that has
-        reached the goal is kept.
-        """
+        """Make a usable calibration the session's result, unless the goal keeps a better one."""
         was_done = self.goal.progress.done
         progress = self.goal.add(newest, self._seen, self.checks.faults())
         result = self.goal.best or newest
@@ -406,35 +441,47 @@ class SolveCycle:
         return is_good, self._say(self._with_findings(result), every_s)
 
     def _say(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
-        """A line about a calibration with its reasons and warnings. What is new of that is logged:
-        the reasons once the motion has had its chance, as the progress says what to do before.
+        """Return a line about a calibration with its reasons and warnings, and log new ones.
+
+        Reasons are logged only if more motion would not help; before, the progress names what to
+        do.
         """
-        text, progress = describe(calibration), self.goal.progress
+        text = describe(calibration)
+        progress = self.goal.progress
         self._log.info(text, every_s, key="result")
         is_final = progress.done or progress.will_not_get_there or calibration.status.failure
-        said = []
+        reasons = []
         for reason in calibration.reasons:
-            said.append(f"{reason.sentence}; {reason.what_to_do}")
-            if is_final and not reason.is_finding:  # which are in the log already
-                self._log.warning(f"{reason.verdict.value}: {said[-1]}")
+            reasons.append(f"{reason.sentence}; {reason.what_to_do}")
+            if is_final and not reason.is_finding:  # findings are in the log already
+                self._log.warning(f"{reason.verdict.value}: {reasons[-1]}")
                 self._warned[reason.rule] = reason.sentence
         rules = {reason.rule for reason in calibration.reasons}
         for rule in self._warned.keys() - rules:
             self._log.info(f"no longer found: {self._warned.pop(rule)}")
-        return "; ".join((text, *said, *calibration.warnings))
+        return "; ".join((text, *reasons, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with the findings of the stream checks.
+
+        A calibration from positions, rotations or rates keeps its own findings. Only findings about
+        the received poses are added.
+        """
         findings = self.checks.findings
-        if calibration.measured != "poses":  # it has its own
-            own = {(each.code, each.stream) for each in calibration.findings}
-            others = [each for each in findings if (each.code, each.stream) not in own]
-            lasting = [each for each in others if each.code in _OF_RAW_POSES]
-            findings = gravest_first([*calibration.findings, *lasting])
+        if calibration.measured != "poses":
+            own = {(finding.code, finding.stream) for finding in calibration.findings}
+            added = [
+                finding
+                for finding in findings
+                if (finding.code, finding.stream) not in own and finding.code in _RAW_POSE_CODES
+            ]
+            findings = gravest_first([*calibration.findings, *added])
         if calibration.findings == findings:
             return calibration
         return replace(calibration, findings=findings)
 
     def _report(self, failure: Failure) -> str:
+        """Log a failure and return its text."""
         if failure.details:
             text = f"the solve failed unexpectedly: {failure.what}"
             self._log.error(f"{text}\n{failure.details}")
@@ -450,10 +497,16 @@ class SolveCycle:
     def extrinsic_state(
         self, accepts_poses: bool, tf_static: tuple[Broadcast, str]
     ) -> ExtrinsicState:
-        """The result: what is missing, how good it is, how it was found. ``tf_static`` is what is
-        done about that topic, and the reason.
+        """Return the diagnostics of the result.
+
+        Parameters
+        ----------
+        accepts_poses : bool
+        tf_static : tuple of Broadcast and str
+            Whether the result is broadcast on /tf_static, and the reason.
         """
-        seen, told = self._seen, self._told_result
+        seen = self._seen
+        state = self._result_state
         level, text = self._judged(accepts_poses, tf_static)
         contradictions = self.result.contradictions if self.result is not None else {}
         return ExtrinsicState(
@@ -471,12 +524,13 @@ class SolveCycle:
             problem=self.problem,
             priors=priors_of(self._session.calibrator.config),
             contradicted=tuple(contradictions),
-            result=told and replace(told, age_s=time.monotonic() - self._solved_at_s),
+            result=state and replace(state, age_s=time.monotonic() - self._solved_at_s),
         )
 
     def _judged(self, accepts_poses: bool, tf_static: tuple[Broadcast, str]) -> tuple[Level, str]:
-        """Level and message: the gravest that applies."""
-        result, failure = self.result, self._failure
+        """Return level and text of the gravest condition that applies."""
+        result = self.result
+        failure = self._failure
         if failure is not None and failure.details:
             return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
         if result is not None and self.problem:
@@ -485,9 +539,9 @@ class SolveCycle:
         if not accepts_poses:
             return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
         if result is None:
-            said = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
-            said += [failure.what] if failure else []
-            return Level.WARN, "; ".join(said) or "no result yet"
+            texts = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
+            texts += [failure.what] if failure else []
+            return Level.WARN, "; ".join(texts) or "no result yet"
         if tf_static[0] is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
             return Level.WARN, f"publish_tf is refused: {tf_static[1]}"
         if failure is not None:
@@ -497,11 +551,20 @@ class SolveCycle:
     def progress_state(
         self, why_not_compared: str, pause: tuple[Level, str] = (Level.OK, "")
     ) -> ProgressState:
-        """Each axis against its target, the seconds left, and what to do now; WARN while somebody
-        should do something else than go on. ``why_not_compared`` with what is installed: empty if
-        that was not asked for. ``pause`` is why no poses come in, and how grave that is.
+        """Return the diagnostics of the progress towards the targets.
+
+        The level is WARN if a person should do something else than continue the motion.
+
+        Parameters
+        ----------
+        why_not_compared : str
+            Reason why the result is not compared with the installed transform; empty if no
+            comparison was requested.
+        pause : tuple of Level and str
+            Severity and reason if no poses arrive; see :func:`pause_of`.
         """
-        progress, result = self.goal.progress, self.result
+        progress = self.goal.progress
+        result = self.result
         is_well = self.standing is Standing.CURRENT and not progress.is_faulty
         may_go_on = is_well and not progress.will_not_get_there
         comparison = result.comparison if result is not None else None
@@ -522,7 +585,7 @@ class SolveCycle:
 
 
 def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Level, str]:
-    """Why the session gets no poses, and whether a person should act; no text if it gets some."""
+    """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
     if not accepts_poses:
         return Level.WARN, "Paused: not accepting poses; call ~/set_enabled to go on."
     paused = {name: state for name, state in inputs.items() if state.is_paused}
@@ -538,7 +601,7 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Lev
 
 
 def _with_halves_of(newest: Calibration, kept: Calibration) -> Calibration:
-    """The result that is kept, with the comparison of both halves of the whole drive."""
+    """Return the kept result with the newest comparison of both halves of the recording."""
     if newest.cross_check is None or kept.cross_check is None:
         return kept
     rows = {}
@@ -550,24 +613,26 @@ def _with_halves_of(newest: Calibration, kept: Calibration) -> Calibration:
 
 
 def is_refuted(result: Calibration) -> bool:
-    """Whether the solve failed, or an error in the streams speaks against every axis."""
-    return bool(result.status.failure) or any(each.makes_unusable for each in result.findings)
+    """Whether the solve failed, or an error in the streams makes every axis unusable."""
+    return bool(result.status.failure) or any(finding.makes_unusable for finding in result.findings)
 
 
 def priors_of(config: CalibratorConfig) -> dict[str, str]:
-    """The priors that are set, by axis, as they were typed."""
+    """Return the priors of the options by axis, as typed by the user."""
     priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
     return {axis: text for axis, text in priors.items() if text}
 
 
-def _result_state(result: Calibration) -> ResultState:
-    pose, sigmas = se3.xyz_rpy(result.T_parent_child), result.sigmas_printed
+def _state_of(result: Calibration) -> ResultState:
+    """Return the diagnostics of a result; its age is filled in later."""
+    pose = se3.xyz_rpy(result.T_parent_child)
+    sigmas = result.sigmas_printed
     return ResultState(
         parent_frame=result.parent_frame,
         child_frame=result.child_frame,
         verdict=result.verdict.value,
         status=result.status.value,
-        reasons=tuple(f"{each.sentence}: {each.what_to_do}" for each in result.reasons),
+        reasons=tuple(f"{reason.sentence}: {reason.what_to_do}" for reason in result.reasons),
         pose=by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
         pose_sigma=by_axis(sigmas),
         warnings=result.warnings,
@@ -579,8 +644,9 @@ def _result_state(result: Calibration) -> ResultState:
 
 
 def describe(calibration: Calibration) -> str:
-    """One line for a log: whose pose in whose frame, how good, from how much."""
-    pose, sigmas = se3.xyz_rpy(calibration.T_parent_child), calibration.sigmas_printed
+    """Return a log line with verdict, pose, standard deviations and amount of data."""
+    pose = se3.xyz_rpy(calibration.T_parent_child)
+    sigmas = calibration.sigmas_printed
     xyz = ", ".join(f"{value:.4f}" for value in pose[:3])
     rpy = ", ".join(f"{value:.3f}" for value in np.degrees(pose[3:]))
     mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
