@@ -98,6 +98,7 @@ def with_comma(text):
 
 
 NAMES = "t,x,y,z,qx,qy,qz,qw\n"
+POSE_NAMES = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 ROS_NAMES = (
     "__time,/odom/header/stamp,/odom/pose/covariance[0;0],/odom/pose/covariance[1;1],"
     + ",".join(f"/odom/pose/pose/position/{axis}" for axis in "xyz")
@@ -183,6 +184,22 @@ LAYOUTS = {
     "columns of a matrix by name": text_of(SECONDS, COLUMNS, P, separator=",",
                                            head=",".join(["t", *(f"r{c}{r}" for r in "123"
                                                                  for c in "123"), *"xyz"]) + "\n"),
+    "covariance by one name": text_of(
+        SECONDS, ["cam_1"] * N, WXYZ, P, COVARIANCE, separator=", ",
+        head="# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar\n",
+    ),
+    "no covariance by its name": text_of(
+        SECONDS, ["cam_1"] * N, WXYZ, P, separator=", ",
+        head="# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar\n",
+    ),
+    "seconds and nanoseconds": text_of(
+        [stamp_ns // 10**9 for stamp_ns in STAMPS_NS],
+        [stamp_ns % 10**9 for stamp_ns in STAMPS_NS], P, Q,
+    ),
+    "paths that end in short names": text_of(
+        SECONDS, P, Q, separator=",",
+        head="t," + ",".join(f"rig_{name}" for name in POSE_NAMES) + "\n",
+    ),
     "state of FAST-LIO": text_of(SECONDS, VECTORS, P, np.zeros((N, 15)),
                                  np.tile([0.0, 0.0, -9.81], (N, 1))),
     "angles": text_of(SECONDS, P, RPY_DEG, separator=",",
@@ -212,10 +229,24 @@ def test_the_same_poses_are_read_from_every_layout(tmp_path, layout):
     assert reading.warnings == []
 
 
+ENCODINGS = ["utf-8", "utf-16", "latin-1"]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_text_is_read_in_every_usual_encoding(tmp_path, encoding):
+    head = "t,x,y,z,roll (°),pitch (°),yaw (°)\n"
+    path = tmp_path / "poses.csv"
+    path.write_bytes(text_of(SECONDS, P, RPY_DEG, head=head, separator=",").encode(encoding))
+    assert_is_the_truth(read(path).trajectory)
+
+
 IN_WORDS = "Time  Latitude  Longitude  H-Ell  Roll  Pitch  Yaw\n"
 UNITS = "(s)  (+/-D M S)  (+/-D M S)  (m)  (deg)  (deg)  (deg)\n"
 PLACES = {
     "degrees": text_of(SECONDS, LAT, LON, HEIGHT, RPY_DEG, head=PROSE + IN_WORDS),
+    "paths of messages": text_of(SECONDS, LAT, LON, HEIGHT, RPY_DEG, separator=",",
+                                 head="__time,/gps/fix/latitude,/gps/fix/longitude,"
+                                 "/gps/fix/altitude,roll,pitch,yaw\n"),
     "D M S in three cells": text_of(SECONDS, sexagesimal(LAT, ""), sexagesimal(LON, ""), HEIGHT,
                                     RPY_DEG, head=PROSE + IN_WORDS + UNITS),
     "hemispheres in the cells": text_of(SECONDS, sexagesimal(LAT, "NS"), sexagesimal(LON, "EW"),
@@ -248,6 +279,7 @@ GPS = {
     "week and second of it": ("GPSWeek,GPSTime", WEEKS, SOW),
     "other names": ("week,sow", WEEKS, SOW),
     "time of week": ("GPS Week,TOW (s)", WEEKS, SOW),
+    "milliseconds": ("GPS Week,TOW [ms]", WEEKS, [f"{1e3 * float(each):.0f}" for each in SOW]),
 }
 
 
@@ -406,6 +438,11 @@ REFUSED = {
     "a row in between with another number": (
         text_of(SECONDS, P, Q).replace("\n", "\n1 2 3\n", 1),
         "line 2: expected 8 numbers, timestamp .* found 3",
+    ),
+    "several sensors": (
+        text_of(SECONDS, ["left", "right"] * (N // 2), P, Q, separator=",",
+                head="t,device_id,x,y,z,qx,qy,qz,qw\n"),
+        "poses of several sensors, device_id left, right; write a file for each",
     ),
     "nmea degrees": (
         text_of(SECONDS, [3330.5] * N, [7015.2] * N, HEIGHT, head="t lat lon height\n"),

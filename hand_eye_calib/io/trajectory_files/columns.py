@@ -45,11 +45,12 @@ _OF_POSITION = "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
 _ALIASES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
-    "datetime date_time utc utctime utc_time time_utc time_of_day",
+    "datetime date_time utc utctime utc_time time_utc time_of_day epoch unix_time unixtime "
+    "ros_time rostime",
     "date": "date day utc_date date_utc gps_date",
-    "week": "week gpsweek gps_week week_number weeks wn",
+    "week": "week gpsweek gps_week week_number weeks wn gwk",
     "sow": "sow tow gps_sow gpssow gps_tow gpstow gps_seconds gpsseconds gpssec seconds_of_week "
-    "second_of_week week_seconds time_of_week",
+    "second_of_week week_seconds time_of_week itow gms",
     "x": _OF_POSITION.format("x")
     + "easting pos_east position0 actual_tcp_pose_0 ecef_x x_ecef x_ecf",
     "y": _OF_POSITION.format("y")
@@ -58,7 +59,8 @@ _ALIASES = {
     "ecef_z z_ecef z_ecf",
     "lat": "lat latitude",
     "lon": "lon long lng longitude",
-    "height": "height ht h_ell ellipsoid_height ellipsoidal_height altitude alt elevation ele",
+    "height": "height ht h_ell h_msl height_msl ellipsoid_height ellipsoidal_height altitude alt "
+    "elevation ele",
     "roll": "roll roll_angle",
     "pitch": "pitch pitch_angle",
     "yaw": "yaw yaw_angle theta",
@@ -66,6 +68,8 @@ _ALIASES = {
     "secs": "stamp_secs stamp_sec secs sec",
     "nsecs": "stamp_nsecs stamp_nanosec stamp_nsec nsecs nanosec nsec",
     "image": "image",
+    "sensor": "device_id device_name sensor_id sensor_name camera_id camera_name child_frame_id "
+    "rigid_body body_name object_name subject_name",
     **{
         f"{kind}{axis}": " ".join(f"{name}{axis}" for name in names.split())
         for kind, names in _BEGINNINGS.items()
@@ -76,6 +80,12 @@ _ALIASES = {
         name: f"{name} actual_tcp_pose_{k} r{name[-1]}" for k, name in enumerate(ROTATION_VECTOR, 3)
     },
     **{name: name for name in MATRIX},
+}
+# Names without an underscore that paths may end in, such as gps_fix_latitude.
+_ENDS = {
+    *("latitude", "longitude", "altitude"),
+    *QUATERNION,
+    *(f"t{axis}" for axis in POSITION),
 }
 # An element of a matrix: t_00, r11, rot_1_2, pose.T[0][3].
 _ELEMENT = re.compile(
@@ -125,7 +135,7 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
     for quantity, aliases in _ALIASES.items():
         known = aliases.split()
         # Of paths, the longest end that is known: position_x rather than x.
-        ends = tuple(f"_{alias}" for alias in known if "_" in alias)
+        ends = tuple(f"_{alias}" for alias in known if "_" in alias or alias in _ENDS)
         places = [at for at, name in enumerate(plain) if name in known]
         places = places or [at for at, name in enumerate(plain) if name.endswith(ends)]
         if quantity in ROTATION_VECTOR:

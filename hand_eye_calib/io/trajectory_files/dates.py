@@ -154,9 +154,10 @@ def _zone_s(zone: str) -> int:
 # ---- the stamp of a row
 
 
-def stamp_of(names: Sequence[str], cells: Sequence[str]) -> Decimal:
+def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Decimal:
     """The stamp of a row as it is written, with no binary floating point in between, in the unit of
-    its column; in seconds for dates and weeks of GPS, in nanoseconds for two columns.
+    its column; in seconds for dates and weeks of GPS, in nanoseconds for two columns. The ``unit``
+    is that of the second of a week, if it is named.
 
     Raises
     ------
@@ -169,7 +170,8 @@ def stamp_of(names: Sequence[str], cells: Sequence[str]) -> Decimal:
         return Decimal(int(cells[0]) * _NS + int(cells[1]))
     second = _number(cells[1])
     if names[0] == "week" and second is not None and second.is_finite():
-        return seconds_of_week(cells[0], second) if second < 2 * WEEK_S else second
+        in_seconds = second * STAMP_UNITS[unit or "s"] / _NS
+        return seconds_of_week(cells[0], in_seconds) if in_seconds < 2 * WEEK_S else second
     last = cells[-1]
     # A time of day belongs to its date, whatever else is complete in itself.
     if names[0] == "date" and ":" in last and len(last) < len("HH:MM:SS") + 12:

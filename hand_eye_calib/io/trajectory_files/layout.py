@@ -64,6 +64,8 @@ STAMPED_POSE = ("t", *POSITION, *UNNAMED)
 # position, and five vectors of which the last is gravity.
 _FAST_LIO = ("t", *ROTATION_VECTOR, *POSITION, *[""] * 18)
 _GRAVITY_M_S2 = (9.6, 10.0)
+# Seconds since 1970 have ten digits.
+_LEAST_SECONDS = 1e9
 _SINCE_1970 = re.compile(r"\d{10,}(\.\d*)?", re.ASCII)
 
 
@@ -259,9 +261,17 @@ def _fitted(
         if sum(widths) == len(row):
             merge = _joining(widths) if max(widths, default=1) > 1 else None
             return _of_angles(names, widths, merge(row) if merge else row), merge
-    if is_comment and len(names) > len(row):
+    if is_comment and len(names) > len(row) and not _is_open(names[-1]):
         return tuple(names[-len(row) :]), None
+    if len(names) > 1 and _is_open(names[-1]):
+        n_more = len(row) - len(names) + 1
+        return ((*names[:-1], *[""] * n_more), None) if n_more >= 0 else None
     return None
+
+
+def _is_open(name: str) -> bool:
+    """Whether a name, the last, is of any number of columns, or of none."""
+    return name.startswith("*") or name.endswith("...") or "cov" in name.lower()
 
 
 # A latitude is one number, degrees, minutes and seconds, or degrees and minutes.
@@ -431,9 +441,11 @@ def _columns_of(values: FloatArray) -> tuple[str, ...] | None:
     if n_columns == n_fast_lio and _is_gravity(values[:, -3:]):
         return _FAST_LIO
     for pose in _POSES:
-        for stamp in ((), ("t",)):
+        for stamp in ((), ("t",), ("secs", "nsecs")):
             columns = (*stamp, *pose)
-            if len(columns) == n_columns and _fits(pose, values[:, len(stamp) :]):
+            if len(columns) != n_columns or not _fits(pose, values[:, len(stamp) :]):
+                continue
+            if len(stamp) < 2 or _are_seconds_and_ns(values):
                 return columns
     for pose in _POSES:
         n_more = n_columns - 1 - len(pose)
@@ -477,6 +489,14 @@ def _fits(pose: Sequence[str], values: FloatArray) -> bool:
             return True
         last_row = values[:, [pose.index(name) for name in LAST_ROW]]
         return bool(np.allclose(last_row, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE))
+
+
+def _are_seconds_and_ns(values: FloatArray) -> bool:
+    """Whether the first two columns are whole seconds since 1970 and whole nanoseconds."""
+    whole = values[:, :2]
+    is_whole = bool((whole == np.round(whole)).all())
+    since_1970 = bool((whole[:, 0] >= _LEAST_SECONDS).all())
+    return is_whole and since_1970 and bool(((whole[:, 1] >= 0) & (whole[:, 1] < 1e9)).all())
 
 
 def _is_gravity(values: FloatArray) -> bool:

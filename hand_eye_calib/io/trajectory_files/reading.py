@@ -5,6 +5,7 @@
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from os import PathLike
@@ -61,6 +62,11 @@ _EXPECTED = (
     "autopilots as csv, a model of COLMAP as text"
 )
 _TIMES = "times.txt"
+# Letters and signs of Latin-1 that headers have, and characters of ASCII.
+_LATIN_1 = [bytes([code]) for code in (0xB0, 0xB2, 0xB5, *range(0xC0, 0x100))]
+_ASCII = bytes([*b"\t\n\r", *range(32, 127)])
+# A text has at most this share of them.
+_FEW_LETTERS = 0.05
 # Time between poses that are paired without stamps.
 _STEP_NS = 100_000_000
 
@@ -342,7 +348,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     for pattern, read in PROGRAMS.items():
         if re.search(pattern, head):
             return foreign_table(path, data, read, options.columns, options.measures)
-    text = decoded(path, data.replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
+    text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
     needs_names = not options.columns and options.format in (AUTO, "csv")
     layout = layout_of(path, text, needs_names)
     if options.format != AUTO or options.columns or options.times:
@@ -359,6 +365,21 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
             table.guess(note)
     _add_times(table, options)
     return table
+
+
+def _in_utf8(data: bytes) -> bytes:
+    """A text as it is, or in UTF-8 if it is in UTF-16 or has some letters of Latin-1, such as °."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        with suppress(UnicodeDecodeError):
+            return data.decode("utf-16").encode()
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        n_other = sum(data.count(letter) for letter in _LATIN_1)
+        n_odd = len(data.translate(None, _ASCII)) - n_other
+        if n_odd == 0 and n_other < _FEW_LETTERS * len(data):
+            return data.decode("latin-1").encode()
+    return data
 
 
 def _as_given(layout: Layout, options: FileOptions) -> Layout:

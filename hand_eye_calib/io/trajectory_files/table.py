@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.config import STAMP_UNITS
 from hand_eye_calib.errors import InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
@@ -36,6 +37,9 @@ from hand_eye_calib.text import shortened, shown_value
 
 # Quantities that are all 0 where there is no orientation, as of tracking that was lost.
 _TURNS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
+
+# More names than this in a column are those of something else, such as images.
+_MOST_SENSORS = 20
 
 
 @dataclass
@@ -105,6 +109,10 @@ class Table:
             self.units["t"] = units[self.stamp_at[0]]
         elif self.stamp_at:
             self.units["t"] = "s"
+        unit = units[self.stamp_at[-1]] if self.stamp_at else ""
+        self._second_unit = unit if unit in STAMP_UNITS else ""
+        self._sensor_at = columns.get("sensor", [])[:1]
+        self._sensors: set[str] = set()
         turn = next((group for group in _TURNS if {*group} <= {*quantities}), ())
         self._turn_at = [list(quantities).index(name) for name in turn]
 
@@ -140,7 +148,17 @@ class Table:
             except ValueError as error:
                 reason = f"expected {self.expected}; {shortened(str(error))}"
                 raise InputError(f"{self.path}, line {line_number}: {reason}") from None
+        self._refuse_several_sensors()
         return self
+
+    def _refuse_several_sensors(self) -> None:
+        """Raise an InputError if a column names few sensors, but more than one."""
+        if 1 < len(self._sensors) <= _MOST_SENSORS:
+            column = self.names[self._sensor_at[0]]
+            listed = shortened(", ".join(sorted(self._sensors)), LONGEST_NAME)
+            raise InputError(
+                f"{self.path}: poses of several sensors, {column} {listed}; write a file for each"
+            )
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
         """Add a row, or count it if it has no pose; a ValueError for what is no number."""
@@ -154,6 +172,8 @@ class Table:
         self.numbers.extend(values)
         if self._image_at:
             self.images.append(cells[self._image_at[0]])
+        if self._sensor_at and len(self._sensors) <= _MOST_SENSORS:
+            self._sensors.add(cells[self._sensor_at[0]])
         self.line_numbers.append(line_number)
         self.rows.append(row)
 
@@ -162,7 +182,7 @@ class Table:
         if self.stamp_at:
             texts = [cells[place] for place in self.stamp_at]
             try:
-                self.stamps.append(stamp_of(self.stamp_names, texts))
+                self.stamps.append(stamp_of(self.stamp_names, texts, self._second_unit))
             except ValueError:
                 if any(map(is_null, texts)):
                     return False
