@@ -66,9 +66,12 @@ STEADY_SHAPE = 1.0
 # Rounds of weights of the shortest path.
 _ROUNDS = 5
 
-# Frames this close (m, rad) may be one: of one world for both streams, the lever arm between the
-# worlds says nothing.
-_SAME_FRAME = 0.01
+# Frames with parallel axes this close (m, rad) may be one: hardly two sensors are. Of one world for
+# both streams, the lever arm between the worlds says nothing.
+_SAME_FRAME_M = 0.03
+_SAME_FRAME_RAD = 0.01
+# Shortest lever arm (m) that is compared.
+_SHORTEST_ARM_M = 0.01
 
 # An arm about its base may move more than the base seen from it. Sensors that stay within this
 # distance (m), an arm's reach, may be such; stops too.
@@ -521,8 +524,9 @@ def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float,
     pairs = right.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
-    arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SAME_FRAME)
-    is_same = np.maximum(arms_m, se3.rotation_angle(Ts[:, :3, :3])).min() <= _SAME_FRAME
+    arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SHORTEST_ARM_M)
+    angles_rad = se3.rotation_angle(Ts[:, :3, :3])
+    is_same = bool(((arms_m <= _SAME_FRAME_M) & (angles_rad <= _SAME_FRAME_RAD)).any())
     arms = 0.0 if is_same else 0.5 * np.log(arms_m[0] / arms_m[1])
     return float(paths), float(arms)
 

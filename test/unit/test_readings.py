@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from faults import inverted, reordered
+from motions import as_trajectory, child_of, wandering_poses
 from published_data import data_folder
 
 import hand_eye_calib as hec
-from hand_eye_calib.checks.hypotheses import PLAIN, Hypothesis, Readings
+from hand_eye_calib.checks import hypotheses
+from hand_eye_calib.checks.hypotheses import PLAIN, Hypothesis, Readings, StreamPair
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.readings import decide
 from hand_eye_calib.engine.run import review
@@ -204,3 +206,14 @@ class TestStrangers:
 def test_the_inversions_are_options_of_the_engine():
     usual = CalibratorConfig()
     assert {name: getattr(usual, name) for name in NONE} == NONE
+
+
+@pytest.mark.parametrize(("lever_m", "counts"), [(0.015, False), (0.2, True)])
+def test_a_lever_arm_of_nearly_zero_is_no_evidence_about_inverse_poses(lever_m, counts):
+    """Inverse poses of two sensors in one world look like one sensor, up to noise."""
+    Ts_pw_p = wandering_poses(200)
+    mount = se3.from_rotation_translation(np.eye(3), [lever_m, 0.0, 0.0])
+    streams = StreamPair(as_trajectory(Ts_pw_p), as_trajectory(child_of(Ts_pw_p, mount)), 1.0)
+    explanation = hypotheses.explain(streams, thorough=False)
+    _, arms = hypotheses._evidence_for_inverse(streams, explanation.fit)
+    assert (arms != 0.0) == counts
