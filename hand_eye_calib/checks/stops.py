@@ -470,7 +470,10 @@ def _explained(few: GivenStops) -> tuple[Mistakes, RoughFit, list[Mistakes]]:
     and other mistakes that are as simple and about as good.
     """
     plain = [Mistakes()] + [Mistakes(is_inverse=True)] * few.is_arm
-    chosen, fit = min(((each, rough_fit(few, each)) for each in plain), key=_badness)
+    fits = [(mistakes, rough_fit(few, mistakes)) for mistakes in plain]
+    # Where the rotations say which way round it is, the positions do not overrule them.
+    most = _DECISIVE * min(fit.turning for _, fit in fits)
+    chosen, fit = min((each for each in fits if each[1].turning <= most), key=_badness)
     if fit.is_noise:
         return chosen, fit, []
     tried = []

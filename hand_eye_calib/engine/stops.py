@@ -15,6 +15,7 @@ from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.checks.stops import (
     GivenStops,
     Mistakes,
+    angles_between,
     examine,
     scale_finding,
     turns_about_two_axes,
@@ -28,6 +29,7 @@ from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import Residuals, gravest_first
 from hand_eye_calib.solvers.robot_world import MIN_STOPS, RobotWorld, Stops, solve
+from hand_eye_calib.stats import median
 
 # Options that mean something for stops; those of groups by the beginnings of their names.
 _OBEYED = {
@@ -64,6 +66,11 @@ _READING_LEAD = 7.0
 _IDENTITY_SIGMAS = 3.0
 _IDENTITY_M = 0.001
 _IDENTITY_RAD = 0.001
+
+# Stops that rotate by more than this (rad; 10 deg) in the median are unknown only through errors
+# that no camera has; seen from the first of so many stops.
+_FAR_RAD = 0.17
+_MOST_TURNS = 150
 
 # What is on a hand is nearer to it than this (m), or than twice the way from the base to what is
 # fixed there.
@@ -354,8 +361,7 @@ def _with_scale(
             scale, sigma = 1.0, 0.0
     if scale == 1.0 and start != 1.0:
         fit, stops, is_inverse, lead = _fit(given, 1.0)
-    if given.has_positions and not turns_about_two_axes(given.parent):
-        findings = [*findings, finding("turning_about_one_axis")]
+    findings = [*findings, *_of_unknown(given, fit, findings)]
     return _Solved(
         fit=fit,
         stops=stops,
@@ -367,6 +373,18 @@ def _with_scale(
         warnings=tuple(warnings),
         lead=lead,
     )
+
+
+def _of_unknown(given: GivenStops, fit: RobotWorld, findings: list[Finding]) -> list[Finding]:
+    """Why directions are unknown: the stops turn about one axis, or contradict each other."""
+    if not turns_about_two_axes(given.parent):
+        return [finding("turning_about_one_axis")] if given.has_positions else []
+    is_unusable = any(found.makes_unusable for found in findings)
+    turned_rad = median(angles_between(given.parent[:_MOST_TURNS])[0])
+    if is_unusable or not fit.undetermined().size or turned_rad < _FAR_RAD:
+        return []
+    share = min(float(np.sqrt(3.0)) * fit.level_rad / turned_rad, 1.0)
+    return [finding("disagreeing_stops", part="rotations", share=share)]
 
 
 def _is_clear(scale: float, sigma: float, n_stops: int) -> bool:
