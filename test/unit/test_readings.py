@@ -217,3 +217,17 @@ def test_a_lever_arm_of_nearly_zero_is_no_evidence_about_inverse_poses(lever_m, 
     explanation = hypotheses.explain(streams, thorough=False)
     _, arms = hypotheses._evidence_for_inverse(streams, explanation.fit)
     assert (arms != 0.0) == counts
+
+
+def test_noise_that_contradicts_a_clear_shape_does_not_choose_alone():
+    """One exact stream and one of hardly any noise: the noise called the exact one inverse."""
+    readings = Readings(
+        hypotheses=(Hypothesis((), ("inverse",)), Hypothesis(("inverse",), ())),
+        shape=-2.9,
+        paths=-1.8,
+        is_small=False,
+    )
+    assert decide(readings, -628.0) == 0
+    assert decide(replace(readings, shape=-0.6), -628.0) == 1
+    assert decide(readings, 628.0) == 0
+    assert decide(replace(readings, shape=-0.1), -628.0) == 1
