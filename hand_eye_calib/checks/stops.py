@@ -52,9 +52,6 @@ _ABOUT_EQUAL = 1.5
 # A hand or a target that rotates less than this between stops (rad) hardly rotates: 3 deg.
 _ROTATES = 0.05
 
-# Rotations between stops that differ by less than this share of it agree.
-_LEAST_APART = 0.2
-
 # A pose that is repeated differs from the one before by less than this (m, rad): by rounding.
 _REPEATED = 1e-6
 
@@ -78,9 +75,8 @@ _FARTHEST_CM = 200.0
 # of a target is not wrong by more.
 _LARGEST_LEFT = 3.0
 
-_CENTIMETRE = 0.01
-_MILLIMETRE = 0.001
-_UNITS = {_CENTIMETRE: "centimetres", _MILLIMETRE: "millimetres"}
+# Factors of units to metres.
+_UNITS = {0.01: "centimetres", 0.001: "millimetres"}
 
 
 @dataclass(frozen=True)
@@ -403,7 +399,7 @@ def _angles(given: GivenStops) -> Iterator[Finding]:
     angles = {"parent": angles_between(few.parent), "child": angles_between(few.child)}
     apart = median(np.abs(_upper(angles["parent"] - angles["child"])))
     spread = max(median(_upper(angles["parent"])), median(_upper(angles["child"])))
-    if apart < _LEAST_APART * _ROTATES or apart < _EXPLAINED * spread:
+    if apart < _HOLDS * _ROTATES or apart < _EXPLAINED * spread:
         return
     least = min(apart / _DECISIVE, _HOLDS * spread)
     agreeing = []
@@ -658,7 +654,8 @@ def _unit_of_size(positions: FloatArray) -> float:
     if _spread(positions) <= _WIDEST_M:
         return 1.0
     is_cm = median(np.linalg.norm(positions, axis=1)) < _FARTHEST_CM
-    return _CENTIMETRE if is_cm else _MILLIMETRE
+    centimetre, millimetre = _UNITS
+    return centimetre if is_cm else millimetre
 
 
 def scale_finding(scale: float, sigma: float, is_used: bool) -> Finding:

@@ -15,7 +15,6 @@ from hand_eye_calib.checks.findings import Finding, finding
 from hand_eye_calib.checks.stops import (
     GivenStops,
     Mistakes,
-    angles_between,
     examine,
     scale_finding,
     turns_about_two_axes,
@@ -68,9 +67,8 @@ _IDENTITY_M = 0.001
 _IDENTITY_RAD = 0.001
 
 # Stops that rotate by more than this (rad; 10 deg) in the median are unknown only through errors
-# that no camera has; seen from the first of so many stops.
+# that no camera has.
 _FAR_RAD = 0.17
-_MOST_TURNS = 150
 
 # What is on a hand is nearer to it than this (m), or than twice the way from the base to what is
 # fixed there.
@@ -380,7 +378,8 @@ def _of_unknown(given: GivenStops, fit: RobotWorld, findings: list[Finding]) -> 
     if not turns_about_two_axes(given.parent):
         return [finding("turning_about_one_axis")] if given.has_positions else []
     is_unusable = any(found.makes_unusable for found in findings)
-    turned_rad = median(angles_between(given.parent[:_MOST_TURNS])[0])
+    rotations = given.parent[:, :3, :3]
+    turned_rad = median(se3.rotation_angle(rotations[0].T @ rotations))
     if is_unusable or not fit.undetermined().size or turned_rad < _FAR_RAD:
         return []
     share = min(float(np.sqrt(3.0)) * fit.level_rad / turned_rad, 1.0)

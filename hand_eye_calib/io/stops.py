@@ -19,6 +19,7 @@ from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of, pose_stack
 from hand_eye_calib.io.npz import read_arrays
+from hand_eye_calib.io.files import LONGEST_NAME
 from hand_eye_calib.io.yaml_files import read_yaml
 
 # Names of both poses of a sample, the robot's first.
@@ -54,9 +55,6 @@ _OPENCV_FRAMES = {
     **dict.fromkeys(("target", "world", "board", "marker", "tag", "object", "obj"), "target"),
     **dict.fromkeys(("cam", "camera", "sensor"), "camera"),
 }
-
-# Longest name that is compared with those of OpenCV.
-_LONGEST_NAME = 40
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,7 @@ def _of_opencv(document: Mapping[str, Any]) -> ArmSamples | None:
     """The samples of OpenCV's arguments, such as R_gripper2base; None if there are none."""
     parts: dict[tuple[str, str], dict[str, Any]] = {}
     for name, value in document.items():
-        match = _OF_OPENCV.fullmatch(str(name)[:_LONGEST_NAME].lower())
+        match = _OF_OPENCV.fullmatch(str(name)[:LONGEST_NAME].lower())
         if match is None or match[1] not in _QUANTITIES:
             continue
         frames = _OPENCV_FRAMES.get(match[2], ""), _OPENCV_FRAMES.get(match[3], "")
