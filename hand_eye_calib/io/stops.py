@@ -18,8 +18,8 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import pose_of, pose_stack
-from hand_eye_calib.io.npz import read_arrays
 from hand_eye_calib.io.files import LONGEST_NAME
+from hand_eye_calib.io.npz import read_arrays
 from hand_eye_calib.io.yaml_files import read_yaml
 
 # Names of both poses of a sample, the robot's first.
