@@ -12,7 +12,7 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.checks.hypotheses import MIN_PAIRS
+from hand_eye_calib.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.checks.response import Regression, delays, response
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -53,9 +53,6 @@ _SOUND_PART, _OTHER_PART = 0.25, 0.5
 
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
-
-# Rotation vectors near half a turn may point either way.
-_MAX_ROTATION = 2.8
 
 # Smallest factor of a coordinate whose inverse is stated: less is noise.
 _LEAST_FACTOR = 1e-3
@@ -146,7 +143,7 @@ def check_parts(pose_pairs: PosePairs) -> list[Finding]:
     """
     motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
     angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
-    motions = motions[angles < _MAX_ROTATION]
+    motions = motions[angles < MAX_ROTATION_RAD]
     for share in _SPLITS:
         split = int(share * len(pose_pairs))
         parts = [motions[motions.j < split], motions[motions.i >= split]]

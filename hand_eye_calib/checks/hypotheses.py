@@ -42,6 +42,9 @@ LAGS_S = (3.0, 1.0, 0.4)
 MAX_PAIRS, _MAX_ROUGH = 400, 120
 MIN_PAIRS = 12
 
+# Largest angle (rad) of a rotation vector: near half a turn its sign is ambiguous.
+MAX_ROTATION_RAD = 2.8
+
 # A hypothesis holds if it leaves at most this share of the motion unexplained. If the plain one
 # does not hold, another replaces it that leaves this many times less.
 HOLDS, _DECISIVE = 0.12, 2.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.checks.findings import Finding, Severity, finding
-from hand_eye_calib.checks.hypotheses import MIN_PAIRS, StreamPair
+from hand_eye_calib.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
 from hand_eye_calib.checks.streams import USUAL, coarse
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -23,9 +23,6 @@ _SMALL_SHARE = 0.005
 # Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
 # compared: a hundredth of them, at least and at most so many.
 _NEAREST = (40, 300)
-
-# Rotation vectors (rad) near half a turn may point either way.
-_MAX_ROTATION = 2.8
 
 # Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
 # upper half of their spectra both have so many times more than what remains, in positions or
@@ -140,7 +137,9 @@ def _left_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
 def _left(motions: MotionPairs) -> float:
     """Angle (rad) that remains between the rotations of both; infinite unless a small share."""
     angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
-    motions, angles = motions[angles < _MAX_ROTATION], angles[angles < _MAX_ROTATION]
+    is_clear = angles < MAX_ROTATION_RAD
+    motions = motions[is_clear]
+    angles = angles[is_clear]
     if len(motions) < MIN_PAIRS:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
@@ -204,7 +203,7 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
     """
     of_parent = se3.rotation_log(motions.Ts_parenti_parentj[:, :3, :3])
     of_child = se3.rotation_log(motions.Ts_childi_childj[:, :3, :3])
-    is_clear = np.linalg.norm(of_parent, axis=1) < _MAX_ROTATION
+    is_clear = np.linalg.norm(of_parent, axis=1) < MAX_ROTATION_RAD
     blocks = motions.i * _BLOCKS // n_poses
     if is_clear.sum() < MIN_PAIRS or len(np.unique(blocks[is_clear])) < _BLOCKS:
         return None

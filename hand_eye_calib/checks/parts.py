@@ -19,7 +19,7 @@ from hand_eye_calib.assessment.covariance import BLOCKS, usual_speed
 from hand_eye_calib.assessment.moved import find_change
 from hand_eye_calib.checks import agreement
 from hand_eye_calib.checks.findings import LIMITS, Finding, Severity, finding, graded, gravest_first
-from hand_eye_calib.checks.hypotheses import LAGS_S, MIN_PAIRS
+from hand_eye_calib.checks.hypotheses import LAGS_S, MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.checks.response import Regression, delays, response
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
@@ -72,9 +72,6 @@ _MOVES_M = 1e-3
 
 # Largest number of motions in a regression of rotations.
 _MOST_MOTIONS = 3000
-
-# Largest angle of a rotation vector (rad). Near half a turn its sign is ambiguous.
-_MOST_RAD = 2.8
 
 # Rates have left-handed axes if the residual of the best reflection is below this share of the
 # residual of the best rotation. Noise alone makes both about equal.
@@ -410,7 +407,8 @@ def _rotation_vectors(pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
         se3.rotation_log(Ts[:, :3, :3])
         for Ts in (motions.Ts_parenti_parentj, motions.Ts_childi_childj)
     ]
-    usable = np.max([np.linalg.norm(vectors, axis=1) for vectors in turns], axis=0) < _MOST_RAD
+    angles = np.max([np.linalg.norm(vectors, axis=1) for vectors in turns], axis=0)
+    usable = angles < MAX_ROTATION_RAD
     return turns[0][usable], turns[1][usable]
 
 
