@@ -132,11 +132,11 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
         return Layout(rows_after, split, [], of_last, "tum" if of_last is None else "csv", columns)
     rows = cells[first_row:]
     row = _usual_row(rows)
-    names, merge = _names_above(above, row, separator, n_above > 0)
+    names, merge = _names_above(above, row, separator)
     if names is None and not row[-1]:
         row = row[:-1]
         merge = _without_last
-        names, _ = _names_above(above, row, separator, n_above > 0)
+        names, _ = _names_above(above, row, separator)
     if names is None:
         if needs_names:
             _refuse_other_number(path, lines[:n_above], row, separator)
@@ -205,11 +205,12 @@ _Merge = Callable[[Sequence[str]], list[str]]
 
 
 def _names_above(
-    above: Sequence[str], row: Sequence[str], separator: str, has_text: bool
+    above: Sequence[str], row: Sequence[str], separator: str
 ) -> tuple[tuple[str, ...] | None, _Merge | None]:
-    """The names of the columns in the lines above the rows, nearest first, and what joins cells
-    that belong to one name; none if no line has names that are known and fit. If text that is no
-    comment is above the rows, the last of its lines that fits names them in any case.
+    """Return the names of the columns, and what joins cells that belong to one name.
+
+    The nearest line above the rows with known names counts, then the nearest that fits and is no
+    comment. Both are None if there is no such line.
     """
     unknown: tuple[str, ...] | None = None
     for place in reversed(range(len(above))):
