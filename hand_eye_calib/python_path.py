@@ -6,6 +6,8 @@ a bag would then run as code of the standard library.
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _PACKAGE_PARENT = str(Path(__file__).resolve().parent.parent)
@@ -30,8 +32,27 @@ def trusted_environment() -> dict[str, str]:
 
     ``PYTHONSAFEPATH`` keeps that Python from adding its current folder.
     """
-    return {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(trusted_path()),
-        "PYTHONSAFEPATH": "1",
-    }
+    return {**os.environ, **_settings()}
+
+
+@contextmanager
+def starting_trusted() -> Iterator[None]:
+    """Give processes that are started here that environment, and put this one's back at the end.
+
+    For ``multiprocessing``, which takes no environment.
+    """
+    settings = _settings()
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _settings() -> dict[str, str]:
+    return {"PYTHONPATH": os.pathsep.join(trusted_path()), "PYTHONSAFEPATH": "1"}

@@ -7,6 +7,8 @@ import sys
 import pytest
 from source_code import SOURCE
 
+from hand_eye_calib.python_path import starting_trusted
+
 # Modules of the standard library that the commands and their processes import late.
 STRANGERS = ("queue.py", "bisect.py", "csv.py", "heapq.py", "multiprocessing.py", "numpy.py")
 # As pip installs it: Python looks for modules beside this file first.
@@ -82,3 +84,17 @@ def test_python_m_runs_no_file_of_the_current_folder_once_the_package_runs(hosti
     done = run(["-m", "hand_eye_calib", "calibrate", str(bags[0])], hostile_folder)
     assert done.returncode in (0, 3), done.stderr
     assert not (hostile_folder / "executed").exists()
+
+
+@pytest.mark.parametrize("before", [None, "/somewhere"])
+def test_the_environment_of_the_program_is_put_back(monkeypatch, before):
+    if before is None:
+        monkeypatch.delenv("PYTHONPATH", raising=False)
+    else:
+        monkeypatch.setenv("PYTHONPATH", before)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    with starting_trusted():
+        assert os.environ["PYTHONSAFEPATH"] == "1"
+        assert os.environ["PYTHONPATH"] != before
+    assert os.environ.get("PYTHONPATH") == before
+    assert "PYTHONSAFEPATH" not in os.environ

@@ -29,7 +29,7 @@ from hand_eye_calib.io import remote
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.option import Options
 from hand_eye_calib.plain import Document
-from hand_eye_calib.python_path import trusted_environment
+from hand_eye_calib.python_path import starting_trusted
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import told_apart
@@ -277,17 +277,18 @@ def outcomes(
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
     """Worker processes, spawned: forking a program with threads is not safe."""
+    spawning = multiprocessing.get_context("spawn")
     # A worker is `python -c`, which would import modules from the current folder.
-    os.environ.update(trusted_environment())
-    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
-    try:
-        yield executor
-    except BaseException:
-        executor.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-    executor.shutdown()
+    with starting_trusted():
+        executor = ProcessPoolExecutor(jobs, spawning, initializer=_begin)
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+        executor.shutdown()
 
 
 def _begin() -> None:
