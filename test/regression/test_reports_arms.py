@@ -3,13 +3,10 @@
 The inputs are rebuilt from reports, with known truth; without the folder the tests are skipped.
 """
 
-import json
-
 import numpy as np
 import pytest
-from real_data import data_folder
+from report_inputs import calibrated, reports_folder
 
-from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 
 
@@ -28,18 +25,13 @@ WITHIN_DEG = 0.3
 
 @pytest.fixture
 def arms():
-    folder = data_folder() / "reports" / "arms"
-    if not folder.is_dir():
-        pytest.skip(f"no inputs of reports in {folder}")
-    return folder
+    return reports_folder("arms")
 
 
 def run(arms, capsys, command):
     """Exit code, document (None after an error) and what was written to stderr."""
     words = [str(arms / word) if (arms / word).exists() else word for word in command.split()]
-    code = main(["calibrate", *words, "--json"])
-    out, err = capsys.readouterr()
-    return code, json.loads(out) if out else None, err
+    return calibrated(capsys, *words)
 
 
 def off(document, truth):

@@ -3,11 +3,9 @@
 They are looked for where :mod:`published_data` looks; without them the tests are skipped.
 """
 
-import json
-
 import numpy as np
 import pytest
-from published_data import data_folder
+from report_inputs import calibrated, reports_folder
 
 from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
@@ -27,17 +25,8 @@ MESSAGES = 1192
 @pytest.fixture
 def bag():
     """Path of a bag by its name."""
-    folder = data_folder() / "reports" / "bags"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+    folder = reports_folder("bags")
     return lambda name: str(folder / name)
-
-
-def calibrated(capsys, *arguments):
-    """Exit code, document and notes of a command."""
-    code = main(["calibrate", *arguments, "--json"])
-    out, err = capsys.readouterr()
-    return code, json.loads(out) if out else None, err
 
 
 def matrix_of(truth):

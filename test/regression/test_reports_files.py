@@ -1,12 +1,9 @@
 """Trajectory files rebuilt from public bug reports give the truth, or one line with the cause."""
 
-import json
-
 import numpy as np
 import pytest
-from published_data import data_folder
+from report_inputs import calibrated, reports_folder
 
-from hand_eye_calib.cli.main import main
 from hand_eye_calib.geometry import se3
 
 # Translation (m) and roll, pitch, yaw (deg) of the child in the parent.
@@ -37,17 +34,13 @@ CAUSES = [
 
 
 @pytest.fixture
-def calibrated(capsys):
+def run_files(capsys):
     """Runs calibrate on two files of the reports; exit code, document and what is said."""
-    folder = data_folder() / "reports" / "files"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+    folder = reports_folder("files")
 
     def run(parent, child, *options):
         files = [str(folder / parent), str(folder / child)]
-        code = main(["calibrate", *files, *options, "--json"])
-        printed, said = capsys.readouterr()
-        return code, json.loads(printed) if printed else None, said
+        return calibrated(capsys, *files, *options)
 
     return run
 
@@ -62,29 +55,29 @@ def assert_is(document, truth):
 
 
 @pytest.mark.parametrize(("parent", "child", "truth"), RIGHT)
-def test_the_truth_is_found(calibrated, parent, child, truth):
-    code, document, _ = calibrated(parent, child)
+def test_the_truth_is_found(run_files, parent, child, truth):
+    code, document, _ = run_files(parent, child)
     assert code == 0
     assert_is(document, truth)
 
 
 @pytest.mark.parametrize(("parent", "child", "truth", "offset_s"), RIGHT_WITH_OFFSET)
-def test_the_truth_is_found_with_clocks_of_other_epochs(calibrated, parent, child, truth, offset_s):
-    code, document, _ = calibrated(parent, child, "--time-offset", "estimate")
+def test_the_truth_is_found_with_clocks_of_other_epochs(run_files, parent, child, truth, offset_s):
+    code, document, _ = run_files(parent, child, "--time-offset", "estimate")
     assert code == 0
     assert_is(document, truth)
     assert document["time_offset_s"] == pytest.approx(offset_s, abs=0.01)
 
 
-def test_motions_in_place_of_poses_are_named(calibrated):
-    _, document, _ = calibrated("p.tum", "relative.tum")
+def test_motions_in_place_of_poses_are_named(run_files):
+    _, document, _ = run_files("p.tum", "relative.tum")
     assert document["verdict"] == "DO_NOT_USE"
     assert "motions since the pose before" in document["reasons"][0]["sentence"]
 
 
 @pytest.mark.parametrize(("parent", "child", "cause"), CAUSES)
-def test_the_cause_is_one_line(calibrated, parent, child, cause):
-    code, document, said = calibrated(parent, child)
+def test_the_cause_is_one_line(run_files, parent, child, cause):
+    code, document, said = run_files(parent, child)
     assert (code, document) == (1, None)
     *_, last = said.splitlines()
     assert cause in last
