@@ -101,6 +101,9 @@ class SimilarityFit:
     is_in_one_unit, has_own_unit : bool
         Whether the lengths of both streams clearly do not differ by enough to matter; and whether
         they do, significantly.
+    scale_bias : float
+        By how much s differs from the scale with the streams exchanged, as noise of the child makes
+        it. Computed if the lengths differ significantly, otherwise zero.
     """
 
     T_parent_child: FloatArray
@@ -119,6 +122,7 @@ class SimilarityFit:
     is_in_one_unit: bool
     has_own_unit: bool
     unexplained: float
+    scale_bias: float = 0.0
 
 
 def fit_similarity(
@@ -193,7 +197,11 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
     T_child_parent[:3, 3] /= best.scale
     start = replace(best, T_parent_child=T_child_parent, scale=1.0 / best.scale)
     of_exchanged = _best_scale(exchanged, (), start)
-    return replace(best, has_own_unit=of_exchanged.has_own_unit)
+    return replace(
+        best,
+        has_own_unit=of_exchanged.has_own_unit,
+        scale_bias=abs(1.0 / of_exchanged.scale - best.scale),
+    )
 
 
 def _best_scale(

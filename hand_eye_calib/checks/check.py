@@ -48,7 +48,7 @@ _COARSE, _SLOW_GAP = 0.5, 1.5
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
 
 # A scale is that of a unit within so many of its standard deviations, or to rounding (share).
-_UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
+UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
 # A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
 _UNIT_NEAR = 0.05
 
@@ -337,7 +337,8 @@ def _check_sizes(
                 values["options"] = {"scale": float(f"{total:.4g}")}
                 differs = graded("scale", "child", fit.scale - 1.0, **values)
                 as_given = streams.parent, streams.child.scaled(1.0 / known)
-                unit = in_other_units(fit.scale, fit.scale_sigma, *as_given, known)
+                sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
+                unit = in_other_units(fit.scale, sigma_and_bias, *as_given, known)
                 findings.append(unit or differs)
     return [*filter(None, findings)], fit
 
@@ -475,7 +476,7 @@ def _unit_of(total: float, sigma: float) -> tuple[float, bool]:
     for unit in _UNITS:
         factor = unit if total < 1.0 else 1.0 / unit
         off = abs(total - factor)
-        is_exact = off <= max(_UNIT_SIGMAS * sigma, _UNIT_ROUNDING * factor)
+        is_exact = off <= max(UNIT_SIGMAS * sigma, _UNIT_ROUNDING * factor)
         if is_exact or off <= _UNIT_NEAR * factor:
             return unit, is_exact
     return 0.0, False

@@ -326,11 +326,11 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
             continue
         # Streams that nearly agree may have one mistake: an arm's, or one on nearly flat ground.
         rivals = [each for each in _USUAL if len(each.mistakes) == 1 or not plain.holds]
-        chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
-        if chosen is plain and not plain.holds:
+        if not plain.holds:
             # A body that rotates about one of its sensors: that one's translations are noise.
             in_one_unit = _fitted(PLAIN, streams, lag_s, same_unit=True)
-            chosen = in_one_unit if in_one_unit.holds else plain
+            plain = in_one_unit if in_one_unit.holds else plain
+        chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
         if not chosen.holds and thorough and not failed:
             chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:

@@ -237,15 +237,19 @@ def _bettered(first: Run, settled: Collection[str], known: Run | None) -> Run:
         return first
     doubts = []
     if "parent_scale" not in given:
-        doubts = [_as_doubt(each) for each in found if each.code == "unit_or_scale"]
+        doubtful = [each for each in found if each.code == "unit_or_scale"]
+        doubts = [_as_doubt(each, second.calibration) for each in doubtful]
     return _doubting(_telling(second, options, found), doubts)
 
 
-def _as_doubt(found: Finding) -> Finding:
-    """A finding about lengths that may be read in two ways, once one way is taken: as grave as the
-    scale is close to a unit.
+def _as_doubt(found: Finding, calibration: Calibration) -> Finding:
+    """Return the finding about lengths that may be read in two ways, once one way is taken: an
+    error if the scale of the check, or that of the result, is a unit's within its uncertainty.
     """
-    severity = Severity.ERROR if found.evidence["is_exact"] else Severity.WARNING
+    off = abs(calibration.scale - 1.0 / found.evidence["factor"])
+    is_near = off <= checking.UNIT_SIGMAS * calibration.scale_sigma
+    is_exact = bool(found.evidence["is_exact"]) or is_near
+    severity = Severity.ERROR if is_exact else Severity.WARNING
     return replace(found, severity=severity, options={})
 
 

@@ -13,6 +13,7 @@ from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from reproduction.coverage import classes, mixed
 from reproduction.coverage.classes import make
 
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
@@ -175,3 +176,13 @@ class TestNoisyChild:
     def test_the_lengths_of_the_child_are_kept(self):
         result = hec.calibrate(*self.recorded(0.01, 0.02), method="dnlo")
         assert result.scale == 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(classes, "arm_target"), (mixed, "mixed_arm")], ids=["target", "mixed"]
+)
+def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, name):
+    drive = kind.make(name, 2002)
+    result = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), drive.child)
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    assert "unit_or_scale" in {each.code for each in result.findings if each.makes_unusable}
