@@ -275,11 +275,24 @@ def test_latitudes_are_read_in_every_form(tmp_path, form):
     np.testing.assert_allclose(trajectory.poses[:, :3, :3], R, atol=1e-5)
 
 
+MS_OF_WEEK = [f"{1e3 * float(second):.0f}" for second in SOW]
 GPS = {
     "week and second of it": ("GPSWeek,GPSTime", WEEKS, SOW),
     "other names": ("week,sow", WEEKS, SOW),
     "time of week": ("GPS Week,TOW (s)", WEEKS, SOW),
-    "milliseconds": ("GPS Week,TOW [ms]", WEEKS, [f"{1e3 * float(each):.0f}" for each in SOW]),
+    "milliseconds": ("GPS Week,TOW [ms]", WEEKS, MS_OF_WEEK),
+    "unit behind the name": ("week,tow_s", WEEKS, SOW),
+    "milliseconds behind the name": ("gps_week,tow_ms", WEEKS, MS_OF_WEEK),
+    "in other order": ("gps_tow_ms,gps_week", MS_OF_WEEK, WEEKS),
+    "numbers": ("gps_wn,gps_sow_s", WEEKS, SOW),
+    "one word": ("gpsWeek,timeOfWeek", WEEKS, SOW),
+    "ublox": ("wn,iTOW", WEEKS, MS_OF_WEEK),
+    "ublox with its unit": ("week,itow_ms", WEEKS, MS_OF_WEEK),
+    "septentrio": ("WNc,TOW", WEEKS, MS_OF_WEEK),
+    "ardupilot": ("GWk,GMS", WEEKS, MS_OF_WEEK),
+    "novatel": ("gps_week_number,gps_week_milliseconds", WEEKS, MS_OF_WEEK),
+    "milliseconds without a word": ("gps_week,gps_tow", WEEKS, MS_OF_WEEK),
+    "milliseconds of the week": ("week,ms_of_week", WEEKS, MS_OF_WEEK),
 }
 
 
@@ -290,6 +303,26 @@ def test_a_week_of_gps_and_its_second_are_stamps(tmp_path, form):
     reading = read(written(tmp_path / "ins.csv", text))
     assert_is_the_truth(reading.trajectory)
     assert any("18 s ahead of UTC" in guess for guess in reading.guesses)
+
+
+@pytest.mark.parametrize("name", ["itow", "tow_ms", "ms_of_week", ".navpvt.iTOW"])
+def test_milliseconds_of_a_week_are_stamps_without_the_week(tmp_path, name):
+    head = f"{name},x,y,z,qx,qy,qz,qw\n"
+    path = written(tmp_path / "ins.csv", text_of(MS_OF_WEEK, P, Q, head=head, separator=","))
+    week_ns = 604_800_000_000_000
+    of_week_ns = (TRUTH.stamps_ns - 315_964_800_000_000_000) % week_ns
+    np.testing.assert_array_equal(read(path).trajectory.stamps_ns, of_week_ns)
+
+
+def test_a_table_keeps_the_unit_of_the_second_of_a_week():
+    pd = pytest.importorskip("pandas")
+    table = pd.DataFrame({"gps_week": WEEKS, "tow_ms": [int(text) for text in MS_OF_WEEK]})
+    for column, name in enumerate(("x", "y", "z")):
+        table[name] = P[:, column]
+    for column, name in enumerate(("qx", "qy", "qz", "qw")):
+        table[name] = Q[:, column]
+    trajectory = hec.read_trajectory(table)
+    np.testing.assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
 
 
 @pytest.mark.parametrize(("period_s", "name"), [(604_800, "sow"), (86_400, "time")])

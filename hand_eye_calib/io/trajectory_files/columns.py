@@ -48,9 +48,12 @@ _ALIASES = {
     "datetime date_time utc utctime utc_time time_utc time_of_day epoch unix_time unixtime "
     "ros_time rostime",
     "date": "date day utc_date date_utc gps_date",
-    "week": "week gpsweek gps_week week_number weeks wn gwk",
+    "week": "week gpsweek gps_week week_number weeknumber weekno week_no gps_week_no weeks wn wnc "
+    "gps_wn gwk",
     "sow": "sow tow gps_sow gpssow gps_tow gpstow gps_seconds gpsseconds gpssec seconds_of_week "
-    "second_of_week week_seconds time_of_week itow gms",
+    "second_of_week secs_of_week week_seconds time_of_week timeofweek tow_sec tow_secs sow_sec",
+    "mow": "itow gms mow towms tow_msec gps_week_ms week_ms week_msec week_milliseconds "
+    "gps_milliseconds gps_ms ms_of_week msec_of_week milliseconds_of_week",
     "x": _OF_POSITION.format("x")
     + "easting pos_east position0 actual_tcp_pose_0 ecef_x x_ecef x_ecf",
     "y": _OF_POSITION.format("y")
@@ -84,6 +87,7 @@ _ALIASES = {
 # Names without an underscore that paths may end in, such as gps_fix_latitude.
 _ENDS = {
     *("latitude", "longitude", "altitude"),
+    "itow",
     *QUATERNION,
     *(f"t{axis}" for axis in POSITION),
 }
@@ -121,6 +125,8 @@ _UNITS_IN_BRACKETS = {
     # Degrees, minutes and seconds.
     **dict.fromkeys(("d/m/s", "+/-d/m/s", "dms", "d/m"), "deg"),
 }
+# Words of stamps, the last for seconds of a week of GPS: a unit behind them is one of time.
+_TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
 _OPENING = "[("
 _CLOSING = "])"
 
@@ -211,15 +217,17 @@ def measured(
 
 
 #: Ways to give a stamp, the preferred first: the stamp of the message's header rather than the
-#: time of its arrival; a date and a time of day; a week of GPS and its second.
+#: time of its arrival; a date and a time of day; a week of GPS and its second or millisecond.
 _STAMPS = (
     ("secs", "nsecs"),
     ("header",),
     ("date", "t"),
     ("week", "sow"),
+    ("week", "mow"),
     ("week", "t"),
     ("t",),
     ("sow",),
+    ("mow",),
     ("date",),
     (),
 )
@@ -230,7 +238,8 @@ def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
 
     A stamp beside a week of GPS and its second is on the clock of the recording.
     """
-    if {"week", "sow", "t"} <= columns.keys():
+    has_second = "sow" in columns or "mow" in columns
+    if has_second and {"week", "t"} <= columns.keys():
         return ("t",)
     return next(way for way in _STAMPS if {*way} <= columns.keys())
 
@@ -262,7 +271,7 @@ def _split(name: str) -> tuple[str, str]:
         return "_".join(words), _UNITS_IN_BRACKETS.get(unit, "")
     if len(words) > 1 and words[-1].isdigit() and words[-2] in ("q", "position"):
         return "_".join([*words[:-2], words[-2] + words[-1]]), ""
-    is_time = any(re.fullmatch("t|time.*|stamp.*", word) for word in words)
+    is_time = any(_TIME_WORD.fullmatch(word) for word in words)
     for count in (2, 1):
         unit = _UNITS.get("/".join(words[-count:]), "")
         if len(words) > count and unit and (unit in STAMP_UNITS) == is_time:

@@ -157,7 +157,8 @@ def _zone_s(zone: str) -> int:
 def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Decimal:
     """The stamp of a row as it is written, with no binary floating point in between, in the unit of
     its column; in seconds for dates and weeks of GPS, in nanoseconds for two columns. The ``unit``
-    is that of the second of a week, if it is named.
+    is that of the second of a week, if it is named: otherwise what is no second of a week, nor of
+    the next, is a millisecond.
 
     Raises
     ------
@@ -170,8 +171,11 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
         return Decimal(int(cells[0]) * _NS + int(cells[1]))
     second = _number(cells[1])
     if names[0] == "week" and second is not None and second.is_finite():
-        in_seconds = second * STAMP_UNITS[unit or "s"] / _NS
-        return seconds_of_week(cells[0], in_seconds) if in_seconds < 2 * WEEK_S else second
+        for possible_unit in (unit,) if unit else ("s", "ms"):
+            in_seconds = second * STAMP_UNITS[possible_unit] / _NS
+            if in_seconds < 2 * WEEK_S:
+                return seconds_of_week(cells[0], in_seconds)
+        return second
     last = cells[-1]
     # A time of day belongs to its date, whatever else is complete in itself.
     if names[0] == "date" and ":" in last and len(last) < len("HH:MM:SS") + 12:

@@ -110,7 +110,11 @@ class Table:
         elif self.stamp_at:
             self.units["t"] = "s"
         unit = units[self.stamp_at[-1]] if self.stamp_at else ""
-        self._second_unit = unit if unit in STAMP_UNITS else ""
+        self.second_unit = unit if unit in STAMP_UNITS else ""
+        if "mow" in self.stamp_names:
+            self.second_unit = self.second_unit or "ms"
+        if self.stamp_names == ("mow",):
+            self.units["t"] = self.second_unit
         self._sensor_at = columns.get("sensor", [])[:1]
         self._sensors: set[str] = set()
         turn = next((group for group in _TURNS if {*group} <= {*quantities}), ())
@@ -182,7 +186,7 @@ class Table:
         if self.stamp_at:
             texts = [cells[place] for place in self.stamp_at]
             try:
-                self.stamps.append(stamp_of(self.stamp_names, texts, self._second_unit))
+                self.stamps.append(stamp_of(self.stamp_names, texts, self.second_unit))
             except ValueError:
                 if any(map(is_null, texts)):
                     return False
@@ -284,7 +288,8 @@ def table_of_object(source: Any, times: Any = None) -> Table:
             times = source[keys[table.stamp_at[0]]]
         elif times is None and table.stamp_at:
             texts = zip(*(map(str, source[keys[at]]) for at in table.stamp_at), strict=True)
-            times = [stamp_of(table.stamp_names, cells) for cells in texts]
+            unit = table.second_unit
+            times = [stamp_of(table.stamp_names, cells, unit) for cells in texts]
     else:
         names, values, notes = columns_of_array(source)
         if names[0] == "t":
