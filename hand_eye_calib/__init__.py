@@ -12,12 +12,41 @@ nothing but Python.
 from importlib import import_module
 from typing import Any
 
-# The home of every public name, as the stub beside this file imports it.
-with open(f"{__file__}i", encoding="utf-8") as _stub:
-    _imports = [line.split() for line in _stub if line.startswith("from")]
-_HOMES = {name: module for _, module, _, name, *_ in _imports}
+from hand_eye_calib import extras, io, offline, online
 
-__all__ = [*_HOMES]
+# Module of every public name.
+_MODULES = {
+    "CalibratorConfig": "hand_eye_calib.config",
+    "Calibrator": "hand_eye_calib.engine.calibrator",
+    "calibrate": "hand_eye_calib.engine.offline",
+    "cross_check": "hand_eye_calib.engine.offline",
+    "calibrate_arm": "hand_eye_calib.engine.stops",
+    "calibrate_stops": "hand_eye_calib.engine.stops",
+    "HandEyeCalibError": "hand_eye_calib.errors",
+    "Trajectory": "hand_eye_calib.geometry.trajectory",
+    "load": "hand_eye_calib.io.results",
+    "save": "hand_eye_calib.io.results",
+    "read_arm_samples": "hand_eye_calib.io.stops",
+    "read_trajectory": "hand_eye_calib.io.trajectory_files.reading",
+    "write_trajectory": "hand_eye_calib.io.trajectory_files.table",
+    "plot": "hand_eye_calib.report.figures",
+    "Calibration": "hand_eye_calib.results.calibration",
+    "Residuals": "hand_eye_calib.results.records",
+    "SolveStatus": "hand_eye_calib.results.records",
+    "Reason": "hand_eye_calib.results.verdict",
+    "Verdict": "hand_eye_calib.results.verdict",
+    "RigCalibration": "hand_eye_calib.session.rig",
+    "calibrate_rig": "hand_eye_calib.session.rig",
+    "calibrate_many": "hand_eye_calib.session.together",
+    "calibrate_together": "hand_eye_calib.session.together",
+    "compare": "hand_eye_calib.session.together",
+    "simulate": "hand_eye_calib.simulation.drive",
+}
+
+__all__ = [*_MODULES]
+
+for _layer in (io, offline, online, extras):
+    _layer.register()
 
 
 def __getattr__(name: str) -> Any:
@@ -25,9 +54,9 @@ def __getattr__(name: str) -> Any:
         from hand_eye_calib.version import version_of
 
         return version_of()
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'hand_eye_calib' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""The public names and their homes, for the package itself, editors and type checkers."""
+"""The public names and their modules, for editors and type checkers."""
 
 from hand_eye_calib.config import CalibratorConfig as CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator as Calibrator

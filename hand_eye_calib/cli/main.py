@@ -8,7 +8,6 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
@@ -16,19 +15,8 @@ from hand_eye_calib.cli.options import Exit, as_typed, fail
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, installing
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.option import did_you_mean
+from hand_eye_calib.registry import COMMANDS
 from hand_eye_calib.text import shown_value
-
-COMMANDS = {
-    "calibrate": "calibrate from two trajectory files, a bag or a journal",
-    "replay": "the same for bags and journals alone",
-    "check": "check two pose streams before any solve",
-    "calibrator": "run the ROS 2 node",
-    "watch": "show the live node on the terminal, or in a browser",
-    "compare": "compare results with what is installed, or with each other",
-    "info": "show a saved result",
-    "simulate": "simulate trajectories or a bag with known truth",
-    "demo": "simulate a recording and calibrate from it, offline and live",
-}
 
 _EPILOG = """\
 examples:
@@ -132,13 +120,12 @@ def _run(argv: Sequence[str]) -> int:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    added = {each: commands.add_parser(each, help=COMMANDS[each]) for each in COMMANDS}
+    added = {name: commands.add_parser(name, help=COMMANDS[name].help) for name in COMMANDS}
     for one in (parser, *added.values()):
         one.formatter_class, one.allow_abbrev = argparse.RawDescriptionHelpFormatter, False
     if command is not None:
-        file = "calibrate" if command == "replay" else command
-        module = import_module(f"hand_eye_calib.cli.{file}")
-        added[command].description = COMMANDS[command]
+        module = COMMANDS[command].load()
+        added[command].description = COMMANDS[command].help
         module.add_arguments(added[command])
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":

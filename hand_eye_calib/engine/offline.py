@@ -16,7 +16,6 @@ from hand_eye_calib.option import option_name
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.results.records import CrossCheck
 from hand_eye_calib.text import AXIS_UNITS, Prior, shown_value
-from hand_eye_calib.upstairs import upstairs
 
 MethodName: TypeAlias = Literal[
     "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive"
@@ -105,7 +104,9 @@ def calibrate(
     values = {name: value for name, value in locals().items() if value is not None}
     first, second = parent, child
     if not (isinstance(first, Trajectory) and isinstance(second, Trajectory)):
-        first, second = upstairs("io.trajectory_files.reading", "read_trajectories")(first, second)
+        from hand_eye_calib.io.trajectory_files.reading import read_trajectories
+
+        first, second = read_trajectories(first, second)
     values |= prior_fields({} if prior is None else prior)
     named = [each for each in fields(CalibratorConfig) if each.name in values]
     given = {option_name(each): values[each.name] for each in named}

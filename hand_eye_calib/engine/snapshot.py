@@ -19,6 +19,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import StreamFrames
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs, select_keyframes, synchronise
+from hand_eye_calib.registry import ESTIMATORS
 from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import frame_name
 
@@ -223,13 +224,10 @@ class Snapshot:
 
     def _estimate_part(self, cross_check: bool) -> Calibration:
         """The part of the extrinsic that streams without rotations or positions show."""
-        from hand_eye_calib.engine.partial import estimate_lever_arm, estimate_rotation
-
         for name, allowed in _OF_PARTS_ALONE.items():
             if getattr(self.config, name) not in allowed:
                 self.config.require_poses(f"{name} {getattr(self.config, name)}")
-        rotation = partial(estimate_rotation, cross_check=cross_check)
-        estimate = estimate_lever_arm if self.config.measured == "positions" else rotation
+        estimate = partial(ESTIMATORS[self.config.measured], cross_check=cross_check)
         result = estimate(self.pose_pairs, self.config)
         found_s, given_s = result.time_offset_s, float(self.config.time_offset)
         if not abs(found_s - given_s) < UNASKED_S:

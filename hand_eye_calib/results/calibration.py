@@ -12,11 +12,11 @@ from hand_eye_calib.errors import required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.plain import Document
+from hand_eye_calib.registry import RESULT_METHODS
 from hand_eye_calib.results import document
 from hand_eye_calib.results.records import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.results.verdict import Judged, Verdict
 from hand_eye_calib.text import AXIS_UNITS
-from hand_eye_calib.upstairs import upstairs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,11 +124,11 @@ class Calibration(Judged):
 
     def save(self, directory: str | Path) -> Path:
         """Write ``extrinsic.yaml`` and the files for robots; see :func:`hand_eye_calib.save`."""
-        return upstairs("io.results", "save_result")(self, directory)
+        return RESULT_METHODS["save"](self, directory)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
-        return upstairs("report.figures", "plot")(self, ax)
+        return RESULT_METHODS["plot"](self, ax)
 
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML file; a directory gets ``report.html``.
@@ -140,8 +140,7 @@ class Calibration(Judged):
         """
         self.residuals()
         path = Path(path, "report.html") if Path(path).is_dir() else Path(path)
-        page = upstairs("report.report", "render")(self, self.recording)
-        return upstairs("io.results", "save_text")(path, page)
+        return RESULT_METHODS["report"](self, path)
 
     def static_transform_command(self) -> str:
         """Shell command that publishes the child's pose as a static transform, in the frame that it
@@ -180,9 +179,7 @@ class Calibration(Judged):
         --------
         >>> print(result.export("fast_lio"))  # doctest: +SKIP
         """
-        from hand_eye_calib.results.exports import export_text
-
-        return export_text(self, format)
+        return RESULT_METHODS["export"](self, format)
 
     def to_dict(self) -> Document:
         """Everything but the residuals as plain numbers, strings, lists and mappings, ready for

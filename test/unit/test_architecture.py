@@ -13,7 +13,7 @@ from hand_eye_calib.simulation.options import NoiseConfig
 
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
-GROUND = {"errors", "text", "config", "arrays", "stats", "plain", "version", "upstairs", "option"}
+GROUND = {"errors", "text", "config", "arrays", "stats", "plain", "version", "registry", "option"}
 GROUND |= {"python_path"}
 ENGINE = {
     "errors": set(),
@@ -22,7 +22,7 @@ ENGINE = {
     "plain": {"errors"},
     "version": set(),
     "python_path": set(),
-    "upstairs": set(),
+    "registry": {"errors"},
     "text": {"errors"},
     "option": {"errors", "text"},
     "config": {"errors", "text", "option"},
@@ -35,17 +35,22 @@ ENGINE["gls"] = ENGINE["solvers"] | {"results", "solvers"}
 ENGINE["assessment"] = ENGINE["gls"] | {"gls"}
 ENGINE["alignment"] = ENGINE["solvers"] | {"results", "solvers"}
 ENGINE["checks"] = ENGINE["alignment"] | {"results", "gls", "assessment", "alignment"}
-ENGINE["engine"] = set(ENGINE)
+ENGINE["engine"] = {*ENGINE, "io"}
 ENGINE["session"] = set(ENGINE)
 ALLOWED = ENGINE | {
     "io": GROUND | {"geometry", "results"},
     "report": set(ENGINE),
     "simulation": GROUND | {"geometry", "io"},
-    "root": GROUND | {"geometry", "results", "engine", "session", "io", "report", "simulation"},
+    "offline": {"registry", "cli", "report", "io"},
+    "online": {"registry", "cli"},
+    "root": GROUND
+    | {"geometry", "results", "engine", "session", "io", "report", "simulation"}
+    | {"offline", "online", "extras"},
     "live": {"io", *ENGINE},
     "watch": {"errors", "plain", "stats", "text", "results", "live"},
     "ros": {"io", "live", "watch", *ENGINE},
     "cli": {"io", "report", "simulation", "live", "watch", "ros", *ENGINE},
+    "extras": {"io", "report", "simulation", "live", "watch", "ros", "cli", *ENGINE},
     "__main__": {"cli", "python_path"},
 }
 

@@ -16,7 +16,7 @@ import yaml
 from packaging.requirements import Requirement
 from source_code import ROOT
 
-from hand_eye_calib.cli.main import COMMANDS
+from hand_eye_calib.registry import COMMANDS
 from hand_eye_calib.watch.board import AXES
 
 PACKAGE = "hand_eye_calib"

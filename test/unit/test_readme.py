@@ -4,16 +4,16 @@ import argparse
 import dataclasses
 import re
 import shlex
-from importlib import import_module
 
 import numpy as np
 import pytest
 from source_code import ROOT
 
-from hand_eye_calib.cli.main import COMMANDS, main
+from hand_eye_calib.cli.main import main
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.io import files
 from hand_eye_calib.option import option_name
+from hand_eye_calib.registry import COMMANDS
 
 NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
 PAGES = {
@@ -164,7 +164,7 @@ def test_command_parses(words):
     name, *arguments = words
     assert name in COMMANDS
     parser = argparse.ArgumentParser(allow_abbrev=False, exit_on_error=False)
-    import_module(f"hand_eye_calib.cli.{name.replace('replay', 'calibrate')}").add_arguments(parser)
+    COMMANDS[name].load().add_arguments(parser)
     if name == "calibrator":
         assert arguments[:1] in ([], ["--ros-args"])
     elif arguments:

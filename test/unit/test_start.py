@@ -17,7 +17,8 @@ HEAVY = {"casadi", "matplotlib", "numpy", "rclpy", "rich", "rosbags", "scipy", "
 
 SHOW_HELP = """
 import sys
-from hand_eye_calib.cli.main import COMMANDS, main
+from hand_eye_calib.cli.main import main
+from hand_eye_calib.registry import COMMANDS
 for command in ((), *((each,) for each in COMMANDS)):
     try:
         main([*command, "--help"])

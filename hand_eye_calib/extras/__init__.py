@@ -1,0 +1,17 @@
+"""Extras: each is a folder here and one line of EXTRAS. Delete both to do without it."""
+
+from importlib import import_module
+
+EXTRAS = (
+    "exports",  # files of other programs
+    "fleet",  # several recordings: compared, together, in batches
+    "partial",  # streams of positions, rotations or angular rates alone
+    "simulation",  # drives with known truth, and the demo
+)
+
+
+def register() -> None:
+    """Register what the extras add to the layers below."""
+    for name in EXTRAS:
+        extra = import_module(f"{__name__}.{name}")
+        extra.register()

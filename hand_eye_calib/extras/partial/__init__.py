@@ -1,0 +1,24 @@
+"""Streams of positions, rotations or angular rates alone."""
+
+from typing import Any
+
+from hand_eye_calib.registry import ESTIMATORS
+
+
+def register() -> None:
+    """Register the estimators of both kinds of streams."""
+    ESTIMATORS["positions"] = _lever_arm
+    ESTIMATORS["rotations"] = _rotation
+
+
+def _lever_arm(pose_pairs: Any, config: Any, cross_check: bool) -> Any:
+    """Estimate the lever arm; positions have no cross-check."""
+    from hand_eye_calib.engine.partial import estimate_lever_arm
+
+    return estimate_lever_arm(pose_pairs, config)
+
+
+def _rotation(pose_pairs: Any, config: Any, cross_check: bool) -> Any:
+    from hand_eye_calib.engine.partial import estimate_rotation
+
+    return estimate_rotation(pose_pairs, config, cross_check=cross_check)

@@ -1,0 +1,25 @@
+"""Simulated drives with known truth, and the demo."""
+
+from typing import Any
+
+from hand_eye_calib.registry import COMMANDS, Command
+
+
+def register() -> None:
+    """Register the commands ``simulate`` and ``demo``."""
+    COMMANDS["simulate"] = Command("simulate trajectories or a bag with known truth", _simulate)
+    COMMANDS["demo"] = Command(
+        "simulate a recording and calibrate from it, offline and live", _demo
+    )
+
+
+def _simulate() -> Any:
+    from hand_eye_calib.cli import simulate
+
+    return simulate
+
+
+def _demo() -> Any:
+    from hand_eye_calib.cli import demo
+
+    return demo

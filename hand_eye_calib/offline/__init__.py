@@ -1,0 +1,49 @@
+"""Commands and reports for recordings."""
+
+from pathlib import Path
+from typing import Any
+
+from hand_eye_calib.registry import COMMANDS, RESULT_METHODS, Command
+
+
+def register() -> None:
+    """Register the commands for recordings, and the methods ``plot`` and ``report`` of results."""
+    COMMANDS["calibrate"] = Command(
+        "calibrate from two trajectory files, a bag or a journal", _calibrate
+    )
+    COMMANDS["replay"] = Command("the same for bags and journals alone", _calibrate)
+    COMMANDS["check"] = Command("check two pose streams before any solve", _check)
+    COMMANDS["info"] = Command("show a saved result", _info)
+    RESULT_METHODS["plot"] = _plot
+    RESULT_METHODS["report"] = _report
+
+
+def _calibrate() -> Any:
+    from hand_eye_calib.cli import calibrate
+
+    return calibrate
+
+
+def _check() -> Any:
+    from hand_eye_calib.cli import check
+
+    return check
+
+
+def _info() -> Any:
+    from hand_eye_calib.cli import info
+
+    return info
+
+
+def _plot(result: Any, ax: Any) -> Any:
+    from hand_eye_calib.report.figures import plot
+
+    return plot(result, ax)
+
+
+def _report(result: Any, path: Path) -> Path:
+    from hand_eye_calib.io.results import save_text
+    from hand_eye_calib.report.report import render
+
+    return save_text(path, render(result, result.recording))

@@ -1,0 +1,63 @@
+"""Tables that layers above fill, so that no layer imports one above it.
+
+Each layer and each extra has a function ``register()`` in its ``__init__.py``; the package calls
+all of them once, when it is imported. A registered function imports its module when it is called,
+so that importing the package takes no time.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+from hand_eye_calib.errors import ConfigError
+
+Entry = TypeVar("Entry")
+
+
+class Registry(dict[str, Entry]):
+    """Entries by name.
+
+    Parameters
+    ----------
+    what : str
+        What an entry is, for messages.
+
+    Raises
+    ------
+    ConfigError
+        If a name is looked up that no layer has registered.
+    """
+
+    def __init__(self, what: str) -> None:
+        super().__init__()
+        self.what = what
+
+    def __missing__(self, name: str) -> Entry:
+        names = ", ".join(self) or "none"
+        raise ConfigError(f"unknown {self.what} {name!r}; this installation has: {names}")
+
+
+class Command(NamedTuple):
+    """A command of the command line.
+
+    Attributes
+    ----------
+    help : str
+        One line for the list of commands.
+    load : callable
+        Return the module of the command, with ``add_arguments(parser)`` and
+        ``run(arguments) -> int``.
+    """
+
+    help: str
+    load: Callable[[], Any]
+
+
+#: Commands of the command line, in the order of its help.
+COMMANDS: Registry[Command] = Registry("command")
+
+#: Methods of a result that take a layer above the core: save, plot, report, export.
+RESULT_METHODS: Registry[Callable[..., Any]] = Registry("method of a result")
+
+#: Estimators of streams that are no poses, by what both streams measure together. Called with the
+#: pose pairs, the options, and whether to cross-check.
+ESTIMATORS: Registry[Callable[..., Any]] = Registry("kind of streams")
