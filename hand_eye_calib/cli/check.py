@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
     from hand_eye_calib.checks.findings import finding, gravest_first
     from hand_eye_calib.engine.evidence import summarise
-    from hand_eye_calib.engine.run import check
+    from hand_eye_calib.engine.examination import check
     from hand_eye_calib.engine.snapshot import whole_snapshot
     from hand_eye_calib.plain import plain
 

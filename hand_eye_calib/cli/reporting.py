@@ -65,7 +65,7 @@ def write_session() -> None:
         if result.others:
             _session_rig(directory / "rig", result)
         if result.with_report:
-            from hand_eye_calib.engine.run import check
+            from hand_eye_calib.engine.examination import check
             from hand_eye_calib.io.results import save_result
 
             checked = check(result.snapshot, result.calibration)

@@ -10,8 +10,8 @@ from hand_eye_calib.assessment.excitation import what_is_missing
 from hand_eye_calib.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.checks.findings import Finding, Severity, answered, gravest_first
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.attempts import with_options
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.run import with_options
 from hand_eye_calib.engine.snapshot import Snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.live.log import GOES_ON_S, ONCE_S, NodeLog
@@ -370,7 +370,7 @@ class SolveCycle:
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
             self._certain = {**self._certain, **answer.options}
-            self._option_warnings = answer.told
+            self._option_warnings = answer.messages
         if answer.check is not None:
             self.checks.take(answer.check)
         elif answer.is_checked:

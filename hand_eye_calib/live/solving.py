@@ -25,8 +25,10 @@ from hand_eye_calib.assessment.excitation import Excitation, excitation
 from hand_eye_calib.checks.check import MIN_DURATION_S, CheckResult, can_check
 from hand_eye_calib.checks.findings import answered, gravest_first
 from hand_eye_calib.checks.streams import check_positions, check_stream
+from hand_eye_calib.engine.attempts import with_options
 from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.engine.run import check, review, with_options
+from hand_eye_calib.engine.examination import check
+from hand_eye_calib.engine.run import review
 from hand_eye_calib.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.live.state import GRACE_S
@@ -82,7 +84,7 @@ class Answer:
 
     ``is_checked`` if a check was asked for: its result is None if the motion is too short or has
     too little rotation to tell. The result is one with the options that it is certain of, and
-    ``told`` are the warnings about that.
+    ``messages`` say so.
     """
 
     session: int
@@ -94,7 +96,7 @@ class Answer:
     is_checked: bool = False
     check: CheckResult | None = None
     options: Options = field(default_factory=dict)
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
 
 
 def answer(job: Job) -> Answer:
@@ -118,7 +120,9 @@ def answer(job: Job) -> Answer:
                 done = replace(done, check=check(as_sent))
             else:
                 run = review(done.calibration, as_sent, job.options)
-                done = replace(done, check=run.check, options=dict(run.options), told=run.told)
+                done = replace(
+                    done, check=run.check, options=dict(run.options), messages=run.messages
+                )
                 if run.options:
                     done = replace(done, calibration=run.calibration)
     except Exception as error:  # the node reports it

@@ -13,8 +13,9 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.config import CalibratorConfig
+from hand_eye_calib.engine.attempts import Attempt
 from hand_eye_calib.engine.estimation import solve_poses
-from hand_eye_calib.engine.run import Run, run
+from hand_eye_calib.engine.run import run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
@@ -86,7 +87,7 @@ def calibrate_rig(
     return RigCalibration.of(sensors, star, chain)
 
 
-def _as_solved(child: Trajectory, found: Run) -> Trajectory:
+def _as_solved(child: Trajectory, found: Attempt) -> Trajectory:
     """Return the poses of a child as a run has read them, with the name of the sensor's frame.
 
     Inverse poses are those of the other frame of the stream: of a camera that sees a marker.

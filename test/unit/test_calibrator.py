@@ -18,8 +18,8 @@ from motions import (
 
 from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
+from hand_eye_calib.engine.examination import check
 from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.engine.run import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import InputError, NotEnoughDataError
 from hand_eye_calib.geometry import se3

@@ -7,7 +7,7 @@ from motions import geodetic, planar_poses, walked, wandering_poses
 import hand_eye_calib as hec
 from hand_eye_calib.assessment.covariance import usual_speed
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.run import check
+from hand_eye_calib.engine.examination import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

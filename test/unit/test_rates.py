@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
 from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.run import check
+from hand_eye_calib.engine.examination import check
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3

@@ -12,7 +12,8 @@ import hand_eye_calib as hec
 from hand_eye_calib.checks.check import CheckResult
 from hand_eye_calib.checks.streams import check_lengths
 from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.run import review, run, with_options
+from hand_eye_calib.engine.attempts import with_options
+from hand_eye_calib.engine.run import review, run
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory

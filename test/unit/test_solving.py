@@ -192,11 +192,11 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     replayed = review(live.estimate(), live).calibration
     found = answer(Job(1, calibrator, check=True))
     assert found.options == {"time_offset": "estimate"}
-    assert "solved with time_offset estimate" in found.told[0]
+    assert "solved with time_offset estimate" in found.messages[0]
     again = answer(Job(1, calibrator, check=True, options=found.options))
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
     for each in (found, again):
         np.testing.assert_array_equal(each.calibration.T_parent_child, replayed.T_parent_child)
         np.testing.assert_array_equal(each.calibration.covariance, replayed.covariance)
-    assert (again.options, again.told) == ({}, ())
+    assert (again.options, again.messages) == ({}, ())
     assert "time_offset" not in {finding.code for finding in again.check.findings}
