@@ -39,7 +39,7 @@ _MODULES = {
     "calibrate_rig": "hand_eye_calib.session.rig",
     "calibrate_many": "hand_eye_calib.session.together",
     "calibrate_together": "hand_eye_calib.session.together",
-    "compare": "hand_eye_calib.session.together",
+    "compare": "hand_eye_calib.assessment.comparison",
     "simulate": "hand_eye_calib.simulation.drive",
 }
 

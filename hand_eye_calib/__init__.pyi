@@ -1,5 +1,6 @@
 """The public names and their modules, for editors and type checkers."""
 
+from hand_eye_calib.assessment.comparison import compare as compare
 from hand_eye_calib.config import CalibratorConfig as CalibratorConfig
 from hand_eye_calib.engine.calibrator import Calibrator as Calibrator
 from hand_eye_calib.engine.offline import calibrate as calibrate
@@ -23,7 +24,6 @@ from hand_eye_calib.session.rig import RigCalibration as RigCalibration
 from hand_eye_calib.session.rig import calibrate_rig as calibrate_rig
 from hand_eye_calib.session.together import calibrate_many as calibrate_many
 from hand_eye_calib.session.together import calibrate_together as calibrate_together
-from hand_eye_calib.session.together import compare as compare
 from hand_eye_calib.simulation.drive import simulate as simulate
 
 __version__: str

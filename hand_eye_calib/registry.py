@@ -58,6 +58,18 @@ COMMANDS: Registry[Command] = Registry("command")
 #: Methods of a result that take a layer above the core: save, plot, report, export.
 RESULT_METHODS: Registry[Callable[..., Any]] = Registry("method of a result")
 
+#: Writers of the pages of a session of the node. Called with the output directory and the session's
+#: result.
+SESSION_PAGES: Registry[Callable[..., None]] = Registry("page of a session")
+
+#: Readers of messages that are no poses, by their type, or "images of a target". Called with the
+#: bag, the stream, the topic and what the source names behind it.
+BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
+
+#: Readers of trajectory files of other programs. Called with the path, the bytes, and the options;
+#: return None for a file of another format.
+FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")
+
 #: Estimators of streams that are no poses, by what both streams measure together. Called with the
 #: pose pairs, the options, and whether to cross-check.
 ESTIMATORS: Registry[Callable[..., Any]] = Registry("kind of streams")

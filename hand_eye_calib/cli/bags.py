@@ -196,8 +196,7 @@ def journal_in(path: Path | str) -> Path | None:
 
 def read_journal_of(directory: Path, options: Options) -> Recording:
     """Read the journal of a session of the node; the options go before those of the session."""
-    from hand_eye_calib.io.journal import read_journal
-    from hand_eye_calib.live.session import give
+    from hand_eye_calib.io.journal import read_journal, replay_journal
 
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
@@ -210,7 +209,7 @@ def read_journal_of(directory: Path, options: Options) -> Recording:
         given = [name for name in names if name in session.get("given", ())]
         given += CalibratorConfig.from_options(options).given
         calibrator = Calibrator(dataclasses.replace(config, given=given))
-        give(journal, directory, Calibrators(child=calibrator))
+        replay_journal(journal, directory, Calibrators(child=calibrator))
     sources = {stream: journal.about.get(stream, {}).get("topic") or stream for stream in STREAMS}
     inputs = {"journal": str(directory), **calibrator.inputs(sources)}
     return Recording(calibrator.snapshot(), inputs, sorted(directory.glob("*.tum")))

@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare; returns the exit code."""
+    from hand_eye_calib.assessment.comparison import compare
     from hand_eye_calib.io.results import load_result
-    from hand_eye_calib.session.together import compare
 
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):

@@ -85,8 +85,8 @@ def _with_robot(
     """
     installed = arguments.installed
     base = frame_name(arguments.base_frame or "")
+    from hand_eye_calib.assessment.comparison import with_comparison
     from hand_eye_calib.io.installed import frames_of_bag, open_installed, read_urdf
-    from hand_eye_calib.session.together import with_comparison
 
     if installed:
         frames = calibration.parent_frame, calibration.child_frame

@@ -19,7 +19,6 @@ from hand_eye_calib.cli.present import (
     wrapped,
 )
 from hand_eye_calib.cli.reading import read_files
-from hand_eye_calib.cli.reporting import write_rig_report
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.results.document import transforms_of
 
@@ -77,6 +76,8 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
     finally:  # even if the reader of what is printed has gone
         if arguments.out:
+            from hand_eye_calib.report.rig_page import write_rig_report
+
             write_rig_report(arguments.out, rig, names)
     failed = [each for each in rig.calibrations if each.status.failure]
     for each in failed:

@@ -13,9 +13,6 @@ from collections.abc import Callable, Iterator
 from io import StringIO
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.cli.options import argument_type, note
-from hand_eye_calib.errors import ConfigError
-
 if TYPE_CHECKING:
     from hand_eye_calib.watch.board import Board, View
 
@@ -74,7 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
             server = WebServer(board, requests.put, arguments.web)
             stack.callback(server.stop)
             addresses = server.addresses()
-            note(*(f"open {address} in a browser" for address in addresses))
+            for address in addresses:
+                print(f"hand_eye_calib: note: open {address} in a browser", file=sys.stderr)
         session = Session(board, requests, stack.enter_context(_keyboard()))
         show = stack.enter_context(_display(addresses[0]))
         while not came and not session.is_over:
@@ -193,9 +191,8 @@ def _keyboard() -> Iterator[Callable[[], str]]:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-@argument_type
 def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
-        raise ConfigError(f"expected PORT or HOST:PORT, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected PORT or HOST:PORT, got {text!r}")
     return host.strip("[]"), int(port)

@@ -3,9 +3,10 @@
 from importlib import import_module
 
 EXTRAS = (
-    "exports",  # files of other programs
     "fleet",  # several recordings: compared, together, in batches
     "partial",  # streams of positions, rotations or angular rates alone
+    "rig",  # three sensors or more
+    "sensors",  # lidar scans, images of a target, files of other programs
     "simulation",  # drives with known truth, and the demo
 )
 

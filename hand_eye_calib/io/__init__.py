@@ -6,11 +6,18 @@ from hand_eye_calib.registry import RESULT_METHODS
 
 
 def register() -> None:
-    """Register the method ``save`` of results."""
+    """Register the methods ``save`` and ``export`` of results."""
     RESULT_METHODS["save"] = _save
+    RESULT_METHODS["export"] = _export
 
 
 def _save(result: Any, directory: Any) -> Any:
     from hand_eye_calib.io.results import save_result
 
     return save_result(result, directory)
+
+
+def _export(result: Any, format: str) -> str:
+    from hand_eye_calib.results.exports import export_text
+
+    return export_text(result, format)

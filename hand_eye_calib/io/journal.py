@@ -24,7 +24,8 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.config import other_names
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.engine.calibrator import Calibrators
+from hand_eye_calib.errors import InputError, located
 from hand_eye_calib.io.files import LONGEST_LINE, open_regular
 from hand_eye_calib.io.trajectory_files.table import tum_line
 from hand_eye_calib.plain import Document
@@ -241,3 +242,24 @@ def count_poses(directory: str | Path) -> int | None:
         return len(read_journal(directory).stamps_ns)
     except InputError:
         return None
+
+
+def replay_journal(journal: Journal, directory: Path, engines: Calibrators) -> None:
+    """Add the poses of the session of a directory to engines, in the order of their arrival.
+
+    Raises
+    ------
+    InputError
+        If the engines refuse them.
+    """
+    with located(f"cannot use the session journal {directory}"):
+        for stream, about in journal.about.items():
+            if about.get("frame"):
+                engines.set_frame(stream, about["frame"])
+            if about.get("world"):
+                engines.set_world(stream, about["world"])
+        columns = (journal.streams, journal.stamps_ns, journal.poses)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for stream, stamp_ns, pose in rows:
+            if engines.takers(stream):
+                engines.add_pose(stream, stamp_ns, pose[:3], pose[3:])

@@ -21,6 +21,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment import change, moved
+from hand_eye_calib.assessment.comparison import SEEN_TARGETS
 from hand_eye_calib.assessment.covariance import floor_of_pairs
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
@@ -31,7 +32,6 @@ from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.results.records import AXES
-from hand_eye_calib.session.together import SEEN_TARGETS
 from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
 from hand_eye_calib.text import axes_in_words
 

@@ -4,11 +4,11 @@ import pickle
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 from hand_eye_calib.config import NodeConfig
-from hand_eye_calib.engine.snapshot import Snapshot
+from hand_eye_calib.engine.session_result import SessionResult
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.io.results import keep_earlier_results, save_result
 from hand_eye_calib.live.cycle import SolveCycle
@@ -16,24 +16,9 @@ from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.solving import start
 from hand_eye_calib.live.state import SavedState, Standing
-from hand_eye_calib.plain import Document
-from hand_eye_calib.results.calibration import Calibration
 from hand_eye_calib.text import listing
 
-_REPORT = "from hand_eye_calib.cli.reporting import write_session; write_session()"
-
-
-@dataclass(frozen=True)
-class SessionResult:
-    """A result of the node, the poses that gave it, and where these came from; whether a report is
-    wanted, and the poses of further child sensors, each with those of the parent.
-    """
-
-    calibration: Calibration
-    snapshot: Snapshot
-    inputs: Document
-    with_report: bool = True
-    others: Mapping[str, Snapshot] = field(default_factory=dict)
+_REPORT = "from hand_eye_calib.live.pages import write_session; write_session()"
 
 
 class Saver:

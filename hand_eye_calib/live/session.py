@@ -8,33 +8,13 @@ from pathlib import Path
 from hand_eye_calib.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, Calibrators
 from hand_eye_calib.engine.snapshot import STREAMS
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError, located
+from hand_eye_calib.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.journal import Journal, has_session, read_journal
+from hand_eye_calib.io.journal import Journal, has_session, read_journal, replay_journal
 from hand_eye_calib.live.journal import SessionJournal
 from hand_eye_calib.live.log import NodeLog
 from hand_eye_calib.live.state import GRACE_S, JournalState, Level
 from hand_eye_calib.plain import Document
-
-
-def give(journal: Journal, directory: Path, engines: Calibrators) -> None:
-    """Give engines the session of a directory.
-
-    Raises
-    ------
-    InputError
-        If they do not take it.
-    """
-    with located(f"cannot use the session journal {directory}"):
-        for stream, about in journal.about.items():
-            if about.get("frame"):
-                engines.set_frame(stream, about["frame"])
-            if about.get("world"):
-                engines.set_world(stream, about["world"])
-        columns = (journal.streams, journal.stamps_ns, journal.poses)
-        for stream, stamp_ns, pose in zip(*(each.tolist() for each in columns), strict=True):
-            if engines.takers(stream):
-                engines.add_pose(stream, stamp_ns, pose[:3], pose[3:])
 
 
 class LiveSession:
@@ -188,7 +168,7 @@ class LiveSession:
             return None
         try:
             journal = read_journal(directory)
-            give(journal, directory, self.engines)
+            replay_journal(journal, directory, self.engines)
         except HandEyeCalibError as error:
             self._log.error(f"cannot resume: {error}; a new session begins")
             for engine in self.engines.values():

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.registry import COMMANDS, RESULT_METHODS, Command
+from hand_eye_calib.registry import COMMANDS, RESULT_METHODS, SESSION_PAGES, Command
 
 
 def register() -> None:
@@ -16,6 +16,7 @@ def register() -> None:
     COMMANDS["info"] = Command("show a saved result", _info)
     RESULT_METHODS["plot"] = _plot
     RESULT_METHODS["report"] = _report
+    SESSION_PAGES["report"] = _session_report
 
 
 def _calibrate() -> Any:
@@ -47,3 +48,9 @@ def _report(result: Any, path: Path) -> Path:
     from hand_eye_calib.report.report import render
 
     return save_text(path, render(result, result.recording))
+
+
+def _session_report(directory: Path, session: Any) -> None:
+    from hand_eye_calib.cli.reporting import write_session_report
+
+    write_session_report(directory, session)

@@ -1,8 +1,6 @@
-"""``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence; of
-a rig, where its sensors are.
-"""
+"""``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -21,7 +19,7 @@ from hand_eye_calib.errors import printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.plain import Document
-from hand_eye_calib.report.figures import LOOK, figure_of_views, figures_of
+from hand_eye_calib.report.figures import LOOK, figures_of
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.document import (
     allowance_in_words,
@@ -32,7 +30,6 @@ from hand_eye_calib.results.document import (
 )
 from hand_eye_calib.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.results.verdict import shown, target_of
-from hand_eye_calib.session.rig import RigCalibration
 from hand_eye_calib.version import version_of
 
 MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
@@ -130,25 +127,6 @@ def render(
         figures=figures_of(calibration, evidence),
         shown_first=_SHOWN_FIRST,
         **_data(calibration, snapshot, evidence, inputs),
-    )
-
-
-def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
-    """The report of a rig as HTML: where its sensors are, and whether results for two sensors at a
-    time close; ``inputs`` are where the trajectories came from.
-    """
-    return page(
-        "rig.html",
-        TONES[rig.verdict.value],
-        rig.verdict.value,
-        "",
-        rig=rig,
-        inputs=inputs,
-        poses=[
-            printed_numbers(transforms_of(each)["T_parent_child"], (), "±")
-            for each in rig.calibrations
-        ],
-        figures=[figure_of_views(rig.calibrations)],
     )
 
 

@@ -13,6 +13,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from hand_eye_calib.assessment.comparison import with_comparison
 from hand_eye_calib.config import NodeConfig
 from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.geometry.frames import Extrinsic, FrameTree, checked_pose
@@ -24,7 +25,6 @@ from hand_eye_calib.live.state import Broadcast
 from hand_eye_calib.results.calibration import Calibration, Verdict
 from hand_eye_calib.results.records import AXES, ROTATIONS
 from hand_eye_calib.ros.conversions import LATCHED, LISTENING, quick, to_transform
-from hand_eye_calib.session.together import with_comparison
 from hand_eye_calib.text import axes_in_words
 
 TF, STATIC_TOPIC, DYNAMIC_TOPIC = "tf", "/tf_static", "/tf"

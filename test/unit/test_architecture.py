@@ -38,8 +38,8 @@ ENGINE["checks"] = ENGINE["alignment"] | {"results", "gls", "assessment", "align
 ENGINE["engine"] = {*ENGINE, "io"}
 ENGINE["session"] = set(ENGINE)
 ALLOWED = ENGINE | {
-    "io": GROUND | {"geometry", "results"},
-    "report": set(ENGINE),
+    "io": GROUND | {"geometry", "results", "engine"},
+    "report": {"cli", "io", *ENGINE},
     "simulation": GROUND | {"geometry", "io"},
     "offline": {"registry", "cli", "report", "io"},
     "online": {"registry", "cli"},

@@ -360,7 +360,7 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
         try:
             with PoseBag(path) as bag:
                 counts = {topic.name: topic.count for topic in bag.topics.values()}
-                found = sum(len(run.messages) for run in bag._runs([*counts]))
+                found = sum(len(run.messages) for run in bag.runs([*counts]))
                 assert found == sum(counts.values())
         except InputError as error:
             refused[path.name] = str(error)

@@ -30,8 +30,7 @@ from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags.messages import MessageReader
 from hand_eye_calib.io.bags.reader import PoseBag
 from hand_eye_calib.io.installed import open_installed
-from hand_eye_calib.io.journal import read_journal
-from hand_eye_calib.live.session import give
+from hand_eye_calib.io.journal import read_journal, replay_journal
 
 N = 200
 STAMPS_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(N)
@@ -337,6 +336,6 @@ def test_a_journal_keeps_the_world_of_a_stream(tmp_path):
             writer.add_pose(stream, stamp_ns, row[:3], row[3:])
     writer.close()
     engine = Calibrator(CalibratorConfig(child_invert="poses"))
-    give(read_journal(tmp_path), tmp_path, Calibrators(child=engine))
+    replay_journal(read_journal(tmp_path), tmp_path, Calibrators(child=engine))
     snapshot = engine.snapshot()
     assert (snapshot.parent_frame, snapshot.child_frame) == ("tool0", "camera")

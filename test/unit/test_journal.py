@@ -17,9 +17,9 @@ from hand_eye_calib.io.journal import (
     has_session,
     keep_aside,
     read_journal,
+    replay_journal,
 )
 from hand_eye_calib.live.journal import lock_directory
-from hand_eye_calib.live.session import give
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}
@@ -42,7 +42,7 @@ def record(writer, calibrator, sequence, flush_every=25):
 
 def resumed(directory, limits=None):
     calibrator, journal = Calibrator(CONFIG, limits), read_journal(directory)
-    give(journal, directory, Calibrators(child=calibrator))
+    replay_journal(journal, directory, Calibrators(child=calibrator))
     return calibrator, journal
 
 
@@ -180,7 +180,7 @@ def test_further_child_sensors_are_resumed_too(tmp_path):
             engines.add_pose(name, *pose)
     writer.close()
     again = Calibrators(child=Calibrator(CONFIG), child2=Calibrator(CONFIG))
-    give(read_journal(tmp_path), tmp_path, again)
+    replay_journal(read_journal(tmp_path), tmp_path, again)
     assert again["child2"].statistics("child").received == 60
     T = engines["child"].estimate().T_parent_child
     for each in again.values():

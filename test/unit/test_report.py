@@ -19,6 +19,7 @@ from matplotlib.lines import Line2D
 from result_making import NAMES, calibration, dofs
 
 import hand_eye_calib as hec
+from hand_eye_calib.assessment.comparison import with_comparison
 from hand_eye_calib.cli import main as cli
 from hand_eye_calib.cli.demo import DRIVE
 from hand_eye_calib.cli.reporting import write_report
@@ -30,7 +31,6 @@ from hand_eye_calib.report.figures import _VIEWS
 from hand_eye_calib.report.report import render
 from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.results.records import Finding, Severity
-from hand_eye_calib.session.together import with_comparison
 from hand_eye_calib.simulation.drive import simulate_drive
 from hand_eye_calib.simulation.options import REALISTIC
 from hand_eye_calib.text import amount, change, with_sigma

@@ -13,7 +13,7 @@ from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io.bags.writer import write_bag
 from hand_eye_calib.io.results import save_rig
-from hand_eye_calib.report.report import render_rig
+from hand_eye_calib.report.rig_page import render_rig
 from reproduction.rig import simulated, unequal
 
 

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -18,12 +18,11 @@ from hand_eye_calib.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.io.bags import messages, roles, sources
 from hand_eye_calib.io.bags.messages import PoseTable, Run
-from hand_eye_calib.io.bags.scans import ScanReading
 from hand_eye_calib.io.bags.sources import Reading, Source
 from hand_eye_calib.io.bags.storage import losses_of, open_bags
 from hand_eye_calib.io.files import LONGEST_NAME
-from hand_eye_calib.io.target_images import Target, camera_of, read_camera
 from hand_eye_calib.io.transforms import TfSource, TfStream
+from hand_eye_calib.registry import BAG_READINGS
 
 # A topic with fewer poses is not one of the two sensors: goals and initial poses are published
 # once.
@@ -101,7 +100,7 @@ class PoseBag:
     def _listing(self) -> str:
         return f"The bag has {', '.join(map(str, self.topics.values())) or 'no topics'}"
 
-    def _type_of(self, source: Source) -> str:
+    def type_of(self, source: Source) -> str:
         """Message type of a topic; empty for frames, and for what is not there."""
         return self.topics[source].type if source in self.topics else ""
 
@@ -112,7 +111,7 @@ class PoseBag:
         """Pairs of frames, ``parent:child``, in the first messages of a topic, if these are
         transforms. An InputError if they cannot be read.
         """
-        runs = self._runs([topic] if self.topics[topic].type in messages.TF_TYPES else [])
+        runs = self.runs([topic] if self.topics[topic].type in messages.TF_TYPES else [])
         first = next((run.transforms() for run in runs), ())
         return sorted({f"{each.world_frame}:{each.sensor_frame}" for _, each in first})
 
@@ -126,7 +125,7 @@ class PoseBag:
             if usual != "poses" and wanted not in ("auto", usual):
                 raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
             return usual if wanted == "auto" else wanted
-        return messages.measured_as(self._type_of(source), wanted, source)
+        return messages.measured_as(self.type_of(source), wanted, source)
 
     def check(self, source: Source) -> None:
         """Raise InputError, with the topics that are there, for a topic without poses, and for
@@ -144,7 +143,7 @@ class PoseBag:
         if len(parts) > 1:
             for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
                 self.measured(part, wanted)
-        elif not fields and (type_ := self._type_of(topic)) not in messages.MESSAGE_TYPES:
+        elif not fields and (type_ := self.type_of(topic)) not in messages.MESSAGE_TYPES:
             hint = "name its fields, TOPIC?t=header.stamp,x=..."
             if type_ in messages.TF_TYPES:
                 hint = "name two of its frames instead, as odom:lidar"
@@ -196,7 +195,7 @@ class PoseBag:
 
     def sensor_frame(self, topic: str) -> str:
         """Frame of the sensor of a topic of poses, as its first message names it; empty if none."""
-        run = next(self._runs([topic]), None)
+        run = next(self.runs([topic]), None)
         kind = self.topics[topic].type
         if run is None or kind not in messages.POSE_TYPES:
             return ""
@@ -236,7 +235,7 @@ class PoseBag:
         for reading in readings:
             reading.use_stamps((stamps or {}).get(reading.stream, "header"))
         topics = {topic for reading in readings for topic in reading.topics}
-        count, runs = sum(self.topics[topic].count for topic in topics), self._runs(topics)
+        count, runs = sum(self.topics[topic].count for topic in topics), self.runs(topics)
         for run in self.shown(runs, count, f"reading {self}", lambda run: len(run.messages)):
             for reading in readings:
                 if run.kind.topic in reading.topics:
@@ -252,8 +251,8 @@ class PoseBag:
             return sources.TransformReading(stream, of_tree, self._of_transforms())
         topic, _, fields = source.partition("?")
         if ":" in fields and "=" not in fields:
-            return self._images(stream, topic, fields)
-        type_ = self._type_of(topic)
+            return BAG_READINGS["images of a target"](self, stream, topic, fields)
+        type_ = self.type_of(topic)
         row = messages.MESSAGE_TYPES.get(type_)
         if fields := fields or (row.fields if row else ""):
             return sources.FieldReading(stream, topic, fields)
@@ -262,31 +261,12 @@ class PoseBag:
         if type_ == messages.PATH_TYPE:
             return sources.PathReading(stream, topic)
         if type_ == messages.POINTS_TYPE:
-            return ScanReading(stream, topic, self.paths[0], self.files)
+            return BAG_READINGS[type_](self, stream, topic, fields)
         fixes, turns = self._parts_of(topic)
         return sources.JoinedReading(
-            sources.TopicReading(stream, fixes, self._type_of(fixes), "positions"),
-            sources.TopicReading(stream, turns, self._type_of(turns), "rotations"),
+            sources.TopicReading(stream, fixes, self.type_of(fixes), "positions"),
+            sources.TopicReading(stream, turns, self.type_of(turns), "rotations"),
         )
-
-    def _images(self, stream: str, topic: str, text: str) -> Reading:
-        """Reads images of a target, with the intrinsics of a file or of the camera_info beside."""
-        name, _, file = text.partition("@")
-        target = Target.parse(name)
-        if (type_ := self._type_of(topic)) not in messages.IMAGE_TYPES:
-            raise InputError(f"{topic} is of type {type_}, which has no images of a target")
-        if file:
-            return sources.ImageReading(stream, topic, target, read_camera(file))
-        beside = (str(folder / "camera_info") for folder in PurePosixPath(topic).parents)
-        info = next((each for each in beside if each in self.topics), "")
-        run = next(self._runs([info]), None)
-        if run is None:
-            raise InputError(
-                f"no camera_info beside {topic} in {self}; name a file of the intrinsics: with "
-                f"--camera, or {topic}?{name}@FILE"
-            )
-        camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
-        return sources.ImageReading(stream, topic, target, camera)
 
     def trajectory(
         self, source: Source, measures: str = "auto", stamps: str = "header"
@@ -314,7 +294,7 @@ class PoseBag:
         one that is no pose is left out. An InputError if they form no tree or are damaged.
         """
         tree, notes = FrameTree("the bag's transforms"), {}
-        for run in self._runs(self._of_transforms()):
+        for run in self.runs(self._of_transforms()):
             is_fixed = run.kind.topic.endswith("tf_static")
             for _, (_, parent, frame, *values) in run.transforms():
                 try:
@@ -328,7 +308,7 @@ class PoseBag:
 
     # ---- messages
 
-    def _runs(self, topics: Collection[str]) -> Iterator[Run]:
+    def runs(self, topics: Collection[str]) -> Iterator[Run]:
         """Messages of some topics, many of a kind at once: in the order of bag time, or one file
         after the other if they were recorded at the same time.
         """

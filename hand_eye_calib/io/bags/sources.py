@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.errors import ConfigError, InputError, NoPoseError, located, printable
+from hand_eye_calib.errors import ConfigError, InputError, NoPoseError, printable
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import are_null
 from hand_eye_calib.io.bags import messages
-from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, grey_of
 from hand_eye_calib.io.trajectory_files.columns import TWIST
 from hand_eye_calib.io.trajectory_files.poses import poses_of
 from hand_eye_calib.io.trajectory_files.stamps import stamps_in_ns
@@ -236,31 +235,6 @@ class PathReading(Reading):
         self._note_null(int(is_null.sum()), len(poses))
         table = messages.PoseTable.of(stamps_ns, poses, frame).recorded(self.stream, stamps_ns)
         return self._stamped(table[~is_null])
-
-
-class ImageReading(Reading):
-    """Images of a target: the poses of the camera in the frame of the target."""
-
-    def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
-        super().__init__(stream, topic)
-        self._finder, self._frame = TargetFinder(target, camera), ""
-        self._stamps_ns, self._bag_ns = list[int](), list[int]()
-
-    def take(self, run: messages.Run) -> None:
-        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
-            with located(self.topics[0]):
-                is_seen = self._finder.look(grey_of(message))
-            if is_seen:
-                self._stamps_ns.append(messages.ns_of(message.header.stamp) or 0)
-                self._bag_ns.append(bag_ns)
-                self._frame = printable(frame_name(message.header.frame_id))
-
-    def table(self) -> messages.PoseTable:
-        found = self._finder.found()
-        self.notes.append(f"{self.topics[0]}: {found}")
-        poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
-        table = messages.PoseTable.of(self._stamps_ns, poses, "target", self._frame)
-        return self._stamped(table.recorded(self.stream, self._bag_ns))
 
 
 class FieldReading(Reading):

@@ -25,7 +25,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.errors import InputError, MissingDependencyError, required
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.files import LONGEST_NAME
+from hand_eye_calib.io.files import LONGEST_LINE, LONGEST_NAME
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
@@ -33,6 +33,7 @@ from hand_eye_calib.io.trajectory_files.columns import (
     ROTATION_VECTOR,
 )
 from hand_eye_calib.io.trajectory_files.dates import GPS_TIME
+from hand_eye_calib.io.trajectory_files.reading import FileOptions
 from hand_eye_calib.io.trajectory_files.table import Table, columns_of_array
 from hand_eye_calib.text import shortened
 
@@ -48,6 +49,21 @@ _NUMBERED = "the file has no times: the numbers of its {} are taken for seconds,
 _Rows = tuple[Sequence[str], Iterable[Sequence[Any]], Sequence[str]]
 # Of the bytes of a file, and the body of several that is meant.
 _Reader = Callable[[bytes, str | None], _Rows]
+
+
+def table_of_program(path: str | Path, data: bytes, options: FileOptions) -> Table | None:
+    """Rows of a file in one of the formats of :data:`PROGRAMS`; None for other files.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    head = data[:LONGEST_LINE].removeprefix(b"\xef\xbb\xbf").lstrip()
+    for pattern, read in PROGRAMS.items():
+        if re.search(pattern, head):
+            return foreign_table(path, data, read, options.columns, options.measures)
+    return None
 
 
 def foreign_table(

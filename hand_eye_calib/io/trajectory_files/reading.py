@@ -2,7 +2,6 @@
 (``foreign.py``), bags, and numbers in memory.
 """
 
-import re
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,7 +18,7 @@ from hand_eye_calib.arrays import IntArray
 from hand_eye_calib.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.errors import ConfigError, InputError
 from hand_eye_calib.geometry.trajectory import Trajectory, TrajectoryLike
-from hand_eye_calib.io.files import LONGEST_LINE, LONGEST_NAME, decoded, read_bytes, read_text
+from hand_eye_calib.io.files import LONGEST_NAME, decoded, read_bytes, read_text
 from hand_eye_calib.io.trajectory_files.columns import (
     MATRIX,
     POSITION,
@@ -28,7 +27,6 @@ from hand_eye_calib.io.trajectory_files.columns import (
     stamp_columns,
 )
 from hand_eye_calib.io.trajectory_files.dates import notes_on_stamps
-from hand_eye_calib.io.trajectory_files.foreign import PROGRAMS, foreign_table
 from hand_eye_calib.io.trajectory_files.layout import (
     STAMPED_POSE,
     TUM,
@@ -43,6 +41,7 @@ from hand_eye_calib.io.trajectory_files.stamps import (
     stamps_in_ns,
 )
 from hand_eye_calib.io.trajectory_files.table import Table, table_of_object
+from hand_eye_calib.registry import FILE_READERS
 from hand_eye_calib.text import MUCH_NULL, shortened, told_apart, without_poses
 
 #: The format that the lines look like.
@@ -344,10 +343,10 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     cannot be read, a line cannot be used, or columns have no names.
     """
     data = read_bytes(path)
-    head = data[:LONGEST_LINE].removeprefix(b"\xef\xbb\xbf").lstrip()
-    for pattern, read in PROGRAMS.items():
-        if re.search(pattern, head):
-            return foreign_table(path, data, read, options.columns, options.measures)
+    for read in FILE_READERS.values():
+        table: Table | None = read(path, data, options)
+        if table is not None:
+            return table
     text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
     needs_names = not options.columns and options.format in (AUTO, "csv")
     layout = layout_of(path, text, needs_names)
