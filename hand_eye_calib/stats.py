@@ -4,6 +4,8 @@ The quantiles of NumPy import ``numpy.ma`` in a tenth of the time of NumPy itsel
 distributions of SciPy take longer to import than a comparison: so both are here, in numbers.
 """
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -66,11 +68,53 @@ def robust_sigma(vectors: FloatArray) -> FloatArray:
     return medians(np.linalg.norm(vectors, axis=-1)) / MEDIAN_LENGTH
 
 
-def student_weights(squared: FloatArray) -> FloatArray:
-    """Weights of vectors of six values, with these squared lengths in standard deviations, as of
-    Student's t distribution: 1 on average, small for outliers.
+def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray:
+    """Weights of vectors of six values from Student's t distribution: 1 on average.
+
+    K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
+    distribution*, JASA 84, 1989, eq. 4.
+
+    Parameters
+    ----------
+    squared : (...) array
+        Squared Mahalanobis distance of each vector.
+    degrees : float
+        Degrees of freedom.
     """
-    return (STUDENT + 6.0) / (STUDENT + squared)
+    return (degrees + 6.0) / (degrees + squared)
+
+
+# Weights by kind, of squared residuals in units of the square at which they fall.
+_WEIGHTS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    # P. J. Huber, *Robust estimation of a location parameter*, Ann. Math. Statist. 35, 1964.
+    "huber": lambda squared: np.asarray(1.0 / np.maximum(np.sqrt(squared), 1.0)),
+    # P. W. Holland, R. E. Welsch, *Robust regression using iteratively reweighted least-squares*,
+    # Comm. Statist. A 6, 1977, table 1.
+    "cauchy": lambda squared: 1.0 / (1.0 + squared),
+    # S. Geman, D. E. McClure, *Statistical methods for tomographic image reconstruction*, Bulletin
+    # of the International Statistical Institute 52, 1987.
+    "geman_mcclure": lambda squared: 1.0 / (1.0 + squared) ** 2,
+    "student": student_weights,
+}
+
+
+def robust_weights(kind: str, squared: FloatArray) -> FloatArray:
+    """Weights of residuals for iteratively reweighted least squares.
+
+    Parameters
+    ----------
+    kind : {"huber", "cauchy", "geman_mcclure", "student"}
+        The first three are at most 1; ``student`` is 1 on average over vectors of six values.
+    squared : (...) array
+        Squared residuals in units of the square at which a weight falls: by half for ``cauchy``, to
+        a quarter for ``geman_mcclure``. ``huber`` begins to fall there.
+
+    Examples
+    --------
+    >>> robust_weights("cauchy", np.array([0.0, 1.0, 9.0])).tolist()
+    [1.0, 0.5, 0.1]
+    """
+    return _WEIGHTS[kind](squared)
 
 
 def chi_square_quantile(tail: float) -> float:

@@ -25,14 +25,14 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.solvers import all_pairs, quadratic_form
-from hand_eye_calib.stats import MEDIAN_LENGTH, median
+from hand_eye_calib.stats import MEDIAN_LENGTH, median, robust_weights
 
 # Starts: so many random subsets of each size, of so many pairs; and how many are refined.
 _SUBSETS, _SUBSET_SIZES, _MAX_RANKED_PAIRS, _REFINED_STARTS = 32, (12, 24, 48), 300, 3
 # Steps end below this share of a standard deviation in every direction that is determined.
 _MAX_STEPS, _STEP_TOLERANCE = 30, 1e-2
 
-# Geman-McClure: residuals of about this many standard deviations have half the weight.
+# Residuals of this many standard deviations have a quarter of the weight.
 _TUNING = 3.0
 
 # Blocks of time, for the jackknife and for a clock that drifts.
@@ -355,7 +355,7 @@ class _Problem:
             max(median(lengths[1]) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION),
         )
         squared = sum((length / sigma) ** 2 for length, sigma in zip(lengths, sigmas, strict=True))
-        root = 1.0 / (1.0 + squared / (6 * _TUNING**2))
+        root = np.sqrt(robust_weights("geman_mcclure", squared / (6 * _TUNING**2)))
         for part, sigma in zip(parts, sigmas, strict=True):
             part *= (root / sigma)[:, None, None]
         return parts, sigmas, root

@@ -148,7 +148,7 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
     for _ in range(_ROUNDS):
         squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)
-        weights = stats.student_weights(squared)
+        weights = stats.robust_weights("student", squared)
         scatter = (weights[:, None] * residuals).T @ residuals / len(residuals)
         covariance = scatter + np.diag(_LEAST_SIGMA**2)
     return covariance, weights

@@ -34,7 +34,7 @@ from hand_eye_calib.checks.streams import coarse
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3, trajectory
 from hand_eye_calib.pairing import motion_pairs
-from hand_eye_calib.stats import median, medians
+from hand_eye_calib.stats import median, medians, robust_weights
 
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
 # so many at most, and to see which mistake it is.
@@ -542,7 +542,8 @@ def _least(poses: FloatArray, order: int) -> tuple[float, float]:
     steps, chords = changes[:, :, 3], changes[:, :, :3]
     lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
     for _ in range(_ROUNDS):
-        roots = 1.0 / np.sqrt(np.maximum(lengths[-1], 0.01 * median(lengths[-1])))
+        least = 0.01 * median(lengths[-1])
+        roots = np.sqrt(robust_weights("huber", (lengths[-1] / least) ** 2))
         rows, target = (roots[:, None, None] * chords).reshape(-1, 3), roots[:, None] * steps
         point = np.linalg.lstsq(rows, target.ravel(), rcond=1e-6)[0]
         lengths.append(np.linalg.norm(steps - chords @ point, axis=1) + 1e-9)

@@ -12,7 +12,7 @@ from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between, pairs_over
 from hand_eye_calib.solvers.all_pairs import align_rotation_vectors
-from hand_eye_calib.stats import median, quantile
+from hand_eye_calib.stats import median, quantile, robust_weights
 from hand_eye_calib.text import angle, length
 
 # Orientations that are copies agree to this angle (rad), which is rounding to five digits, and to
@@ -216,7 +216,7 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
         R = se3.nearest_rotation(total)
         residuals = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
         usual = 2.0 * median(residuals[is_clear]) + 1e-12
-        weights = is_clear / (1.0 + (residuals / usual) ** 2)
+        weights = is_clear * robust_weights("cauchy", (residuals / usual) ** 2)
     return se3.nearest_rotation(np.concatenate([total[None], total - products]))
 
 
@@ -244,5 +244,6 @@ def _after_alignment(points: FloatArray, others: FloatArray) -> float:
         others_from_mean = others - np.average(others, axis=0, weights=weights)
         R = se3.nearest_rotation((weights[:, None] * from_mean).T @ others_from_mean)
         distances = np.linalg.norm(from_mean - others_from_mean @ R.T, axis=1)
-        weights = 1.0 / (1.0 + (distances / (2.0 * median(distances) + 1e-9)) ** 2)
+        usual_m = 2.0 * median(distances) + 1e-9
+        weights = robust_weights("cauchy", (distances / usual_m) ** 2)
     return median(distances)

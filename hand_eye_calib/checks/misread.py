@@ -17,6 +17,7 @@ from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.trajectory import Trajectory
 from hand_eye_calib.pairing.motion_pairs import PosePairs
+from hand_eye_calib.stats import robust_weights
 
 # Motions between two poses turn by less than this (rad); a sensor with such poses hardly moves.
 _MOST_TURN_RAD = 1.0
@@ -170,7 +171,7 @@ def _fitted_turn(streams: StreamPair, lag_s: float) -> FloatArray:
         weighted = (roots[:, :, None] * rows).reshape(-1, 12)
         unknowns = np.linalg.lstsq(weighted, (roots * target).ravel(), rcond=1e-9)[0]
         residuals = np.linalg.norm(rows @ unknowns - target, axis=1)
-        weights = 1.0 / np.maximum(residuals, _LEAST_RESIDUAL_M)
+        weights = robust_weights("huber", (residuals / _LEAST_RESIDUAL_M) ** 2)
     return se3.nearest_rotation(unknowns[:9].reshape(3, 3))
 
 

@@ -27,13 +27,13 @@ from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import BLOCKS
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
-from hand_eye_calib.stats import median, robust_sigma
+from hand_eye_calib.stats import median, robust_sigma, robust_weights
 
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
 _STEP_S, TOLERANCE = 0.05, 0.3
 
-# Geman-McClure: residuals of about this many standard deviations have half the weight.
+# Residuals of this many standard deviations have a quarter of the weight.
 _TUNING, _ROUNDS = 3.0, 4
 
 # Scales by axis stand in place of the scale.
@@ -66,7 +66,8 @@ class Regression:
             left = (known[:, -1] - known[:, :-1] @ values).reshape(n_rows, size)
             lengths = np.sqrt((left**2).sum(axis=1))
             self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
-            weights = 1.0 / (1.0 + (lengths / self._sigma) ** 2 / (size * _TUNING**2)) ** 2
+            squared = (lengths / self._sigma) ** 2 / (size * _TUNING**2)
+            weights = robust_weights("geman_mcclure", squared)
         self._weight = float(weights.sum())
         weighted = rows * weights[:, None, None]
         self._squares = flat.T @ weighted.reshape(flat.shape)

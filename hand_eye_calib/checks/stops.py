@@ -18,7 +18,7 @@ from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.checks.findings import CONVENTIONS, Finding, Severity, conventions, finding
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.solvers.robot_world import closest_rotations
-from hand_eye_calib.stats import median, medians
+from hand_eye_calib.stats import median, medians, robust_weights
 
 # Fewest stops that can contradict: four have twelve coordinates for seven unknown lengths.
 _FEWEST = 6
@@ -500,7 +500,7 @@ def rough_fit(given: GivenStops, mistakes: Mistakes) -> RoughFit:
     for _ in range(_ROUNDS):
         X, Z = closest_rotations(A[:, :3, :3], B[:, :3, :3], weights)
         left = se3.rotation_angle(np.swapaxes(Z @ B[:, :3, :3], 1, 2) @ A[:, :3, :3] @ X)
-        weights = 1.0 / (1.0 + (left / max(median(left), 1e-12)) ** 2)
+        weights = robust_weights("cauchy", (left / max(median(left), 1e-12)) ** 2)
     spread = max(median(_upper(angles_between(A))), median(_upper(angles_between(B))))
     # Rotations of a few degrees are not judged: noise may be as large.
     turning = median(left) / max(spread, _ROTATES)
@@ -545,7 +545,7 @@ def _least(rows: FloatArray, positions: FloatArray) -> tuple[float, FloatArray]:
         target = -(roots[:, None] * positions).ravel()
         values = np.linalg.lstsq(scaled, target, rcond=1e-9)[0]
         lengths = np.linalg.norm(rows @ values + positions, axis=1)
-        weights = 1.0 / (1.0 + (lengths / max(median(lengths), 1e-12)) ** 2)
+        weights = robust_weights("cauchy", (lengths / max(median(lengths), 1e-12)) ** 2)
     return median(lengths), np.asarray(values, dtype=float)
 
 

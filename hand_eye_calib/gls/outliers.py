@@ -19,7 +19,14 @@ from hand_eye_calib.gls.normal import transposed
 from hand_eye_calib.gls.reml import walk_covariance
 from hand_eye_calib.gls.state_space import WHITE, Posterior, combined
 from hand_eye_calib.gls.tuning import TUNING
-from hand_eye_calib.stats import CHI2, MEDIAN_LENGTH, STUDENT, chi_square_quantile, median
+from hand_eye_calib.stats import (
+    CHI2,
+    MEDIAN_LENGTH,
+    STUDENT,
+    chi_square_quantile,
+    median,
+    robust_weights,
+)
 
 
 @dataclass(frozen=True)
@@ -179,4 +186,4 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     ]
     best = int(np.argmin(losses))
     level = levels[best if losses[best] < losses[0] - TUNING.least_gain_of_widths else 0]
-    return np.asarray((STUDENT + 6.0) / (STUDENT * level + expected))
+    return robust_weights("student", expected / level) / level

@@ -42,6 +42,7 @@ from hand_eye_calib.gls.stages import known_products, rough_levels, sample
 from hand_eye_calib.gls.state_space import Posterior, StateSpace
 from hand_eye_calib.gls.tuning import TUNING
 from hand_eye_calib.results.records import Noise
+from hand_eye_calib.stats import robust_weights
 from hand_eye_calib.text import angle, length
 
 # A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
@@ -395,7 +396,7 @@ def _start(
             scale = float(np.median(shares))
         residuals = scale * rotated - path
         errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
-        weights = 1.0 / (1.0 + (errors / (np.median(errors) + 1e-12)) ** 2)
+        weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
         pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
         before = lever_arm
         lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)

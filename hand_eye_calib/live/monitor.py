@@ -32,7 +32,7 @@ from hand_eye_calib.live.session import LiveSession
 from hand_eye_calib.live.state import Level, MountState, by_axis
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.results.records import AXES
-from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, student_weights
+from hand_eye_calib.stats import NINE_TIMES_OUT_OF_TEN, robust_weights
 from hand_eye_calib.text import axes_in_words
 
 
@@ -345,7 +345,7 @@ def _information(
     precision = np.linalg.inv(noise)
     centred = residuals if shift is None else residuals + jacobians @ shift
     squared = np.einsum("ki,ki->k", centred @ precision, centred)
-    weights = student_weights(squared)
+    weights = robust_weights("student", squared)
     whitened = np.swapaxes(jacobians, 1, 2) @ precision * weights[:, None, None]
     H = (whitened @ jacobians).sum(axis=0)
     S = -np.einsum("kij,kj->i", whitened, residuals)

@@ -14,6 +14,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
+from hand_eye_calib.stats import student_weights
 
 # A rotation about an axis needs two motions, that is three stops.
 MIN_STOPS = 3
@@ -437,7 +438,7 @@ def _fit(
         means = in_the_end / weights.sum() * (weights @ squared) / n_free
         variances = _variances(means, stops, n_values)
         distance = squared @ (1.0 / variances)
-        weights = alone * (tails + 6.0) / (tails + distance)
+        weights = alone * student_weights(distance, tails)
         scale = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
         rows = scale[..., None] * np.concatenate([jacobian, errors[..., None]], axis=2)
         products = _products(rows, pairs, n_values)

@@ -27,6 +27,27 @@ def test_the_numbers_are_those_of_scipy():
         assert {dof: pytest.approx(chi2.isf(tail, dof), abs=1e-2) for dof in table} == table
 
 
+@pytest.mark.parametrize(
+    ("kind", "loss"),
+    [
+        ("huber", lambda length: length**2 / 2 if length < 1 else length - 0.5),
+        ("cauchy", lambda length: np.log1p(length**2) / 2),
+        ("geman_mcclure", lambda length: length**2 / (1 + length**2) / 2),
+        ("student", lambda length: 5 * np.log1p(length**2 / 4)),
+    ],
+)
+def test_a_weight_is_the_slope_of_its_loss_over_the_residual(kind, loss):
+    lengths, step = np.array([0.1, 0.5, 0.9, 1.1, 3.0, 20.0]), 1e-6
+    slopes = [(loss(length + step) - loss(length - step)) / (2 * step) for length in lengths]
+    assert stats.robust_weights(kind, lengths**2) == pytest.approx(slopes / lengths, rel=1e-6)
+
+
+def test_student_weights_of_many_degrees_of_freedom_are_those_of_normal_errors():
+    squared = np.array([0.0, 6.0, 60.0])
+    assert stats.student_weights(squared, 1e9) == pytest.approx(np.ones(3), rel=1e-6)
+    assert stats.student_weights(squared, 12.0) == pytest.approx([1.5, 1.0, 0.25])
+
+
 @pytest.mark.parametrize("tail", [1e-30, 1e-9, 1e-3, 0.05, 0.5, 0.99])
 def test_the_quantile_of_chi_square_is_that_of_scipy(tail):
     assert stats.chi_square_quantile(tail) == pytest.approx(chi2.isf(tail, 6), rel=1e-12)
