@@ -52,8 +52,38 @@ class Command(NamedTuple):
     load: Callable[[], Any]
 
 
+class Route(NamedTuple):
+    """A way of ``calibrate`` for other data than two streams.
+
+    Attributes
+    ----------
+    add_arguments : callable
+        Declare the arguments of the route on a parser.
+    takes : callable
+        Return whether parsed arguments ask for the route.
+    run : callable
+        Calibrate; called with the arguments and what puts URLs back into plain values. Return the
+        exit code.
+    """
+
+    add_arguments: Callable[[Any], None]
+    takes: Callable[[Any], bool]
+    run: Callable[[Any, Callable[[Any], Any]], int]
+
+
 #: Commands of the command line, in the order of its help.
 COMMANDS: Registry[Command] = Registry("command")
+
+#: Ways of ``calibrate`` for other data than two streams; the first that takes the arguments counts.
+ROUTES: Registry[Route] = Registry("way to calibrate")
+
+#: How several recordings of one rig become one result. Called with the arguments and the bags of
+#: each recording; returns the exit code.
+SEVERAL_RECORDINGS: Registry[Callable[..., int]] = Registry("way to join recordings")
+
+#: Monitors of the mount. Called with the session, what is installed, why that is unknown, and the
+#: log.
+MOUNT_MONITORS: Registry[Callable[..., Any]] = Registry("monitor of the mount")
 
 #: Methods of a result that take a layer above the core: save, plot, report, export.
 RESULT_METHODS: Registry[Callable[..., Any]] = Registry("method of a result")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from hand_eye_calib.cli import options
 from hand_eye_calib.cli.options import note, print_result, waiting_for
 from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.registry import ROUTES, SEVERAL_RECORDINGS
 
 if TYPE_CHECKING:
     from hand_eye_calib.io.remote import AsGiven
@@ -32,8 +33,6 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
-# Files of an arm's samples.
-_SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 # Of the table of topics.
 _ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
@@ -50,18 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "recording; or the journal of a node's session, or the output directory that holds it",
     )
     add = parser.add_argument
-    topics = (
-        "poses of three sensors or more, or frames as odom:lidar: all are solved together, in the "
-        "frame of the first"
-    )
-    add("--topics", metavar="TOPIC", nargs="+", help=topics)
     listing = "show the bag's topics with types, counts, rates and frames, and exit"
     add("--list", action="store_true", help=listing)
-    order = (
-        "none: the poses of two files are stops without an order, paired by their rows. So are the "
-        "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
-    )
-    add("--order", choices=("time", "none"), default="time", help=order)
     options.add_config_arguments(parser)
     group = parser.add_argument_group("output")
     out = (
@@ -79,7 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
     )
     options.add_json_argument(group, or_verbose=True)
-    _add_rare(parser)
+    for route in ROUTES.values():
+        route.add_arguments(parser)
+    _add_installed(parser)
 
 
 @options.argument_type
@@ -90,32 +81,7 @@ def _label(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _add_rare(parser: argparse.ArgumentParser) -> None:
-    """Declare what is about images of a target, many recordings, and what is installed."""
-    add = parser.add_argument_group("images of a target").add_argument
-    target = (
-        "what the images of --child-topic show, or those of a folder, the second PATH, one for "
-        "each pose of a hand: such as "
-        "charuco:5x7:0.04:0.03:4X4_50 (squares, side of a square and of a marker in m, markers) or "
-        "aprilgrid:6x6:0.088:0.0264 (tags, side of a tag, gap)"
-    )
-    add("--target", metavar="TARGET", help=target)
-    camera = "intrinsics: YAML of camera_info, Kalibr or OpenCV; a bag may have its own camera_info"
-    add("--camera", metavar="FILE", type=Path, help=camera)
-    add = parser.add_argument_group("many recordings").add_argument
-    batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
-    add("--batch", metavar="BAG", nargs="+", help=batch)
-    vehicle = (
-        "the vehicle's name, or its place in the paths of --batch, such as 'fleet/{vehicle}/*': "
-        "recordings of one vehicle are put together"
-    )
-    add("--vehicle", metavar="PATTERN", help=vehicle)
-    no_report = "no page for each recording: they take most time"
-    add("--no-report", action="store_true", help=no_report)
-    jobs = "number of worker processes. Default: one for each core"
-    add("--jobs", metavar="N", type=options.at_least(1), help=jobs)
-    dask = "use a Dask cluster instead: address of its scheduler, tcp://..."
-    add("--dask", metavar="ADDRESS", help=dask)
+def _add_installed(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("what is installed").add_argument
     installed = (
         "compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
@@ -131,25 +97,14 @@ def _add_rare(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
-    if not (arguments.paths or arguments.batch):
+    is_batch = bool(getattr(arguments, "batch", None))
+    if not (arguments.paths or is_batch):
         print(f"{arguments.parser.format_usage()}\n{EXAMPLES}", file=sys.stderr)
         return 2
-    if arguments.batch and (arguments.paths or arguments.list):
+    if is_batch and (arguments.paths or arguments.list):
         raise ConfigError("--batch cannot be combined with PATH or --list")
-    if not arguments.batch and (arguments.dask or arguments.vehicle):
-        raise ConfigError("--dask and --vehicle are for --batch")
-    if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
-        raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
-    never = ("parent_topic", "child_topic", "batch", "list")
-    others = [name for name in never if getattr(arguments, name)]
-    if arguments.topics and others:
-        raise ConfigError(f"--topics and --{others[0].replace('_', '-')} do not go together")
-    if arguments.batch:
-        from hand_eye_calib.cli.batch.run import run_batch
-
-        return run_batch(arguments)
     if any("*" in str(path) for path in arguments.paths):
-        from hand_eye_calib.cli.batch.work import matching
+        from hand_eye_calib.io.bags.patterns import matching
 
         arguments.paths = [
             type(path)(found) for path in arguments.paths for found in matching(str(path))
@@ -164,24 +119,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     """Calibrate from files here; ``as_given`` puts URLs back into texts. Returns the exit code."""
+    routes = [route for route in ROUTES.values() if route.takes(arguments)]  # or it raises
     if arguments.list:
         return _list_topics(arguments, as_given)
+    if routes:
+        return routes[0].run(arguments, as_given)
     from hand_eye_calib.cli import reading
     from hand_eye_calib.cli.present import deliver
 
     paths = arguments.paths
-    are_images = arguments.target and not arguments.child_topic
-    are_samples = len(paths) == 1 and paths[0].suffix in _SAMPLES
-    if are_samples or are_images or arguments.order == "none":
-        from hand_eye_calib.cli import stops
-
-        options.refuse_stamps(arguments)
-        return deliver(*stops.solved(arguments), arguments)
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
-    if arguments.topics or (len(paths) > 2 and not are_bags):
-        from hand_eye_calib.cli.rig import calibrate_rig
-
-        return calibrate_rig(arguments, as_given)
     given = options.options_from(arguments)
     if not are_bags:
         options.refuse_stamps(arguments)
@@ -192,10 +139,8 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         try:
             recording = bags.read_recording(paths, options.sources_from(arguments), given)
         except bags.SeveralRecordingsError as several:
-            from hand_eye_calib.cli.batch.run import run_together
-
             note(f"{several.reason}; they give one result, as recordings of one rig")
-            return run_together(arguments, several.groups)
+            return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
     bag = paths[0] if are_bags else None

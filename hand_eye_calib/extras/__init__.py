@@ -4,7 +4,9 @@ from importlib import import_module
 
 EXTRAS = (
     "fleet",  # several recordings: compared, together, in batches
+    "mount",  # the monitor of the mount
     "partial",  # streams of positions, rotations or angular rates alone
+    "stops",  # poses that are stops, such as the samples of an arm
     "rig",  # three sensors or more
     "sensors",  # lidar scans, images of a target, files of other programs
     "simulation",  # drives with known truth, and the demo

@@ -27,10 +27,10 @@ from hand_eye_calib.live.cycle import SolveCycle, pause_of, priors_of
 from hand_eye_calib.live.input import PoseInput
 from hand_eye_calib.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.live.log import GOES_ON_S, NodeLog
-from hand_eye_calib.live.monitor import LIMITS, MountWatch
 from hand_eye_calib.live.saving import Saver
 from hand_eye_calib.live.session import LiveSession, output_path
 from hand_eye_calib.live.state import REPORT_PERIOD_S, NodeState
+from hand_eye_calib.registry import MOUNT_MONITORS
 from hand_eye_calib.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.ros.outputs import PROGRESS_TOPIC, ResultTopics, StateTopics
 from hand_eye_calib.ros.parameters import Parameters
@@ -138,10 +138,10 @@ class CalibratorNode(Node):
         ]
         self._log.info("; ".join(filter(None, told)))
 
-    def _watch_mount(self) -> MountWatch:
+    def _watch_mount(self) -> Any:
         robot = self._robot
-        self._session.watch_only(LIMITS)
-        return MountWatch(self._session, robot.installed, lambda: robot.problem, self._log)
+        watch = MOUNT_MONITORS["installed"]
+        return watch(self._session, robot.installed, lambda: robot.problem, self._log)
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
         options = self._options.node

@@ -25,10 +25,11 @@ from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wanderin
 from hand_eye_calib.cli.batch import run as batch_run
 from hand_eye_calib.cli.batch import work as batch_work
 from hand_eye_calib.cli.batch.run import write_rows
-from hand_eye_calib.cli.batch.work import Outcome, Task, matching, outcomes, tasks_of, work
+from hand_eye_calib.cli.batch.work import Outcome, Task, outcomes, tasks_of, work
 from hand_eye_calib.errors import ConfigError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.io import remote
+from hand_eye_calib.io.bags.patterns import matching
 from hand_eye_calib.io.bags.writer import write_bag
 from hand_eye_calib.io.results import load_result
 from hand_eye_calib.session.together import together

@@ -14,11 +14,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hand_eye_calib.cli.batch import work
-from hand_eye_calib.cli.batch.work import Outcome, Row, Task, matching, outcomes, tasks_of
+from hand_eye_calib.cli.batch.work import Outcome, Row, Task, outcomes, tasks_of
 from hand_eye_calib.cli.options import note, options_from, sources_from, waiting_for, with_progress
 from hand_eye_calib.cli.present import deliver, wrapped
 from hand_eye_calib.cli.reporting import REPORT
 from hand_eye_calib.errors import InputError
+from hand_eye_calib.io.bags.patterns import matching
 from hand_eye_calib.io.results import save_result, save_text
 from hand_eye_calib.plain import json_text
 from hand_eye_calib.results.calibration import Calibration, Verdict

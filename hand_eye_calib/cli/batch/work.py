@@ -16,7 +16,6 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from glob import glob, has_magic
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ from typing import Any, NamedTuple
 from hand_eye_calib.cli.bags import read_recording
 from hand_eye_calib.cli.options import STREAMS
 from hand_eye_calib.cli.present import exit_code
-from hand_eye_calib.errors import ConfigError, HandEyeCalibError, InputError, required
+from hand_eye_calib.errors import HandEyeCalibError, InputError, required
 from hand_eye_calib.io import remote
 from hand_eye_calib.io.files import limit_memory
 from hand_eye_calib.option import Options
@@ -35,7 +34,6 @@ from hand_eye_calib.session.together import row_of_result
 from hand_eye_calib.text import told_apart
 
 STATE, TABLE, INDEX, VEHICLES = "batch.jsonl", "rows.csv", "index.html", "vehicles"
-_BAGS = (".bag", ".mcap", ".db3")
 
 Row = Document
 
@@ -110,38 +108,6 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
 def _without_suffix(path: Path) -> Path:
     """Return a path without the last suffix; the root of the file system has no name."""
     return path.with_suffix("") if path.name else path
-
-
-def matching(pattern: str) -> list[str]:
-    """The bags that a pattern stands for, or a ConfigError; a bag stands for itself, another folder
-    for all bags below it. ``**`` finds bags alone.
-    """
-    found = [pattern]
-    if not remote.is_url(pattern) and _is_folder_of_bags(Path(pattern)):
-        pattern = str(Path(pattern) / "**")
-    if remote.is_url(pattern):  # a question mark begins its query
-        found = remote.expanded(pattern) if "*" in pattern else found
-    elif has_magic(pattern) and not Path(pattern).exists():
-        found = sorted(glob(pattern, recursive=True))
-        if "**" in pattern:
-            found = [each for each in found if _is_recording(Path(each))]
-    if not found:
-        raise ConfigError(f"no bag matches {pattern}")
-    return found
-
-
-def _is_folder_of_bags(path: Path) -> bool:
-    """Whether a path is a folder that is no bag itself."""
-    return path.is_dir() and not any(
-        file.name == "metadata.yaml" or file.suffix in _BAGS for file in path.iterdir()
-    )
-
-
-def _is_recording(path: Path) -> bool:
-    """Whether a path is a bag, and not a file of one."""
-    if path.is_dir():
-        return (path / "metadata.yaml").exists()
-    return path.suffix in _BAGS and not (path.parent / "metadata.yaml").exists()
 
 
 # ------------------------------------------------------------------ one recording

@@ -2,17 +2,57 @@
 
 from typing import Any
 
-from hand_eye_calib.registry import COMMANDS, Command
+from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.registry import COMMANDS, ROUTES, SEVERAL_RECORDINGS, Command, Route
 
 
 def register() -> None:
-    """Register the command ``compare``."""
+    """Register the command ``compare``, and batches and recordings of one rig for ``calibrate``."""
     COMMANDS["compare"] = Command(
         "compare results with what is installed, or with each other", _compare
     )
+    ROUTES["batch"] = Route(_add_arguments, _is_batch, _run_batch)
+    SEVERAL_RECORDINGS["one rig"] = _run_together
 
 
 def _compare() -> Any:
     from hand_eye_calib.cli import compare
 
     return compare
+
+
+def _add_arguments(parser: Any) -> None:
+    from hand_eye_calib.cli.options import at_least
+
+    add = parser.add_argument_group("many recordings").add_argument
+    batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
+    add("--batch", metavar="BAG", nargs="+", help=batch)
+    vehicle = (
+        "the vehicle's name, or its place in the paths of --batch, such as 'fleet/{vehicle}/*': "
+        "recordings of one vehicle are put together"
+    )
+    add("--vehicle", metavar="PATTERN", help=vehicle)
+    no_report = "no page for each recording: they take most time"
+    add("--no-report", action="store_true", help=no_report)
+    jobs = "number of worker processes. Default: one for each core"
+    add("--jobs", metavar="N", type=at_least(1), help=jobs)
+    dask = "use a Dask cluster instead: address of its scheduler, tcp://..."
+    add("--dask", metavar="ADDRESS", help=dask)
+
+
+def _is_batch(arguments: Any) -> bool:
+    if not arguments.batch and (arguments.dask or arguments.vehicle):
+        raise ConfigError("--dask and --vehicle are for --batch")
+    return bool(arguments.batch)
+
+
+def _run_batch(arguments: Any, _: Any) -> int:
+    from hand_eye_calib.cli.batch.run import run_batch
+
+    return run_batch(arguments)
+
+
+def _run_together(arguments: Any, groups: Any) -> int:
+    from hand_eye_calib.cli.batch.run import run_together
+
+    return run_together(arguments, groups)

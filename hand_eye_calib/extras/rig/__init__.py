@@ -3,11 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.registry import SESSION_PAGES
+from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.registry import ROUTES, SESSION_PAGES, Route
 
 
 def register() -> None:
-    """Register the pages of a session with further sensors."""
+    """Register rigs for ``calibrate``, and the pages of a session with further sensors."""
+    ROUTES["rig"] = Route(_add_arguments, _is_rig, _calibrate_rig)
     SESSION_PAGES["rig"] = _session_rig
 
 
@@ -16,3 +18,31 @@ def _session_rig(directory: Path, session: Any) -> None:
         from hand_eye_calib.report.rig_page import write_session_rig
 
         write_session_rig(directory, session)
+
+
+def _add_arguments(parser: Any) -> None:
+    topics = (
+        "poses of three sensors or more, or frames as odom:lidar: all are solved together, in the "
+        "frame of the first"
+    )
+    parser.add_argument("--topics", metavar="TOPIC", nargs="+", help=topics)
+
+
+def _is_rig(arguments: Any) -> bool:
+    if arguments.topics:
+        for name in ("parent_topic", "child_topic", "batch", "list"):
+            if getattr(arguments, name, None):
+                flag = name.replace("_", "-")
+                raise ConfigError(f"--topics and --{flag} do not go together")
+        return True
+    if len(arguments.paths) < 3 or arguments.command == "replay":
+        return False
+    from hand_eye_calib.cli.reading import are_bags
+
+    return not are_bags(arguments.paths)
+
+
+def _calibrate_rig(arguments: Any, as_given: Any) -> int:
+    from hand_eye_calib.cli.rig import calibrate_rig
+
+    return calibrate_rig(arguments, as_given)

@@ -1,0 +1,50 @@
+"""Poses that are stops: the samples of an arm, rows of two files, a hand and images of a target."""
+
+from pathlib import Path
+from typing import Any
+
+from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.registry import ROUTES, Route
+
+# Files of an arm's samples.
+_SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
+
+
+def register() -> None:
+    """Register stops for ``calibrate``."""
+    ROUTES["stops"] = Route(_add_arguments, _are_stops, _calibrate)
+
+
+def _add_arguments(parser: Any) -> None:
+    order = (
+        "none: the poses of two files are stops without an order, paired by their rows. So are the "
+        "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
+    )
+    parser.add_argument("--order", choices=("time", "none"), default="time", help=order)
+    add = parser.add_argument_group("images of a target").add_argument
+    target = (
+        "what the images of --child-topic show, or those of a folder, the second PATH, one for "
+        "each pose of a hand: such as "
+        "charuco:5x7:0.04:0.03:4X4_50 (squares, side of a square and of a marker in m, markers) or "
+        "aprilgrid:6x6:0.088:0.0264 (tags, side of a tag, gap)"
+    )
+    add("--target", metavar="TARGET", help=target)
+    camera = "intrinsics: YAML of camera_info, Kalibr or OpenCV; a bag may have its own camera_info"
+    add("--camera", metavar="FILE", type=Path, help=camera)
+
+
+def _are_stops(arguments: Any) -> bool:
+    if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
+        raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
+    are_images = arguments.target and not arguments.child_topic
+    are_samples = len(arguments.paths) == 1 and arguments.paths[0].suffix in _SAMPLES
+    return bool(are_samples or are_images or arguments.order == "none")
+
+
+def _calibrate(arguments: Any, _: Any) -> int:
+    from hand_eye_calib.cli import stops
+    from hand_eye_calib.cli.options import refuse_stamps
+    from hand_eye_calib.cli.present import deliver
+
+    refuse_stamps(arguments)
+    return deliver(*stops.solved(arguments), arguments)
