@@ -52,6 +52,9 @@ UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
 # A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
 _UNIT_NEAR = 0.05
 
+# Standard deviations of a lever arm that are taken off to get its least length.
+_LEVER_ARM_SIGMAS = 3.0
+
 # Code of positions that are rounded, which is a matter of the unit of length.
 _ROUNDED = "coarse_positions"
 
@@ -170,15 +173,24 @@ def _check_explained(
     """Check streams that a hypothesis explains: ``streams`` have the known time offset, and
     ``findings`` were found before.
     """
-    are_read_well = not any(found.makes_unusable for found in findings if found.code != _ROUNDED)
-    lengths = check_lengths(given.parent) if are_read_well else []
     right = explanation.hypothesis.undo(streams)
     offset = _fine_offset(right, at, explanation.fit)
     right = right.shifted(offset.seconds)
     sizes, fit = _check_sizes(right, explanation, offset.fit, about.scale)
-    findings = _in_metres(findings, [*lengths, *sizes], about.scale)
+    lengths = check_lengths(
+        right.parent, right.child, least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
+    )
     # Whether both are inverse is not decided yet: streams as they are may be right.
     of_reading = explanation.findings if explanation.may_be_upright else ()
+    readings = explanation.readings
+    if of_reading and lengths:
+        # Of one reading, the distance of the sensors is that of the worlds.
+        lengths = check_lengths(streams.parent, streams.child)
+    if readings and lengths:
+        # Neither noise nor shape tells which reading is right before the unit is known.
+        readings = None
+        findings = [found for found in findings if found not in of_reading]
+    findings = _in_metres(findings, [*lengths, *sizes], about.scale)
     is_sound = not any(found.makes_unusable for found in findings if found not in of_reading)
     findings += [*lengths, *check_offset(offset, about.time_offset_s), *sizes]
     if is_sound and not lengths:
@@ -189,7 +201,20 @@ def _check_explained(
         offset_s = about.time_offset_s + offset.seconds
         is_one_axis = any(found.code == "one_axis" for found in sizes)
         findings += _check_agreeing(right, given, fit, about, offset_s, is_one_axis)
-    return CheckResult(gravest_first(findings), explanation.fit, offset, explanation.readings)
+    return CheckResult(gravest_first(findings), explanation.fit, offset, readings)
+
+
+def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
+    """Return the length (m) that a lever arm has at least, within its uncertainty.
+
+    Parameters
+    ----------
+    T_parent_child : (4, 4) array
+    sigmas : (3,) array
+        Standard deviations of its translation, m.
+    """
+    sizes = np.abs(T_parent_child[:3, 3]) - _LEVER_ARM_SIGMAS * sigmas
+    return float(np.linalg.norm(np.clip(np.nan_to_num(sizes, neginf=0.0), 0.0, None)))
 
 
 def _in_metres(
@@ -366,9 +391,12 @@ def _check_agreeing(
     return independence.check_fusion(pose_pairs, best[0], is_one_axis)
 
 
-def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list[Finding]:
+def check_parts(
+    parent: Trajectory, child: Trajectory, max_gap_s: float, lever_arm_m: float = 0.0
+) -> list[Finding]:
     """Check two streams on one clock, at least one of which has only positions, rotations or rates.
-    These findings are about each stream by itself and need no solve.
+    These findings are about each stream by itself and need no solve. ``lever_arm_m`` is the least
+    distance of the sensors, if a solve has shown it.
     """
     if not (parent.has_positions and child.has_positions):
         parent, child = parent.scaled(0.0), child.scaled(0.0)
@@ -377,7 +405,8 @@ def check_parts(parent: Trajectory, child: Trajectory, max_gap_s: float) -> list
     # Rounded positions stay the same while the sensor moves.
     if any(each.makes_unusable or each.code == _ROUNDED for each in findings):
         return findings
-    return [*findings, *check_lengths(parent), *check_frozen(parent, child)]
+    lengths = check_lengths(parent, child, lever_arm_m)
+    return [*findings, *lengths, *check_frozen(parent, child)]
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:

@@ -70,12 +70,11 @@ _ROWS = {
         "odometry in 2D, such as that of wheels",
     ),
     "lengths": _Row(
-        "the parent moves at {speed_m_s:.0f} m/s and changes its velocity by "
-        "{acceleration_m_s2:.0f} m/s within a second, which no vehicle does: its lengths are "
-        "probably not in metres",
-        "give the lengths of both streams in metres, those of a file also by the unit in its "
-        "header, such as x_mm; if they are millimetres, solve with",
-        "such as lengths in millimetres",
+        "{whose} lengths seem to be in {unit}: in metres the parent would move at "
+        "{speed_m_s:.0f} m/s and change its velocity by {acceleration_m_s2:.0f} m/s within a "
+        "second{beside}, which no vehicle does",
+        "give all lengths in metres, those of a file also by the unit in its header, such as "
+        "x_mm; {condition}solve with",
     ),
     # ------------------------------------------------------------------ of both together
     "unrelated": _Row(

@@ -58,6 +58,11 @@ _MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
 # gravity in a tenth of all seconds (m/s^2). Recordings have 6 at most; arms, which move least, 0.1,
 # and so exceed that in millimetres; what hand-held sensors have exceeds it in centimetres.
 _FASTEST, _HARDEST = 340.0, 49.0
+# A sensor more than 3 m from the other is on a car or a larger machine. Tyres and rails hold about
+# 8 m/s^2; simulated cars change their velocity by up to 7.2 m/s within a second.
+_LONG_LEVER_M, _HARDEST_OF_LARGE = 3.0, 9.8
+# Usual changes of velocity within a second (m/s): cars have the largest, arms the smallest, 0.1.
+_MOST_USUAL, _LEAST_USUAL = 8.0, 0.1
 # Slowest usual speed (m/s) of a sensor while it is calibrated. Arms have 0.05.
 _SLOWEST = 0.01
 
@@ -238,22 +243,60 @@ def _exceeds(away: FloatArray, least: float) -> bool:
     return largest > max(least, _MOVES_NOISES * noise)
 
 
-def check_lengths(parent: Trajectory) -> list[Finding]:
-    """Finding about motion that no vehicle has, or none: two streams in millimetres agree, and
-    nothing else tells.
+def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.0) -> list[Finding]:
+    """Return a finding about motion that no vehicle has: two streams in millimetres agree, and only
+    their motion shows it.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        On one scale, if it is known.
+    lever_arm_m : float
+        Distance of the sensors, at least; 0 if it is not known.
     """
-    if not is_too_fast(parent):
+    if not is_too_fast(parent, lever_arm_m):
         return []
     speed, change = _usual_motion(parent)
-    options: dict[str, float | str] = {"parent_scale": 0.001, "scale": 0.001}
-    values = {"speed_m_s": speed, "acceleration_m_s2": change}
-    return [finding("lengths", "parent", None, options, **values)]
+    unit, factor = _unit_of_motion(speed, change)
+    are_both = is_too_fast(child, lever_arm_m)
+    options: dict[str, float | str] = {"parent_scale": factor}
+    if are_both:
+        options["scale"] = factor
+    is_clear = " or " not in unit
+    is_by_lever_arm = not is_too_fast(parent)
+    return [
+        finding(
+            "lengths",
+            "both" if are_both else "parent",
+            None,
+            options,
+            unit=unit,
+            speed_m_s=speed,
+            acceleration_m_s2=change,
+            beside=f", {lever_arm_m:.0f} m away from the child" if is_by_lever_arm else "",
+            condition="" if is_clear else "0.01 is for centimetres; if they are millimetres, ",
+        )
+    ]
 
 
-def is_too_fast(trajectory: Trajectory) -> bool:
-    """Whether no vehicle moves like this, so that the lengths are not in metres."""
+def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
+    """Return the unit in words, and its size (m), in which a speed and the change of velocity
+    within a second are usual; millimetres where centimetres are possible as well.
+    """
+    if speed * 0.01 >= _FASTEST or change * 0.01 > _MOST_USUAL:
+        return "millimetres", 0.001
+    if change * 0.001 < _LEAST_USUAL:
+        return "centimetres", 0.01
+    return "millimetres or centimetres", 0.001
+
+
+def is_too_fast(trajectory: Trajectory, lever_arm_m: float = 0.0) -> bool:
+    """Whether no vehicle moves like this, so that the lengths are not in metres. The distance to
+    the other sensor shows the least size of the vehicle.
+    """
     speed, change = _usual_motion(trajectory)
-    return speed >= _FASTEST or change >= _HARDEST
+    hardest = _HARDEST_OF_LARGE if lever_arm_m >= _LONG_LEVER_M else _HARDEST
+    return speed >= _FASTEST or change >= hardest
 
 
 def is_too_slow(trajectory: Trajectory) -> bool:

@@ -107,6 +107,13 @@ def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[
     return obsolete
 
 
+def _least_lever_arm(calibration: Calibration) -> float:
+    """Return the length (m) that the lever arm of a result has at least, within its uncertainty."""
+    sigmas = np.sqrt(np.diag(calibration.covariance_measured))[:3]
+    is_shown = [axis not in calibration.hidden for axis in "xyz"]
+    return checking.least_lever_arm(calibration.T_parent_child, np.where(is_shown, sigmas, np.inf))
+
+
 def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Finding]:
     """Return findings about streams that are no poses, with those of the solve itself."""
     config = snapshot.config
@@ -114,8 +121,10 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
-        in_metres = child.scaled(_known_scale(snapshot, calibration))
-        findings += checking.check_parts(parent, in_metres.shifted(known_s), config.max_gap)
+        on_one_scale = child.scaled(_known_scale(snapshot, calibration))
+        aligned = on_one_scale.shifted(known_s)
+        lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
+        findings += checking.check_parts(parent, aligned, config.max_gap, lever_arm_m)
     hidden = calibration.hidden if calibration else []
     if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
         findings += _check_clock_of_parts(parent, child, known_s, snapshot)
@@ -125,6 +134,8 @@ def _check_parts(snapshot: Snapshot, calibration: Calibration | None) -> list[Fi
         findings += parts.check_solved(parent, child, calibration, config, least_share)
     if hidden and not any(found.makes_unusable for found in findings):
         findings.append(checking.unseen(hidden))
+    # Lengths in another unit are the cause of what the solve found.
+    findings.sort(key=lambda found: found.code != "lengths")
     return [found for index, found in enumerate(findings) if found not in findings[:index]]
 
 

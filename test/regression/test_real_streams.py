@@ -139,8 +139,9 @@ def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(recordi
     parent = recording().parent
     # Coordinates of a map in millimetres are refused when they are read.
     parent = Trajectory(parent.stamps_ns, np.linalg.inv(parent.poses[0]) @ parent.poses)
-    assert check_lengths(parent) == []
-    assert [finding.code for finding in check_lengths(parent.scaled(1000.0))] == ["lengths"]
+    assert check_lengths(parent, parent) == []
+    in_mm = parent.scaled(1000.0)
+    assert [finding.code for finding in check_lengths(in_mm, in_mm)] == ["lengths"]
 
 
 class TestArms:

@@ -55,8 +55,8 @@ def test_both_streams_in_millimetres_are_never_used(streams):
     result = hec.calibrate(parent.scaled(1000.0), child.scaled(1000.0), reference="B5")
     assert result.verdict is Verdict.DO_NOT_USE
     (finding,) = result.findings
-    assert (finding.code, finding.stream) == ("lengths", "parent")
-    assert "its lengths are probably not in metres" in result.headline
+    assert (finding.code, finding.stream) == ("lengths", "both")
+    assert "both streams' lengths seem to be in millimetres" in result.headline
     assert finding.evidence["speed_m_s"] > 1000
     asked = hec.calibrate(
         parent.scaled(1000.0), child.scaled(1000.0), reference="B5", **finding.options
@@ -130,8 +130,9 @@ def test_kept_pairs_are_put_right_like_poses(streams):
 def test_a_slow_arm_in_millimetres_is_noticed_and_a_drone_in_metres_is_not():
     arm = as_trajectory(wandering_poses(1200, step_m=0.006))
     drone = as_trajectory(wandering_poses(1200, step_m=1.0))
-    assert check_lengths(arm) == check_lengths(drone) == []
-    assert [finding.code for finding in check_lengths(arm.scaled(1000.0))] == ["lengths"]
+    assert check_lengths(arm, arm) == check_lengths(drone, drone) == []
+    in_mm = arm.scaled(1000.0)
+    assert [finding.code for finding in check_lengths(in_mm, in_mm)] == ["lengths"]
 
 
 def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):

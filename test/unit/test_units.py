@@ -7,7 +7,7 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 import hand_eye_calib as hec
 from hand_eye_calib.alignment.similarity import estimate_scale
 from hand_eye_calib.checks.check import in_other_units
-from hand_eye_calib.checks.streams import is_too_fast, is_too_slow
+from hand_eye_calib.checks.streams import check_lengths, is_too_fast, is_too_slow
 from hand_eye_calib.engine.snapshot import whole_snapshot
 from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.geometry.trajectory import Trajectory
@@ -186,3 +186,49 @@ def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, nam
     result = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), drive.child)
     assert result.verdict is hec.Verdict.DO_NOT_USE
     assert "unit_or_scale" in {each.code for each in result.findings if each.makes_unusable}
+
+
+PLATFORMS = ("hand_vio_walk", "car_ins_lidar", "agv_ramps", "drone_gnss_vio", "arm_target")
+
+
+@pytest.mark.parametrize("measures", ["poses", "positions"])
+@pytest.mark.parametrize(("unit", "factor"), [("millimetres", 1e-3), ("centimetres", 1e-2)])
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_both_streams_in_a_small_unit_are_named_first(platform, unit, factor, measures):
+    drive = make(platform, 1701)
+    parent = drive.parent.scaled(1.0 / factor)
+    child = drive.child.scaled(1.0 / factor)
+    result = hec.calibrate(parent, child, child_measures=measures)
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    first = result.findings[0]
+    assert (first.code, first.stream) == ("lengths", "both")
+    assert unit in first.what
+    right = hec.calibrate(parent, child, child_measures=measures, parent_scale=factor, scale=factor)
+    assert "lengths" not in {finding.code for finding in right.findings}
+
+
+class TestSmallUnit:
+    """``check_lengths`` of streams that agree in one unit."""
+
+    @pytest.mark.parametrize(("lever_arm_m", "codes"), [(2.9, []), (3.0, ["lengths"])])
+    def test_a_large_machine_changes_its_velocity_slowly(self, lever_arm_m, codes):
+        poses = wandering_poses(1200, step_m=0.6)
+        arm = as_trajectory(poses)
+        lengths = check_lengths(arm, arm, lever_arm_m)
+        assert [finding.code for finding in lengths] == codes
+
+    def test_a_child_in_metres_is_not_asked_about(self, hand):
+        parent, child = hand
+        (found,) = check_lengths(parent.scaled(1000.0), child)
+        assert (found.stream, [*found.options]) == ("parent", ["parent_scale"])
+
+    def test_short_paths_in_millimetres_are_not_taken_for_inverse(self):
+        drive = mixed.make("mixed_hand", 1702)
+        (found,) = (
+            finding
+            for finding in hec.calibrate(
+                drive.parent[:360].scaled(1000.0), drive.child[:360].scaled(1000.0)
+            ).findings
+            if finding.makes_unusable
+        )
+        assert found.code == "lengths"
