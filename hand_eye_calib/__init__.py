@@ -13,20 +13,18 @@ from importlib import import_module
 from typing import Any
 
 from hand_eye_calib import extras, io, offline, online
+from hand_eye_calib.registry import PUBLIC_NAMES
 
-# Module of every public name.
+# Module of every public name; the extras register theirs.
 _MODULES = {
     "CalibratorConfig": "hand_eye_calib.config",
     "Calibrator": "hand_eye_calib.engine.calibrator",
     "calibrate": "hand_eye_calib.engine.offline",
     "cross_check": "hand_eye_calib.engine.offline",
-    "calibrate_arm": "hand_eye_calib.engine.stops",
-    "calibrate_stops": "hand_eye_calib.engine.stops",
     "HandEyeCalibError": "hand_eye_calib.errors",
     "Trajectory": "hand_eye_calib.geometry.trajectory",
     "load": "hand_eye_calib.io.results",
     "save": "hand_eye_calib.io.results",
-    "read_arm_samples": "hand_eye_calib.io.stops",
     "read_trajectory": "hand_eye_calib.io.trajectory_files.reading",
     "write_trajectory": "hand_eye_calib.io.trajectory_files.table",
     "plot": "hand_eye_calib.report.figures",
@@ -35,18 +33,14 @@ _MODULES = {
     "SolveStatus": "hand_eye_calib.results.records",
     "Reason": "hand_eye_calib.results.verdict",
     "Verdict": "hand_eye_calib.results.verdict",
-    "RigCalibration": "hand_eye_calib.session.rig",
-    "calibrate_rig": "hand_eye_calib.session.rig",
-    "calibrate_many": "hand_eye_calib.session.together",
-    "calibrate_together": "hand_eye_calib.session.together",
     "compare": "hand_eye_calib.assessment.comparison",
-    "simulate": "hand_eye_calib.simulation.drive",
 }
-
-__all__ = [*_MODULES]
 
 for _layer in (io, offline, online, extras):
     _layer.register()
+_MODULES |= PUBLIC_NAMES
+
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:

@@ -71,6 +71,9 @@ class Route(NamedTuple):
     run: Callable[[Any, Callable[[Any], Any]], int]
 
 
+#: Modules of the public names of the extras.
+PUBLIC_NAMES: Registry[str] = Registry("public name")
+
 #: Commands of the command line, in the order of its help.
 COMMANDS: Registry[Command] = Registry("command")
 

@@ -3,11 +3,20 @@
 from typing import Any
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.registry import COMMANDS, ROUTES, SEVERAL_RECORDINGS, Command, Route
+from hand_eye_calib.registry import (
+    COMMANDS,
+    PUBLIC_NAMES,
+    ROUTES,
+    SEVERAL_RECORDINGS,
+    Command,
+    Route,
+)
 
 
 def register() -> None:
     """Register the command ``compare``, and batches and recordings of one rig for ``calibrate``."""
+    PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.session.together"
+    PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.session.together"
     COMMANDS["compare"] = Command(
         "compare results with what is installed, or with each other", _compare
     )

@@ -4,11 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.registry import ROUTES, SESSION_PAGES, Route
+from hand_eye_calib.registry import PUBLIC_NAMES, ROUTES, SESSION_PAGES, Route
 
 
 def register() -> None:
     """Register rigs for ``calibrate``, and the pages of a session with further sensors."""
+    PUBLIC_NAMES["RigCalibration"] = "hand_eye_calib.session.rig"
+    PUBLIC_NAMES["calibrate_rig"] = "hand_eye_calib.session.rig"
     ROUTES["rig"] = Route(_add_arguments, _is_rig, _calibrate_rig)
     SESSION_PAGES["rig"] = _session_rig
 

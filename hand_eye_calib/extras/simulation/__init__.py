@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from hand_eye_calib.registry import COMMANDS, Command
+from hand_eye_calib.registry import COMMANDS, PUBLIC_NAMES, Command
 
 
 def register() -> None:
     """Register the commands ``simulate`` and ``demo``."""
+    PUBLIC_NAMES["simulate"] = "hand_eye_calib.simulation.drive"
     COMMANDS["simulate"] = Command("simulate trajectories or a bag with known truth", _simulate)
     COMMANDS["demo"] = Command(
         "simulate a recording and calibrate from it, offline and live", _demo

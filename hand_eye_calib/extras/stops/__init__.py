@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.registry import ROUTES, Route
+from hand_eye_calib.registry import PUBLIC_NAMES, ROUTES, Route
 
 # Files of an arm's samples.
 _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
@@ -12,6 +12,9 @@ _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 def register() -> None:
     """Register stops for ``calibrate``."""
+    PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.engine.stops"
+    PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.engine.stops"
+    PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.io.stops"
     ROUTES["stops"] = Route(_add_arguments, _are_stops, _calibrate)
 
 
