@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.blocks import Blocks, solve
 from hand_eye_calib.errors import NotEnoughDataError
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -48,9 +49,6 @@ _MAX_UNEXPLAINED_TRANSLATION = 0.3
 # Smallest standard deviations: of rotations (rad), and of translations as a share of the motion.
 # Smaller ones are rounding.
 _MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
-
-# Damping of directions that the motion does not determine, in balanced units.
-_DAMPING = 1e-10
 
 # Fewer motions are not compared. For the scale they are over these times (s); that of the smallest
 # relative standard deviation wins. Long motions show the scale best.
@@ -311,8 +309,9 @@ class _Problem:
         lengths = (np.linalg.norm(Ts[:, :3, 3]) / len(pairs) ** 0.5 for Ts in (A, B))
         self.rms_a, self.rms_b = map(float, lengths)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
-        self.free = np.ones(len(_UNKNOWNS), dtype=bool)
-        self.free[_SCALE], self.free[_OFFSET] = not same_unit, twists is not None
+        self.free = list(range(_SCALE))
+        self.free += [] if same_unit else [_SCALE]
+        self.free += [] if twists is None else [_OFFSET]
         twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
         # Derivatives of B by d. Adding to the child's stamps moves its poses at given instants
         # back.
@@ -368,7 +367,8 @@ class _Problem:
             for part in self.rows(T, scale, offset_s)[0]:
                 flat = part.reshape(-1, len(_UNKNOWNS) + 1)
                 moments += flat.T @ flat
-            step = _solve(moments[:-1, :-1], -moments[:-1, -1], self.free)
+            step = np.zeros(len(_UNKNOWNS))
+            step[self.free] = -solve(moments, self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             T = se3.retracted(T, step[:6])
             scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
@@ -380,7 +380,7 @@ class _Problem:
         """Unexplained shares of translations and motion, from the residuals' sigmas (m, rad)."""
         # Of the stream that moves less or, with one unit of length, of the one that moves more.
         lengths = (self.rms_a, scale * self.rms_b)
-        rms_translation = min(lengths) if self.free[_SCALE] else max(lengths)
+        rms_translation = min(lengths) if _SCALE in self.free else max(lengths)
         of_translation = sigmas[0] / max(rms_translation, 1e-12)
         of_rotation = sigmas[1] / max(self.rms_rotation, 1e-12)
         return of_translation, float(np.hypot(of_translation, of_rotation))
@@ -389,23 +389,17 @@ class _Problem:
         """The result, with its uncertainty."""
         parts, sigmas_of_residuals, root = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
-        blocks = np.array_split(rows, min(_N_BLOCKS, len(rows)))
-        moments = np.array([np.tensordot(each, each, axes=([0, 1], [0, 1])) for each in blocks])
-        normal, gradient = moments[:, :-1, :-1], moments[:, :-1, -1]
-        total = normal.sum(axis=0)
-        # The jackknife: one-step answers without each block.
-        answers = _solve(total - normal, gradient - gradient.sum(axis=0), self.free)
-        answers -= answers.mean(axis=0)
-        extrinsic = np.arange(len(_UNKNOWNS)) < _SCALE
-        by = [_solve(total, -total[:, column], extrinsic)[:6] for column in (_SCALE, _OFFSET)]
-        weights = normal[:, _OFFSET, _OFFSET]
+        blocks = Blocks.of_rows(rows, min(_N_BLOCKS, len(rows)))
+        sigmas = np.zeros(len(_UNKNOWNS))
+        sigmas[self.free] = np.sqrt(np.diag(blocks.jackknife(self.free)))
+        by = [-solve(blocks.total, range(_SCALE), column) for column in (_SCALE, _OFFSET)]
+        weights = blocks.sums[:, _OFFSET, _OFFSET]
         # Robust weights fall as the offset moves, so that a step is shorter than it should be.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
         fall = pulls.sum() / (1.5 * _TUNING**2) / max(weights.sum(), 1e-300)
         held = float(np.clip(1.0 - fall, 0.5, 1.0))
-        offsets = -gradient[:, _OFFSET] / np.where(weights > 0.0, weights, 1.0)
+        offsets = -blocks.sums[:, _OFFSET, -1] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
-        sigmas = np.sqrt(np.diag((len(blocks) - 1) / len(blocks) * answers.T @ answers))
         scale_sigma, off = scale * float(sigmas[_SCALE]), abs(scale - 1.0)
         is_off = off > max(_MIN_DIFFERENCE, _MIN_SIGMAS * scale_sigma)
         return SimilarityFit(
@@ -431,18 +425,3 @@ class _Problem:
 def _times(matrices: FloatArray, right: FloatArray) -> FloatArray:
     """``matrices @ right`` for (K, 3, 3) and (3, 3), in one product."""
     return (matrices.reshape(-1, 3) @ right).reshape(-1, 3, 3)
-
-
-def _solve(normal: FloatArray, right: FloatArray, free: BoolArray) -> FloatArray:
-    """Solutions (..., 8) for the free unknowns of normal equations (..., 8, 8), in balanced units;
-    zero along directions without curvature and for the others.
-    """
-    step = np.zeros_like(right)
-    part = normal[..., free, :][..., free]
-    diagonal = np.diagonal(part, axis1=-2, axis2=-1)
-    units = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    balanced = part * units[..., None, :] * units[..., None]
-    balanced = balanced + _DAMPING * np.eye(units.shape[-1])
-    scaled = (units * right[..., free])[..., None]
-    step[..., free] = units * np.linalg.solve(balanced, scaled)[..., 0]
-    return step

@@ -30,11 +30,12 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.blocks import Blocks, jackknife_covariance
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.gls.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.gls.noise_model import WALK_ROTATION
-from hand_eye_calib.gls.normal import answers_without, multiplied
+from hand_eye_calib.gls.normal import NormalEquations, multiplied
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.results.records import AXES, ROTATIONS
@@ -125,7 +126,7 @@ def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) 
         block_of_pair = np.arange(len(pairs)) * n_blocks // len(pairs)
         left_out = block_of_pair[None, :] == np.arange(n_blocks)[:, None]
         answers = solve_without(left_out)
-        resampled = _spread_of_blocks(se3.log(se3.inverse(T_parent_child) @ answers))
+        resampled = jackknife_covariance(se3.log(se3.inverse(T_parent_child) @ answers))
     return combined(T_parent_child, model, resampled, unknown)
 
 
@@ -190,7 +191,9 @@ def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: sli
     """The model's covariance of a part of xi, widened to the scatter of its blocks."""
     if len(solution.jumps) < BLOCKS * _FEWEST[1]:
         return covariance
-    spread = _spread_of_blocks(answers_without(solution.part_products, BLOCKS)[:, part])
+    blocks = Blocks(solution.part_products).merged(BLOCKS)
+    answers = NormalEquations(blocks.without()).step
+    spread = jackknife_covariance(answers[:, part])
     # One factor for all directions, how many times the covariance they spread on average: that of a
     # single direction scatters too much. Rotations may have a larger one: slow errors of a sensor's
     # rotation pass for those of a world, which motion averages.
@@ -381,15 +384,6 @@ def basis(directions: list[FloatArray]) -> FloatArray:
         return np.zeros((6, 0))
     left, sizes, _ = np.linalg.svd(np.array(directions).T, full_matrices=False)
     return left[:, sizes > 1e-6 * sizes[0]]
-
-
-def _spread_of_blocks(deviations: FloatArray) -> FloatArray:
-    """Jackknife covariance (6, 6) of the deviations (B, 6) of the B answers without a block:
-    ``(B - 1) / B * sum (xi_b - mean)(xi_b - mean)'`` (Efron, Tibshirani, *An introduction to the
-    bootstrap*, 1993, eq. 11.5).
-    """
-    n_blocks, centred = len(deviations), deviations - deviations.mean(axis=0)
-    return (n_blocks - 1) / n_blocks * centred.T @ centred
 
 
 def judged(axis: str, sigma: float) -> DofObservability:

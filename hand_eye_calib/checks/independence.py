@@ -5,6 +5,7 @@ it through an assumed transform. Such a result only returns that transform.
 import numpy as np
 
 from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.blocks import Blocks, jackknife_covariance
 from hand_eye_calib.checks.findings import Finding, Severity, finding
 from hand_eye_calib.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
 from hand_eye_calib.checks.streams import USUAL, coarse
@@ -186,7 +187,7 @@ def _other_mount(pose_pairs: PosePairs) -> Finding | None:
         return None
     of_short, of_long = (stack for stack in rotations if stack is not None)
     turns = se3.rotation_log(np.swapaxes(of_long, 1, 2) @ of_short)
-    covariance = (_BLOCKS - 1) * np.cov(turns[1:].T, bias=True) + 1e-12 * np.eye(3)
+    covariance = jackknife_covariance(turns[1:]) + 1e-12 * np.eye(3)
     sigmas = float(np.sqrt(turns[0] @ np.linalg.solve(covariance, turns[0])))
     turn_rad = float(np.linalg.norm(turns[0]))
     if turn_rad < _OTHER_MOUNT_RAD or sigmas < _OTHER_MOUNT_SIGMAS:
@@ -209,15 +210,13 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
         return None
     weights = is_clear.astype(float)
     for _ in range(_ROUNDS):
-        products = np.zeros((_BLOCKS, 3, 3))
         outer = weights[:, None, None] * of_parent[:, :, None] * of_child[:, None, :]
-        np.add.at(products, blocks, outer)
-        total = products.sum(axis=0)
-        R = se3.nearest_rotation(total)
+        products = Blocks.gathered(outer, blocks, _BLOCKS)
+        R = se3.nearest_rotation(products.total)
         residuals = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
         usual = 2.0 * median(residuals[is_clear]) + 1e-12
         weights = is_clear * robust_weights("cauchy", (residuals / usual) ** 2)
-    return se3.nearest_rotation(np.concatenate([total[None], total - products]))
+    return se3.nearest_rotation(np.concatenate([products.total[None], products.without()]))
 
 
 def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:

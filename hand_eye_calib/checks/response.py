@@ -25,6 +25,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import FloatArray
 from hand_eye_calib.assessment.covariance import BLOCKS
+from hand_eye_calib.blocks import Blocks, solve
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.stats import median, robust_sigma, robust_weights
@@ -62,7 +63,7 @@ class Regression:
         weights = np.ones(n_rows)
         for _ in range(_ROUNDS):
             products = (known * np.repeat(weights, size)[:, None]).T @ known
-            values = _solved(products, list(range(len(products) - 1)))
+            values = solve(products, range(len(products) - 1))
             left = (known[:, -1] - known[:, :-1] @ values).reshape(n_rows, size)
             lengths = np.sqrt((left**2).sum(axis=1))
             self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
@@ -71,10 +72,7 @@ class Regression:
         self._weight = float(weights.sum())
         weighted = rows * weights[:, None, None]
         self._squares = flat.T @ weighted.reshape(flat.shape)
-        blocks, parts = [], (np.array_split(each, BLOCKS) for each in (probes, weighted))
-        for probe, part in zip(*parts, strict=True):
-            blocks.append(probe.reshape(-1, n_columns).T @ part.reshape(-1, n_columns))
-        self._blocks = np.stack(blocks)
+        self._blocks = Blocks.of_rows(weighted, BLOCKS, probes)
 
     def _columns(self, group: str = "", *beside: str) -> list[int]:
         """Columns that a group is fitted beside."""
@@ -96,7 +94,7 @@ class Regression:
         """The share of the squared residuals that a group takes away."""
         before, costs = self._columns(group, *beside), []
         for columns in (before, [*before, *self._where[group]]):
-            x, at = np.append(-_solved(self._blocks.sum(axis=0), columns), 1.0), [*columns, -1]
+            x, at = np.append(-self._blocks.solve(columns), 1.0), [*columns, -1]
             costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
         return 1.0 - costs[1] / max(costs[0], 1e-300)
 
@@ -104,23 +102,14 @@ class Regression:
         """What a group of m columns is fitted with, beside the base or what is left of it, and
         ``beside`` other groups: values and standard deviations (m,), by the jackknife over blocks.
         """
-        before, total = self._columns(group, *beside), self._blocks.sum(axis=0)
-        # All rows, and all but those of each block, or of two: errors may last longer than one.
-        left_out = np.concatenate([self._blocks, self._blocks[::2] + self._blocks[1::2]])
-        tables = np.concatenate([total[None], total - left_out])
-        solved = _solved(tables, [*before, *self._where[group]])[:, len(before) :]
-        _, *parts = np.split(solved, [1, 1 + BLOCKS])
-        variances = [(len(values) - 1) * values.var(axis=0) for values in parts]
-        return solved[0], np.sqrt(np.max(variances, axis=0))
-
-
-def _solved(products: FloatArray, columns: list[int]) -> FloatArray:
-    normal = products[..., columns, :][..., columns]
-    sizes = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
-    units = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > 1e-30)
-    balanced = normal * units[..., :, None] * units[..., None, :] + 1e-9 * np.eye(len(columns))
-    pushed = (units * products[..., columns, -1])[..., None]
-    return np.asarray(units * np.linalg.solve(balanced, pushed)[..., 0])
+        before = self._columns(group, *beside)
+        columns = [*before, *self._where[group]]
+        # Without each block, and without each two: errors may last longer than one.
+        covariances = [
+            blocks.jackknife(columns) for blocks in (self._blocks, self._blocks.merged(BLOCKS // 2))
+        ]
+        variances = np.max([np.diag(covariance) for covariance in covariances], axis=0)
+        return self._blocks.solve(columns)[len(before) :], np.sqrt(variances[len(before) :])
 
 
 class _Stream:

@@ -181,18 +181,3 @@ class NormalEquations:
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
     """Products (k, l) of columns (n, d, k) with columns (n, d, l)."""
     return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
-
-
-def answers_without(products: FloatArray, n_blocks: int) -> FloatArray:
-    """Steps (B, p) of xi and then the systematic errors, each without one of B blocks of parts.
-
-    Parameters
-    ----------
-    products : (K, p + 1, p + 1) array
-        Of :func:`~hand_eye_calib.gls.state_space.Posterior.part_products`.
-    n_blocks : int
-    """
-    block_of_part = np.arange(len(products)) * n_blocks // len(products)
-    total = products.sum(axis=0)
-    blocks = [products[block_of_part == block].sum(axis=0) for block in range(n_blocks)]
-    return NormalEquations(total - np.array(blocks)).step

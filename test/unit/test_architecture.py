@@ -14,11 +14,12 @@ from hand_eye_calib.simulation.options import NoiseConfig
 # A room is a sub-package or a module at the top; "root" is the package's own __init__.py, the
 # public Python API. In the engine each room sees only rooms before it.
 GROUND = {"errors", "text", "config", "arrays", "stats", "plain", "version", "registry", "option"}
-GROUND |= {"python_path"}
+GROUND |= {"python_path", "blocks"}
 ENGINE = {
     "errors": set(),
     "arrays": set(),
     "stats": {"arrays"},
+    "blocks": {"arrays"},
     "plain": {"errors"},
     "version": set(),
     "python_path": set(),
