@@ -1,8 +1,8 @@
 """Evidence of blocks of time, added up: of all blocks, of all but one, before and since a time.
 
 The evidence of a block on p unknowns x, which minimise the squares of ``W^(1/2) (J x - y)``, is the
-table of products ``[J y]' W [J y]`` (p + 1, p + 1). Tables add over blocks. So the answer of any
-set of blocks is one small solve away.
+table of products ``[J y]' W [J y]`` (p + 1, p + 1). Its first p rows ``[H S]`` are the information
+and the score. Tables add over blocks. So the answer of any set of blocks is one small solve away.
 """
 
 from collections.abc import Sequence
@@ -78,6 +78,15 @@ class Blocks:
         """Sums (C, ...) of the blocks since each cut, at most B - 1."""
         return np.asarray(np.cumsum(self.sums[::-1], axis=0)[::-1][cuts])
 
+    def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
+        """Evidence (C, p, p + 1) of a shift of the unknowns at each cut, whatever they were before.
+
+        ``prior`` (p, p) is information that holds besides about the unknowns before.
+        """
+        before = self.before(cuts)
+        covariances = inverse(information(before) + prior)
+        return shift_evidence(self.since(cuts), times(covariances, score(before)), covariances)
+
     def solve(self, columns: Sequence[int]) -> FloatArray:
         """Answer (k,) of all blocks for some of the unknowns, the others being zero."""
         return solve(self.total, columns)
@@ -85,6 +94,44 @@ class Blocks:
     def jackknife(self, columns: Sequence[int]) -> FloatArray:
         """Covariance (k, k) of :meth:`solve` by the answers without each block."""
         return jackknife_covariance(solve(self.without(), columns))
+
+
+def information(tables: FloatArray) -> FloatArray:
+    """Information H (..., p, p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
+    n_unknowns = tables.shape[-1] - 1
+    return tables[..., :n_unknowns, :n_unknowns]
+
+
+def score(tables: FloatArray) -> FloatArray:
+    """Score S (..., p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
+    return tables[..., : tables.shape[-1] - 1, -1]
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Inverses (..., p, p) of matrices (..., p, p)."""
+    return np.asarray(np.linalg.inv(matrices), dtype=float)
+
+
+def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Products (..., p) of matrices (..., p, p) and vectors (..., p)."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from those that are known.
+
+    Parameters
+    ----------
+    tables : (..., p, p + 1) or (..., p + 1, p + 1) array
+        Evidence since the shift; H may be singular.
+    known : (..., p) array
+        The unknowns before the shift.
+    covariance : (..., p, p) array
+        Of the errors of ``known``.
+    """
+    H = information(tables)
+    from_known = np.concatenate([H, (score(tables) - times(H, known))[..., None]], axis=-1)
+    return inverse(np.eye(H.shape[-1]) + H @ covariance) @ from_known
 
 
 def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> FloatArray:

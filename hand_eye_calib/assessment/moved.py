@@ -28,6 +28,7 @@ import numpy as np
 
 from hand_eye_calib import stats
 from hand_eye_calib.arrays import FloatArray, IntArray
+from hand_eye_calib.blocks import Blocks, information, inverse, score, times
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -77,20 +78,27 @@ def shift_covariance(metres: float = SHIFT_M, radians: float = SHIFT_RAD) -> Flo
     return np.diag(np.repeat([metres**2, radians**2], 3))
 
 
-def log_ratio(H: FloatArray, S: FloatArray, shift: FloatArray | None = None) -> FloatArray:
+# Information (6, 6) of the shifts that are looked for; and the share of it that a shift within a
+# recording has before it is looked for: shifts of many metres count as impossible.
+_OF_SHIFT = inverse(shift_covariance())
+_RIDGE = 1e-6
+
+
+def log_ratio(tables: FloatArray, shift: FloatArray | None = None) -> FloatArray:
     """Logarithm of the likelihood ratio of a shift against none.
 
     Parameters
     ----------
-    H : (..., 6, 6) array
-        Information since the time from which on the mount may have moved.
-    S : (..., 6) array
+    tables : (..., 6, 7) array
+        Evidence ``[H S]`` since the time from which on the mount may have moved.
     shift : (6, 6) array, optional
         L; :func:`shift_covariance` if left out.
     """
     L = shift_covariance() if shift is None else shift
+    H, S = information(tables), score(tables)
     _, log_volume = np.linalg.slogdet(np.eye(6) + L @ H)
-    return 0.5 * (S * solve(H + np.linalg.inv(L), S)).sum(axis=-1) - 0.5 * log_volume
+    squared = (S * solve(H + np.linalg.inv(L), S)).sum(axis=-1)
+    return 0.5 * squared - 0.5 * log_volume
 
 
 def solve(H: FloatArray, S: FloatArray) -> FloatArray:
@@ -100,16 +108,20 @@ def solve(H: FloatArray, S: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(H, columns)[..., 0])
 
 
-def most_likely(H: FloatArray, S: FloatArray, ridge: float) -> FloatArray:
-    """Shifts (..., 6) that H (..., 6, 6) and S (..., 6) show, with a share ``ridge`` of the
+def most_likely(tables: FloatArray, ridge: float) -> FloatArray:
+    """Shifts (..., 6) that evidence ``[H S]`` (..., 6, 7) shows, with a share ``ridge`` of the
     information of the shifts that are looked for.
     """
-    return solve(H + ridge * np.linalg.inv(shift_covariance()), S)
+    return solve(information(tables) + ridge * _OF_SHIFT, score(tables))
 
 
-def squared_shift(H: FloatArray, S: FloatArray, ridge: float) -> FloatArray:
-    """Squares of these shifts in units of their covariance: ``S' H^-1 S``."""
-    return np.asarray((S * most_likely(H, S, ridge)).sum(axis=-1))
+def squares_about(tables: FloatArray, answers: FloatArray, ridge: float) -> FloatArray:
+    """Squares (...) of the shifts from answers (..., 6) that evidence ``[H S]`` (..., 6, 7) shows,
+    in units of their covariance.
+    """
+    H = information(tables)
+    scores = score(tables) - times(H, answers)
+    return np.asarray((scores * solve(H + ridge * _OF_SHIFT, scores)).sum(axis=-1))
 
 
 # ---------------------------------------------------------------- within a recording
@@ -140,6 +152,24 @@ def residuals_and_jacobians(
     return se3.log(Bs_inverse @ moved), np.eye(6) - se3.adjoint(Bs_inverse)
 
 
+def evidence(
+    residuals: FloatArray, jacobians: FloatArray, noise: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """Evidence ``[H S]`` (K, p, p + 1) of motion pairs on p parameters.
+
+    Parameters
+    ----------
+    residuals : (K, 6) array
+    jacobians : (K, 6, p) array
+        Negative derivatives of the residuals.
+    noise : (6, 6) array
+        Covariance of the residuals.
+    weights : (K,) array
+    """
+    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(noise) * weights[:, None, None]
+    return whitened @ np.concatenate([jacobians, -residuals[..., None]], axis=2)
+
+
 def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariance (6, 6) of residuals (K, 6) whose noise is Student's t, and the weight (K,) of
     each: 1 on average, small for jumps.
@@ -168,47 +198,39 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     T_parent_child : (4, 4) array
         X0, near the extrinsic.
     """
-    starts_ns, H, S = _by_second(pose_pairs, T_parent_child)
-    # Scores of shifts from the answer of all of them, to first order.
-    S = S - H @ (_inverse(H.sum(axis=0)) @ S.sum(axis=0))
-    cuts = [np.arange(n) * len(S) // n for n in _WINDOWS if len(S) >= n * _LEAST_WINDOW_S]
-    if not cuts:
-        return None
+    starts_ns, blocks = _by_second(pose_pairs, T_parent_child)
+    n_blocks = len(starts_ns)
     long_run = 1.0
-    for edges in cuts:  # the least of all splits, about the answers of their sides
-        H_of, S_of = np.add.reduceat(H, edges), np.add.reduceat(S, edges)
-        splits = np.arange(_LEAST_WINDOWS, len(edges) - _LEAST_WINDOWS + 1)
-        before = [np.cumsum(each, axis=0)[splits - 1] for each in (H_of, S_of)]
-        sides = before, [H_of.sum(axis=0) - before[0], S_of.sum(axis=0) - before[1]]
-        answers = np.stack([se3.times(_inverse(one), two) for one, two in sides], axis=1)
-        is_after = (np.arange(len(edges)) >= splits[:, None]).astype(int)
-        own = answers[np.arange(len(splits))[:, None], is_after]
-        rests = S_of - se3.times(H_of, own)
-        # Mean of S' H^-1 S of scores about two answers, per degree of freedom.
-        seen = np.trace(H_of, axis1=1, axis2=2) > 0
-        squared = squared_shift(H_of[seen], rests[:, seen], 1e-6).sum(axis=1)
+    for n_windows in _WINDOWS:
+        if n_blocks < n_windows * _LEAST_WINDOW_S:
+            continue
+        # The least of all splits, about the answers of their sides.
+        windows = blocks.merged(n_windows)
+        splits = np.arange(_LEAST_WINDOWS, n_windows - _LEAST_WINDOWS + 1)
+        sides = np.stack([windows.before(splits), windows.since(splits)], axis=1)
+        is_after = (np.arange(n_windows) >= splits[:, None]).astype(int)
+        answers = most_likely(sides, _RIDGE)[np.arange(len(splits))[:, None], is_after]
+        seen = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
+        # Per degree of freedom of scores about two answers.
+        squared = squares_about(windows.sums[seen], answers[:, seen], _RIDGE).sum(axis=1)
         long_run = max(long_run, float(squared.min()) / max(6 * seen.sum() - 12, 1))
-    before_H, before_S = np.cumsum(H, axis=0)[:-1], np.cumsum(S, axis=0)[:-1]
-    after_H, after_S = H.sum(axis=0) - before_H, S.sum(axis=0) - before_S
-    # The common answer is free.
-    contrast = before_H - before_H @ _inverse(H.sum(axis=0)) @ before_H
-    ratios = log_ratio(contrast / long_run, before_S / long_run)
-    n_edge = max(int(len(S) * _LEAST_WINDOWS / max(_WINDOWS)), 1)
+    if n_blocks < min(_WINDOWS) * _LEAST_WINDOW_S:
+        return None
+    shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * _OF_SHIFT)
+    ratios = log_ratio(shifts / long_run)
+    n_edge = max(int(n_blocks * _LEAST_WINDOWS / max(_WINDOWS)), 1)
     ratios[: n_edge - 1] = ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
-    cov_before, cov_after = _inverse(before_H[best]), _inverse(after_H[best])
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
-        xi=cov_after @ after_S[best] - cov_before @ before_S[best],
-        covariance=long_run * (cov_before + cov_after),
+        xi=most_likely(shifts[best], _RIDGE),
+        covariance=long_run * inverse(information(shifts[best]) + _RIDGE * _OF_SHIFT),
         log_ratio=float(ratios[best]),
     )
 
 
-def _by_second(
-    pose_pairs: PosePairs, T_parent_child: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Starts (N,) of the seconds of a recording, H (N, 6, 6) and S (N, 6) of each."""
+def _by_second(pose_pairs: PosePairs, T_parent_child: FloatArray) -> tuple[IntArray, Blocks]:
+    """Starts (N,) of the seconds of a recording, and the evidence ``[H S]`` of each."""
     stamps_ns = pose_pairs.stamps_ns
     duration_ns = int(stamps_ns[-1] - stamps_ns[0])
     lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
@@ -216,19 +238,12 @@ def _by_second(
     pairs = pairs_over(pose_pairs, lag_s, most)
     residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
     covariance, weights = noise_covariance(residuals)
-    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(covariance) * weights[:, None, None]
+    tables = evidence(residuals, jacobians, covariance, weights)
     middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
     blocks = (middles_ns - stamps_ns[0]) // _BLOCK_NS
     n_blocks = duration_ns // _BLOCK_NS + 1
-    H, S = np.zeros((n_blocks, 6, 6)), np.zeros((n_blocks, 6))
-    np.add.at(H, blocks, whitened @ jacobians)
-    np.add.at(S, blocks, -np.einsum("kij,kj->ki", whitened, residuals))
-    return stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS, H, S
-
-
-def _inverse(H: FloatArray) -> FloatArray:
-    """Inverse of an information matrix; shifts of many metres count as impossible."""
-    return np.linalg.inv(H + 1e-6 * np.linalg.inv(shift_covariance()))
+    starts_ns = stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS
+    return starts_ns, Blocks.gathered(tables, blocks, n_blocks)
 
 
 def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tuple[str, ...]]:
@@ -248,25 +263,27 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
         Factor of the covariances.
     """
     cuts = np.arange(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
-    before = NormalEquations(np.cumsum(products, axis=0)[cuts - 1])
-    after = NormalEquations(np.cumsum(products[::-1], axis=0)[::-1][cuts])
+    before = NormalEquations(Blocks(products).before(cuts))
+    after = NormalEquations(Blocks(products).since(cuts))
     known = before.is_complete & after.is_complete
     if not known.any():
         return np.zeros((6, 6)), ()
     joint = max(misfit, 1.0) * (before.covariance + after.covariance)[known, :6, :6]
     steps = (after.step - before.step)[known, :6]
     H = np.linalg.inv(joint)
-    S = se3.times(H, steps)
-    ratios = log_ratio(H, S)
+    S = times(H, steps)
+    tables = np.concatenate([H, S[..., None]], axis=2)
+    ratios = log_ratio(tables)
     found = _probability(ratios)
     if found < _LEAST_PROBABILITY:
         return np.zeros((6, 6)), ()
-    shifts = solve(H + np.linalg.inv(shift_covariance()), S)
+    shifts = most_likely(tables, 1.0)
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     spread = found * squared / 4.0
     beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
-    if _probability(log_ratio(beside, se3.times(beside, steps))) < 0.5:
+    scores = times(beside, steps)[..., None]
+    if _probability(log_ratio(np.concatenate([beside, scores], axis=2))) < 0.5:
         return spread, ()
     best = int(np.argmax(ratios))
     share, xi = int(cuts[known][best]) / len(products), shifts[best]

@@ -23,6 +23,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment import change, moved
 from hand_eye_calib.assessment.comparison import SEEN_TARGETS
 from hand_eye_calib.assessment.covariance import floor_of_pairs
+from hand_eye_calib.blocks import Blocks, information, inverse, score, shift_evidence, times
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import Extrinsic
@@ -148,10 +149,10 @@ class MountMonitor:
         self._learning: list[_Second] = []
         self.is_learning = True
         self._tail = PosePairs.empty()
-        # Of the newest seconds of motion, the newest first, and the sums of those before them.
+        # Evidence of the newest seconds of motion, and the sum of those before them.
         self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
-        self._H, self._S = np.zeros((0, 6, 6)), np.zeros((0, 6))
-        self._old = np.zeros((6, 6)), np.zeros(6)
+        self._seconds = Blocks(np.zeros((0, 6, 7)))
+        self._old = np.zeros((6, 7))
         self._centre = np.zeros(6)
         self._last_s = -1
         self._motions_per_s = 0.0
@@ -227,8 +228,8 @@ class MountMonitor:
         self.is_learning = False
         self._noise, _ = moved.noise_covariance(residuals)
         for _ in range(2):
-            H, S, _ = _information(residuals, jacobians, self._noise)
-            shift = moved.most_likely(H, S, TUNING.ridge)
+            table, _ = _information(residuals, jacobians, self._noise)
+            shift = moved.most_likely(table, TUNING.ridge)
             self._noise, _ = moved.noise_covariance(residuals + jacobians @ shift)
         speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
         floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed, speed_m_s)
@@ -240,60 +241,63 @@ class MountMonitor:
 
     def _take(self, stamp_ns: int, residuals: FloatArray, jacobians: FloatArray) -> None:
         """Add the information of a second whatever the scale in it, and follow the noise."""
-        if self.seconds % TUNING.long_run_every_s == 0 and len(self._S) >= TUNING.learning_s:
-            self._centre = moved.most_likely(self._H.sum(axis=0), self._S.sum(axis=0), TUNING.ridge)
+        n_seconds = len(self._seconds.sums)
+        if self.seconds % TUNING.long_run_every_s == 0 and n_seconds >= TUNING.learning_s:
+            self._centre = moved.most_likely(self._seconds.total, TUNING.ridge)
         shift = np.append(self._centre, 0.0)
-        H, S, scatter = _information(residuals, jacobians, self._noise, shift)
-        share = H[:6, 6] / (H[6, 6] + self.long_run / TUNING.scale_sigma**2)
-        H, S = H[:6, :6] - np.outer(share, H[6, :6]), S[:6] - share * S[6]
-        if len(self._S) == TUNING.memory_s and self.alarm is None:
-            kept = 1.0 - 1.0 / TUNING.old_memory_s
-            self._old = kept * self._old[0] + self._H[-1], kept * self._old[1] + self._S[-1]
-        self._stamps_ns = np.append(np.int64(stamp_ns), self._stamps_ns)[: TUNING.memory_s]
-        self._H = np.concatenate([H[None], self._H])[: TUNING.memory_s]
-        self._S = np.concatenate([S[None], self._S])[: TUNING.memory_s]
+        table, scatter = _information(residuals, jacobians, self._noise, shift)
+        of_scale = table[6, [0, 1, 2, 3, 4, 5, 7]]
+        share = table[:6, 6] / (table[6, 6] + self.long_run / TUNING.scale_sigma**2)
+        table = np.delete(table[:6], 6, axis=1) - np.outer(share, of_scale)
+        if n_seconds == TUNING.memory_s and self.alarm is None:
+            self._old = (1.0 - 1.0 / TUNING.old_memory_s) * self._old + self._seconds.sums[0]
+        self._stamps_ns = np.append(self._stamps_ns, np.int64(stamp_ns))[-TUNING.memory_s :]
+        tables = np.concatenate([self._seconds.sums, table[None]])
+        self._seconds = Blocks(tables[-TUNING.memory_s :])
         share = 1.0 / TUNING.noise_memory_s
         self._noise = (1.0 - share) * self._noise + share * scatter
-        self._motions_per_s += (len(residuals) - self._motions_per_s) / min(len(self._S), 100)
+        n_seconds = min(n_seconds + 1, 100)
+        self._motions_per_s += (len(residuals) - self._motions_per_s) / n_seconds
 
     # ------------------------------------------------------------- the judgement
 
     def _judge(self) -> None:
         """Raise an alarm, or follow one that has become clearer."""
         if self.seconds % TUNING.long_run_every_s == 0 or self.seconds <= TUNING.learning_s:
-            self.long_run = _long_run_variance(self._H, self._S, self.long_run)
-        if len(self._S) < _LAGS[0]:
+            self.long_run = _long_run_variance(self._seconds, self.long_run)
+        if len(self._stamps_ns) < _LAGS[0]:
             return
-        lags, H, S = self._sums()
-        ratios = moved.log_ratio(H, S, _KNOCKS[:, None]).max(axis=0)
+        lags, tables = self._shifts()
+        ratios = moved.log_ratio(tables, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
         if ratios[best] < (self.alarm.log_ratio if self.alarm else TUNING.threshold):
             return
-        covariance = np.linalg.inv(H[best] + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
+        H, S = information(tables[best]), score(tables[best])
+        covariance = np.linalg.inv(H + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
         to_parent = np.kron(np.eye(2), self._installed[:3, :3])
-        since_ns, raised_ns = int(self._stamps_ns[lags[best] - 1]), int(self._stamps_ns[0])
+        since_ns, raised_ns = int(self._stamps_ns[-lags[best]]), int(self._stamps_ns[-1])
         self.alarm = Alarm(
             since_ns=self.alarm.since_ns if self.alarm else since_ns,
             raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
             shift=change.moved(
-                to_parent @ covariance @ S[best], to_parent @ covariance @ to_parent.T, np.zeros(6)
+                to_parent @ covariance @ S, to_parent @ covariance @ to_parent.T, np.zeros(6)
             ),
             log_ratio=float(ratios[best]),
         )
 
-    def _sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Lags (l,), H and S over each, with the long-run variance and the uncertainty of what was
-        before counted in; the last lag is all there is.
+    def _shifts(self) -> tuple[IntArray, FloatArray]:
+        """Lags (l,), and the evidence (l, 6, 7) of a shift over each, with the long-run variance
+        and the uncertainty of what was before counted in; the last lag is all there is.
         """
-        lags = _LAGS[: np.searchsorted(_LAGS, len(self._S), side="right")]
-        H, S = np.cumsum(self._H, axis=0), np.cumsum(self._S, axis=0)
-        H = np.concatenate([H[lags - 1], [self._old[0] + H[-1]]]) / self.long_run
-        S = np.concatenate([S[lags - 1], [self._old[1] + S[-1]]]) / self.long_run
-        uncertain = np.linalg.inv(np.linalg.inv(self._covariance) + H[-1] - H)
-        before = (uncertain @ (S[-1] - S)[..., None])[..., 0]
-        off = S - (H @ before[..., None])[..., 0]
-        reduced = np.linalg.inv(np.eye(6) + H @ (uncertain + self._wander))
-        return np.append(lags, len(self._S)), reduced @ H, (reduced @ off[..., None])[..., 0]
+        n_seconds = len(self._stamps_ns)
+        lags = _LAGS[: np.searchsorted(_LAGS, n_seconds, side="right")]
+        since = self._seconds.since(n_seconds - lags)
+        since = np.concatenate([since, [self._old + self._seconds.total]]) / self.long_run
+        before = since[-1] - since
+        covariances = inverse(inverse(self._covariance) + information(before))
+        known = times(covariances, score(before))
+        tables = shift_evidence(since, known, covariances + self._wander)
+        return np.append(lags, n_seconds), tables
 
     def visible(self, seconds: float) -> FloatArray:
         """Shifts (6,) along (m) and about (rad) each axis of the parent sensor that so many seconds
@@ -301,14 +305,14 @@ class MountMonitor:
         """
         if self.is_learning:
             return np.full(6, np.inf)
-        H = self._H.sum(axis=0)
-        known = (self._old[0] + H) / self.long_run
+        H = information(self._seconds.total)
+        known = (information(self._old) + H) / self.long_run
         before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
-        H /= len(self._S)
+        H = H / len(self._stamps_ns)
         # Of that, what the rotation noise of a motion seems to tell of a translation: rotations
         # that never took place reveal nothing.
-        turns, precision = se3.skew(np.eye(3)), np.linalg.inv(self._noise)[:3, :3]
-        seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
+        turns, of_noise = se3.skew(np.eye(3)), np.linalg.inv(self._noise)[:3, :3]
+        seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, of_noise, turns)
         H[:3, :3] -= self._motions_per_s * seeming
         H *= seconds / self.long_run
         scale = np.sqrt(np.diag(moved.shift_covariance(100.0, np.pi)))
@@ -316,8 +320,8 @@ class MountMonitor:
         root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
         covariance = root @ root.T + before
         # A shift along or about an axis of z standard deviations has the ratio z^2 / 2 less this.
-        information = np.linalg.inv(covariance)
-        _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ information)
+        precision = np.linalg.inv(covariance)
+        _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ precision)
         seen_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
         sigmas = sigmas_in_parent(self._installed[:3, :3], covariance)
         return np.asarray(np.repeat(seen_sigmas, 3) * sigmas)
@@ -338,35 +342,30 @@ def _information(
     jacobians: FloatArray,
     noise: FloatArray,
     shift: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """H (p, p), S (p,) of motions for p parameters, and their weighted scatter (6, 6) about given
+) -> tuple[FloatArray, FloatArray]:
+    """Evidence (p, p + 1) of motions on p parameters, and their weighted scatter (6, 6) about given
     ones.
     """
-    precision = np.linalg.inv(noise)
     centred = residuals if shift is None else residuals + jacobians @ shift
-    squared = np.einsum("ki,ki->k", centred @ precision, centred)
+    squared = np.einsum("ki,ki->k", centred @ np.linalg.inv(noise), centred)
     weights = robust_weights("student", squared)
-    whitened = np.swapaxes(jacobians, 1, 2) @ precision * weights[:, None, None]
-    H = (whitened @ jacobians).sum(axis=0)
-    S = -np.einsum("kij,kj->i", whitened, residuals)
-    return H, S, (weights[:, None] * centred).T @ centred / len(centred)
+    table = moved.evidence(residuals, jacobians, noise, weights).sum(axis=0)
+    return table, (weights[:, None] * centred).T @ centred / len(centred)
 
 
-def _long_run_variance(H: FloatArray, S: FloatArray, known: float) -> float:
+def _long_run_variance(seconds: Blocks, known: float) -> float:
     """Long-run variance of the scores in units of the information, from those of seconds: the
     largest over windows of several lengths, each about the answer of all; what is known while there
     are too few.
     """
-    answer = moved.most_likely(H.sum(axis=0), S.sum(axis=0), TUNING.ridge)
+    answer = moved.most_likely(seconds.total, TUNING.ridge)
     found = []
     for length in TUNING.windows_s:
-        n_windows = len(S) // length
+        n_windows = len(seconds.sums) // length
         if n_windows < TUNING.assumed_windows:
             break
-        newest = n_windows * length
-        of_windows = H[:newest].reshape(n_windows, length, 6, 6).sum(axis=1)
-        scores = S[:newest].reshape(n_windows, length, 6).sum(axis=1) - of_windows @ answer
-        squared = moved.squared_shift(of_windows, scores, TUNING.ridge)
+        windows = Blocks(seconds.sums[-n_windows * length :]).merged(n_windows)
+        squared = moved.squares_about(windows.sums, answer, TUNING.ridge)
         seen = np.minimum(squared, TUNING.most_of_typical * np.median(squared)).sum() / 6
         found.append(
             (seen + TUNING.assumed_windows * TUNING.assumed) / (n_windows + TUNING.assumed_windows)

@@ -148,5 +148,5 @@ def test_a_scale_that_drifts_is_no_shift_and_hides_none():
 
 def test_memory_stays_constant():
     monitor, _ = fed(motion(TUNING.memory_s + 200.0, rate_hz=4.0), chunk=400)
-    assert len(monitor._S) == TUNING.memory_s
+    assert len(monitor._seconds.sums) == TUNING.memory_s
     assert len(monitor._tail) < 20
