@@ -23,7 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.arrays import BoolArray, FloatArray
+from hand_eye_calib.blocks import Blocks, information, score
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.se3 import deviation
 from hand_eye_calib.results.records import AXES
@@ -221,16 +222,19 @@ def _explanation(
 
     number = np.arange(len(errors))
     design = np.concatenate([np.broadcast_to(np.eye(6), weights.shape), errors[:, :, None]], axis=2)
-    each = np.swapaxes(design, 1, 2) @ weights @ design, _ranks(weights)
-    all_chi2, all_dof = _left(*(one.sum(axis=0) for one in each))
+    products = Blocks(np.swapaxes(design, 1, 2) @ weights @ design)
+    ranks = Blocks(_ranks(weights))
+    all_chi2, all_dof = _left(products.total, ranks.total)
     p_value = float(chdtrc(all_dof, all_chi2)) if all_dof else 1.0
     kind, apart = "differ" if p_value < _LEVEL else "agree", number < 0
     if len(number) < 3:
         kind = kind if len(number) == 2 else "single"
         return kind, apart, float(all_chi2), int(all_dof), p_value
-    alone_since = [np.concatenate([one, np.cumsum(one[::-1], axis=0)[::-1][2:-1]]) for one in each]
-    others = [one.sum(axis=0) - some for one, some in zip(each, alone_since, strict=True)]
-    chi2, dof = np.add(_left(*alone_since), _left(*others))
+    since = np.arange(2, len(number) - 1)
+    group = np.concatenate([products.sums, products.since(since)])
+    ranks_of_group = np.concatenate([ranks.sums, ranks.since(since)])
+    others = products.total - group, ranks.total - ranks_of_group
+    chi2, dof = np.add(_left(group, ranks_of_group), _left(*others))
     gained, spent = all_chi2 - chi2, all_dof - dof
     p_values = chdtrc(spent, gained)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -247,15 +251,16 @@ def _explanation(
     return kind, apart, float(all_chi2), int(all_dof), p_value
 
 
-def _left(products: FloatArray, ranks: IntArray) -> tuple[FloatArray, FloatArray]:
+def _left(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Chi-square and degrees of freedom that are left of groups of errors after the common part of
     each, from sums of ``(1 e)' W (1 e)`` (..., 7, 7) and of the ranks of W.
     """
-    weights, weighted = products[..., :6, :6], products[..., :6, 6]
+    weights, weighted = information(products), score(products)
     common = np.linalg.solve(weights, weighted[..., None])[..., 0]
-    chi2 = products[..., 6, 6] - (weighted * common).sum(axis=-1)
+    chi2 = products[..., -1, -1] - (weighted * common).sum(axis=-1)
     return np.maximum(chi2, 0.0), np.asarray(ranks - _ranks(weights), dtype=float)
 
 
-def _ranks(weights: FloatArray) -> IntArray:
-    return np.asarray((np.linalg.eigvalsh(weights) > 1 / _UNKNOWN**2).sum(axis=-1))
+def _ranks(weights: FloatArray) -> FloatArray:
+    seen = np.linalg.eigvalsh(weights) > 1 / _UNKNOWN**2
+    return np.asarray(seen.sum(axis=-1), dtype=float)
