@@ -17,7 +17,7 @@ import numpy as np
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.checks.findings import CONVENTIONS, Finding, Severity, conventions, finding
 from hand_eye_calib.geometry import se3
-from hand_eye_calib.solvers.robot_world import closest_rotations
+from hand_eye_calib.solvers.robot_world import Stops, closest_rotations, solve
 from hand_eye_calib.stats import median, medians, robust_weights
 
 # Fewest stops that can contradict: four have twelve coordinates for seven unknown lengths.
@@ -43,8 +43,22 @@ _BY_NOISE = 4.0
 _BEYOND_NOISE = 12.0
 _CONTRADICTING = 0.08
 
-# A mistake is named if without it so many times less stays unexplained.
-_DECISIVE = 3.0
+# Rotations of rows in another order, or of angles read otherwise, agree if they are so many times
+# closer.
+_CLEARLY = 3.0
+
+# A mistake is repaired if the log likelihood without it is larger by this number, and by the
+# logarithm of the second for each coordinate of the stops. KinHEC's stops with strong noise have
+# 190 to 400 for 30 stops, and the logarithm of 2 asks for 62.
+_EVIDENCE = 36.0
+_DECISIVE = 2.0
+
+# Stops are right as they are if their log likelihood is larger than with any mistake by this number:
+# a factor of 1100 between the likelihoods. Between both numbers the stops do not tell.
+_LEAD = 7.0
+
+# Explanations that are solved to compare their likelihoods: the best ones of the rough fits.
+_SOLVED = 6
 
 # Mistakes that leave about as much unexplained, and are as simple, cannot be told apart.
 _ABOUT_EQUAL = 1.5
@@ -145,12 +159,15 @@ class RoughFit:
         Median error of the positions over that which the errors of the rotations cause.
     scale : float or None
         Factor of the child's lengths; None if the stops do not determine it.
+    log_likelihood : float
+        Of the median errors, with a free factor of the child's lengths, but for a constant.
     """
 
     turning: float
     placing: float
     beyond: float = 0.0
     scale: float | None = None
+    log_likelihood: float = 0.0
 
     @property
     def unexplained(self) -> float:
@@ -275,7 +292,7 @@ def _rows(given: GivenStops) -> Iterator[Finding]:
     n = min(len(given), _MOST)
     of_parent, of_child = angles_between(given.parent[:n]), angles_between(given.child[:n])
     apart = median(np.abs(_upper(of_parent - of_child)))
-    best, least = "", apart / _DECISIVE
+    best, least = "", apart / _CLEARLY
     for text, rows in _orders(n):
         left = median(
             np.abs(_upper(of_parent[np.ix_(rows[0], rows[0])] - of_child[np.ix_(rows[1], rows[1])]))
@@ -401,7 +418,7 @@ def _angles(given: GivenStops) -> Iterator[Finding]:
     spread = max(median(_upper(angles["parent"])), median(_upper(angles["child"])))
     if apart < _HOLDS * _ROTATES or apart < _EXPLAINED * spread:
         return
-    least = min(apart / _DECISIVE, _HOLDS * spread)
+    least = min(apart / _CLEARLY, _HOLDS * spread)
     agreeing = []
     for stream, other in (("parent", "child"), ("child", "parent")):
         for detail, rotations in _read_otherwise(getattr(few, stream)):
@@ -468,25 +485,49 @@ def _explained(few: GivenStops) -> tuple[Mistakes, RoughFit, list[Mistakes]]:
     plain = [Mistakes()] + [Mistakes(is_inverse=True)] * few.is_arm
     fits = [(mistakes, rough_fit(few, mistakes)) for mistakes in plain]
     # Where the rotations say which way round it is, the positions do not overrule them.
-    most = _DECISIVE * min(fit.turning for _, fit in fits)
-    chosen, fit = min((each for each in fits if each[1].turning <= most), key=_badness)
-    if fit.is_noise:
-        return chosen, fit, []
-    tried = []
-    for parent in _WAYS:
-        for child in _WAYS:
-            for is_inverse in (False, True):
-                mistakes = Mistakes(parent, child, is_inverse)
-                if mistakes not in plain:
-                    tried.append((mistakes, rough_fit(few, mistakes)))
-    least = min(each.unexplained for _, each in tried)
-    if not (least < _HOLDS and _DECISIVE * least < fit.unexplained):
-        return chosen, fit, []
-    good = [each for each in tried if each[1].unexplained <= _ABOUT_EQUAL * least]
+    most = _CLEARLY * min(fit.turning for _, fit in fits)
+    given = min((candidate for candidate in fits if candidate[1].turning <= most), key=_badness)
+    if given[1].unexplained < _EXPLAINED or not few.has_positions:
+        return *given, []
+    rivals = _rivals(few, plain)
+    solved = [(_objective(few, *rival), *rival) for rival in rivals]
+    least = min(objective for objective, *_ in solved)
+    lead = min(_objective(few, *candidate) for candidate in fits) - least
+    if lead < -_LEAD:
+        return *given, []
+    good = [(mistakes, fit) for objective, mistakes, fit in solved if objective < least + _LEAD]
     simplest = min(mistakes.complexity for mistakes, _ in good)
-    good = [each for each in good if each[0].complexity == simplest]
+    good = [rival for rival in good if rival[0].complexity == simplest]
+    if lead < _decisive(len(few)):
+        return *given, [mistakes for mistakes, _ in good]
     chosen, fit = min(good, key=_badness)
+    if fit.unexplained > _HOLDS:
+        return *given, []
     return chosen, fit, [mistakes for mistakes, _ in good if mistakes != chosen]
+
+
+def _rivals(few: GivenStops, plain: Collection[Mistakes]) -> list[tuple[Mistakes, RoughFit]]:
+    """Return the mistakes with the best rough fits."""
+    rivals = []
+    for parent, child in itertools.product(_WAYS, _WAYS):
+        for is_inverse in (False, True):
+            mistakes = Mistakes(parent, child, is_inverse)
+            if mistakes not in plain:
+                rivals.append((mistakes, rough_fit(few, mistakes)))
+    rivals.sort(key=lambda rival: -rival[1].log_likelihood)
+    return rivals[:_SOLVED]
+
+
+def _objective(few: GivenStops, mistakes: Mistakes, fit: RoughFit) -> float:
+    """Negative log likelihood of the stops without these mistakes, in lengths of the parent."""
+    A, B = few.sides(mistakes)
+    B = se3.from_rotation_translation(B[:, :3, :3], (fit.scale or 1.0) * B[:, :3, 3])
+    return solve(Stops.of_one(A, B)).objective
+
+
+def _decisive(n_stops: int) -> float:
+    """Return the difference of log likelihoods that decides for a mistake in so many stops."""
+    return max(_EVIDENCE, 3.0 * n_stops * float(np.log(_DECISIVE)))
 
 
 def _badness(tried: tuple[Mistakes, RoughFit]) -> float:
@@ -509,7 +550,8 @@ def rough_fit(given: GivenStops, mistakes: Mistakes) -> RoughFit:
     placing, position, scale = _placed(A, B, Z)
     distance = (scale or 1.0) * median(np.linalg.norm(B[:, :3, 3], axis=1))
     beyond = position / max(median(left) * distance, 1e-12)
-    return RoughFit(turning, placing, beyond, scale)
+    logs = np.log(max(median(left), 1e-12)) + np.log(max(position, 1e-12))
+    return RoughFit(turning, placing, beyond, scale, -3.0 * len(A) * float(logs))
 
 
 def _placed(A: FloatArray, B: FloatArray, Z: FloatArray) -> tuple[float, float, float | None]:
@@ -524,7 +566,7 @@ def _placed(A: FloatArray, B: FloatArray, Z: FloatArray) -> tuple[float, float, 
     left, values = _least(free, A[:, :3, 3])
     spreads = [_spread(A[:, :3, 3]), _spread(of_child)]
     scale = float(values[6])
-    if scale > 0.0 and left < without / _DECISIVE:
+    if scale > 0.0 and without > left * np.exp(_decisive(len(A)) / (3.0 * len(A))):
         return left / max(min(spreads[0], scale * spreads[1]), 1e-12), left, scale
     # A hand that moves about one point, or a fault: one unit of length.
     left, _ = _least(levers, A[:, :3, 3] - of_child)
@@ -593,21 +635,22 @@ def _axes(few: GivenStops, fit: RoughFit) -> Finding | None:
     """A finding if the positions of one side are clearly in other axes: that explains more than the
     best of the other mistakes, whose fit is given.
     """
-    if fit.is_noise:
+    if fit.unexplained < _EXPLAINED:
         return None
     best: tuple[str, str] | None = None
-    least = min(fit.unexplained / _DECISIVE, _HOLDS)
+    most = fit.log_likelihood + _decisive(len(few))
     for is_inverse in (False, True) if few.is_arm else (False,):
         mistakes = Mistakes(is_inverse=is_inverse)
-        if rough_fit(few, mistakes).turning > least:
+        if rough_fit(few, mistakes).turning > _HOLDS:
             continue
         for detail, matrix in _signed_axes():
             for stream in ("child", "parent"):
                 poses = getattr(few, stream)
                 moved = _with_poses(few, stream, poses[:, :3, :3], poses[:, :3, 3] @ matrix.T)
-                other = rough_fit(moved, mistakes).unexplained
-                if other < least:
-                    best, least = (stream, detail), other
+                other = rough_fit(moved, mistakes)
+                if other.log_likelihood > most and other.unexplained < _HOLDS:
+                    best = stream, detail
+                    most = other.log_likelihood
     return finding("axes", best[0], detail=best[1]) if best else None
 
 
