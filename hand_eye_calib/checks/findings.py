@@ -360,8 +360,8 @@ _ROWS = {
         code="inverse",
     ),
     "ambiguous_stops": _Row(
-        "another mistake explains these stops as well: {detail}",
-        "say with options which of both it is",
+        "two conventions explain these stops alike: {given}, or {other}",
+        "look up the convention of both sources and give the options of the first, or",
         code="ambiguous",
     ),
     "both_readings": _Row(

@@ -16,6 +16,7 @@ import numpy as np
 
 from hand_eye_calib.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.checks.findings import CONVENTIONS, Finding, Severity, conventions, finding
+from hand_eye_calib.config import CalibratorConfig
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.solvers.robot_world import Stops, closest_rotations, solve
 from hand_eye_calib.stats import median, medians, robust_weights
@@ -53,7 +54,7 @@ _CLEARLY = 3.0
 _EVIDENCE = 36.0
 _DECISIVE = 2.0
 
-# Stops are right as they are if their log likelihood is larger than with any mistake by this number:
+# Stops are right as they are if their log likelihood exceeds that of any mistake by this number:
 # a factor of 1100 between the likelihoods. Between both numbers the stops do not tell.
 _LEAD = 7.0
 
@@ -602,10 +603,34 @@ def _named(
     if mistakes.is_inverse and not given.is_arm:
         findings.append(finding("inverse_stops", "child", options={"child_invert": "poses"}))
     if others:
-        told = [f"{code} of {stream}" for code, stream in _streams(others[0])]
-        doubt = " and ".join(told).replace("_", " ")
-        findings.append(finding("ambiguous_stops", detail=doubt))
+        findings.append(_ambiguous(mistakes, others[0]))
     return findings, repairs
+
+
+def _ambiguous(mistakes: Mistakes, other: Mistakes) -> Finding:
+    """Return the finding that two explanations fit alike, with the options of both."""
+    options = {"the first": _options_of(mistakes), "the other": _options_of(other)}
+    # Each names what the other one would set, so that both are settled.
+    for own, rival in (("the first", "the other"), ("the other", "the first")):
+        for name in options[rival]:
+            options[own].setdefault(name, getattr(CalibratorConfig, name))
+    readings = []
+    for values in options.values():
+        readings.append(" ".join(f"{name} {value}" for name, value in values.items()))
+    return finding(
+        "ambiguous_stops",
+        options=options["the other"],
+        given=readings[0],
+        other=readings[1],
+    )
+
+
+def _options_of(mistakes: Mistakes) -> dict[str, float | str]:
+    """Return the options that put mistakes right."""
+    options: dict[str, float | str] = {}
+    for code, stream in _streams(mistakes):
+        options |= conventions(code, stream)
+    return options
 
 
 def _streams(mistakes: Mistakes) -> list[tuple[str, str]]:
@@ -701,13 +726,12 @@ def _unit_of_size(positions: FloatArray) -> float:
     return centimetre if is_cm else millimetre
 
 
-def scale_finding(scale: float, sigma: float, is_used: bool) -> Finding:
-    """The finding that the child's lengths are those of a target of another size."""
-    severity = Severity.WARNING if is_used else Severity.ERROR
+def scale_finding(scale: float, sigma: float) -> Finding:
+    """Return the finding that the child's lengths are those of a target of another size."""
     return finding(
         "target_scale",
         "child",
-        severity,
+        Severity.ERROR,
         {"scale": "estimate"},
         scale=scale,
         sigma=sigma,

@@ -42,9 +42,9 @@ _OBEYED = {
 }
 _OBEYED_GROUPS = ("prior_", "target_")
 
-# A scale is used, or contradicts, if it is so many of its standard deviations and this share off.
-# Noise of the positions makes it smaller: by three squared standard deviations for each stop, of
-# which so many times as much is allowed (KinHEC: 0.74 +/- 0.03 where 1 is right).
+# A scale contradicts if it is so many of its standard deviations and this share off. Noise of the
+# child's positions makes it smaller, by three squared standard deviations for each stop; that of
+# the parent's does not. Of KinHEC's noisy stops (0.76 +/- 0.06 where 1 is right) that is enough.
 _SCALE_SIGMAS = 3.0
 _SCALE_SHARE = 0.01
 _BY_NOISE = 3.0
@@ -276,7 +276,12 @@ def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
     """Check the stops, repair what is certain, solve, and estimate the scale if it matters."""
     stops = _put_right(given, config)
     examination = examine(stops)
-    findings = [_as_set(found, config) for found in examination.findings]
+    findings = []
+    for found in examination.findings:
+        # Who has named the convention of both sides has decided.
+        is_decided = found.code == "ambiguous" and {*found.options} <= config.given
+        if not is_decided:
+            findings.append(_as_set(found, config) if found.code != "ambiguous" else found)
     settled = {found.code for found in examination.repairs if {*found.options} & config.given}
     repairs = []
     for repair in examination.repairs:
@@ -337,15 +342,17 @@ def _with_scale(
     fit, stops, is_inverse, lead = _fit(given, start)
     is_unusable = any(found.makes_unusable for found in findings)
     scale, sigma = 1.0, 0.0
-    if wants_scale or (rough_scale and not is_unusable):
+    is_determined = given.has_positions and turns_about_two_axes(given.parent)
+    if wants_scale or (is_determined and not is_unusable):
         free = _with_free_scale(given, start, is_inverse)
         scale, sigma = free[2], free[3]
-        is_clear = _is_clear(scale, sigma, len(stops))
+        off = _off_scale(scale, sigma, len(stops))
+        is_clear = off > _SCALE_SHARE
         is_given = "scale" in config.given and config.scale not in ("auto", "estimate")
         is_size = 1.0 / _WRONG_SCALE < scale < _WRONG_SCALE
         is_used = wants_scale or (is_clear and is_size and not is_given)
         if is_clear and not wants_scale:
-            findings = [*findings, scale_finding(base * scale, base * sigma, is_used)]
+            findings = [*findings, scale_finding(base * scale, base * sigma)]
         if is_used:
             fit, stops = free[0], free[1]
             if not wants_scale:
@@ -386,11 +393,13 @@ def _of_unknown(given: GivenStops, fit: RobotWorld, findings: list[Finding]) -> 
     return [finding("disagreeing_stops", part="rotations", share=share)]
 
 
-def _is_clear(scale: float, sigma: float, n_stops: int) -> bool:
-    """Whether a scale differs from 1 by more than its errors."""
+def _off_scale(scale: float, sigma: float, n_stops: int) -> float:
+    """Return the share by which a scale differs from 1, beyond its errors."""
     share = sigma / scale
-    by_noise = _BY_NOISE * 3.0 * n_stops * share**2
-    return abs(np.log(scale)) > max(_SCALE_SIGMAS * share + by_noise, _SCALE_SHARE)
+    by_noise = _BY_NOISE * n_stops * share**2
+    lowest = np.log(scale) - _SCALE_SIGMAS * share
+    highest = np.log(scale) + by_noise + _SCALE_SIGMAS * share
+    return float(max(lowest, -highest, 0.0))
 
 
 def _fit(given: GivenStops, scale: float) -> tuple[RobotWorld, Stops, bool, float]:

@@ -55,9 +55,9 @@ RIGHT = [
     ("q7w.npz", IN_HAND, "hand", "w x y z"),
     ("robot_mm.npz", IN_HAND, "hand", "parent stream's lengths are millimetres"),
     ("track_mm.npz", IN_HAND, "hand", "child stream's lengths are millimetres"),
-    ("s_to_2.0.npz", BESIDE, "base", "multiplied by 0.4998"),
-    ("s_in_2.0.npz", IN_HAND, "hand", "multiplied by 0.4998"),
-    ("s_in_0.5.npz", IN_HAND, "hand", "multiplied by 1.999"),
+    ("s_to_2.0.npz --scale estimate", BESIDE, "base", "read as a camera"),
+    ("s_in_2.0.npz --scale estimate", IN_HAND, "hand", "read as a camera"),
+    ("s_in_0.5.npz --scale estimate", IN_HAND, "hand", "read as a camera"),
     ("opencv.npz", IN_HAND, "hand", "read as a camera on the hand"),
     (
         "H.npy C.npy --order none --pair-by row --child-invert poses",
@@ -135,3 +135,11 @@ def test_rotations_alone_have_no_position(arms, capsys):
     assert "x, y and z are out of reach" in document["headline"]
     assert off(document, IN_HAND)[1] < WITHIN_DEG
     assert document["T_parent_child"]["translation"] == [None, None, None]
+
+
+@pytest.mark.parametrize("name", ["s_to_2.0.npz", "s_in_2.0.npz", "s_in_0.5.npz"])
+def test_a_target_of_another_size_is_refused_and_its_scale_named(arms, capsys, name):
+    code, document, _ = run(arms, capsys, name)
+    assert code == 3
+    assert "multiplied by" in document["findings"][0]["what"]
+    assert document["findings"][0]["options"] == {"scale": "estimate"}

@@ -110,9 +110,6 @@ REPAIRED = {
         lambda Ts: scaled(Ts, 1e2),
         "lengths are centimetres",
     ),
-    "target of twice the size": (same, lambda Ts: scaled(Ts, 2.0), "times as long"),
-    "target of 1.1 times the size": (same, lambda Ts: scaled(Ts, 1.1), "times as long"),
-    "millimetres, and another size": (same, lambda Ts: scaled(Ts, 1500.0), "multiplied by"),
 }
 
 # Mistakes that are refused, and the code of the finding.
@@ -151,6 +148,45 @@ def test_what_is_certain_is_repaired_and_said(name, place):
     assert text in words(result)
     assert f"read as a camera {place}" in words(result)
     assert result.verdict is not hec.Verdict.DO_NOT_USE
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("factor", [0.9, 1.1, 2.0])
+def test_a_target_of_another_size_is_refused_with_its_scale_and_the_option(factor, place):
+    robot, tracking, truth = arm(place)
+    result = calibrate_arm(robot, scaled(tracking, factor))
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    assert result.findings[0].code == "scale"
+    assert result.findings[0].options == {"scale": "estimate"}
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[:3]) < WITHIN_M
+    asked = calibrate_arm(robot, scaled(tracking, factor), CalibratorConfig(scale="estimate"))
+    assert "scale" not in [found.code for found in asked.findings]
+    assert asked.verdict is not hec.Verdict.DO_NOT_USE
+
+
+NOISY = {
+    "scalar first, both": (scalar_first, scalar_first),
+    "scalar first, target": (same, scalar_first),
+    "rotations inverted, robot": (transposed_rotations, same),
+    "rotations inverted, target": (same, transposed_rotations),
+    "target of twice the size": (same, lambda Ts: scaled(Ts, 2.0)),
+}
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("name", NOISY)
+def test_strong_noise_does_not_hide_a_mistake(name, place):
+    of_robot, of_target = NOISY[name]
+    for seed in range(4):
+        robot, tracking, truth = arm(place, seed=40 + seed, n=30, noise_m=0.02)
+        clean = calibrate_arm(robot, tracking)
+        assert clean.verdict is not hec.Verdict.DO_NOT_USE
+        least = np.linalg.norm(se3.log(se3.inverse(clean.T_parent_child) @ truth)[:3])
+        result = calibrate_arm(of_robot(robot), of_target(tracking))
+        error = np.linalg.norm(se3.log(se3.inverse(result.T_parent_child) @ truth)[:3])
+        is_refused = result.verdict is hec.Verdict.DO_NOT_USE
+        assert is_refused or error < 2.0 * least + 0.02
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
