@@ -360,7 +360,7 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         "time: by the stamps; row: poses without stamps, in their order; name: poses of images of "
         "the same name. For both files"
     )
-    group.add_argument("--pair-by", choices=config.PAIR_BY, default=config.PAIR_BY[0], help=pair_by)
+    group.add_argument("--pair-by", choices=config.PAIR_BY, help=pair_by)
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:

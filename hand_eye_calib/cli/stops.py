@@ -46,8 +46,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
             raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
         images = target_images.images_in(child_path)
     of_poses = [parent_path] if arguments.target else arguments.paths
-    if arguments.pair_by == "time":
-        arguments.pair_by = "row"
+    arguments.pair_by = arguments.pair_by or "row"
     files = read_files(arguments, of_poses, options)
     note(*files.repairs, *files.warnings)
     parent, *others = files.trajectories
@@ -76,8 +75,10 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
 def _refuse_ignored(arguments: Namespace) -> None:
     """Refuse arguments that stops have no use for."""
     names = ["topics", *(f"{stream}_{name}" for stream in STREAMS for name in ("topic", "fields"))]
+    if arguments.pair_by == "time":
+        raise ConfigError("--pair-by time has no meaning for stops, which have no stamps; give row")
     if len(arguments.paths) == 1:
-        names += [*FILE_OPTIONS]
+        names += [*FILE_OPTIONS, "pair_by"]
         names += [f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS]
     for name in names:
         if getattr(arguments, name, None):

@@ -353,3 +353,15 @@ def test_degrees_under_names_of_rotation_vectors_are_refused(tmp_path, capsys):
     files = [str(tmp_path / name) for name in ("hand.csv", "camera.tum")]
     assert main(["calibrate", *files, "--order", "none"]) == 1
     assert "angles in degrees" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("n_files", [1, 2])
+def test_pairing_by_time_is_refused_for_stops(n_files, tmp_path, capsys):
+    robot, tracking, _ = arm(ON_HAND)
+    np.savez(tmp_path / "arm.npz", robot=robot, tracking=tracking)
+    for name, Ts in (("hand", robot), ("camera", tracking)):
+        np.save(tmp_path / f"{name}.npy", Ts)
+    names = ["arm.npz"] if n_files == 1 else ["hand.npy", "camera.npy", "--order", "none"]
+    words = [str(tmp_path / name) if "." in name else name for name in names]
+    assert main(["calibrate", *words, "--pair-by", "time"]) == 2
+    assert "--pair-by time has no meaning for stops" in capsys.readouterr().err
