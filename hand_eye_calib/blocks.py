@@ -85,7 +85,8 @@ class Blocks:
         """
         before = self.before(cuts)
         covariances = inverse(information(before) + prior)
-        return shift_evidence(self.since(cuts), times(covariances, score(before)), covariances)
+        known = (covariances @ score(before)[..., None])[..., 0]
+        return shift_evidence(self.since(cuts), known, covariances)
 
     def solve(self, columns: Sequence[int]) -> FloatArray:
         """Answer (k,) of all blocks for some of the unknowns, the others being zero."""
@@ -112,11 +113,6 @@ def inverse(matrices: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrices), dtype=float)
 
 
-def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Products (..., p) of matrices (..., p, p) and vectors (..., p)."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
-
-
 def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray) -> FloatArray:
     """Evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from those that are known.
 
@@ -130,7 +126,8 @@ def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray
         Of the errors of ``known``.
     """
     H = information(tables)
-    from_known = np.concatenate([H, (score(tables) - times(H, known))[..., None]], axis=-1)
+    scores = score(tables)[..., None] - H @ known[..., None]
+    from_known = np.concatenate([H, scores], axis=-1)
     return inverse(np.eye(H.shape[-1]) + H @ covariance) @ from_known
 
 

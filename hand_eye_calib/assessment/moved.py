@@ -28,7 +28,7 @@ import numpy as np
 
 from hand_eye_calib import stats
 from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.blocks import Blocks, information, inverse, score, times
+from hand_eye_calib.blocks import Blocks, information, inverse, score
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.gls.normal import NormalEquations
 from hand_eye_calib.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -120,7 +120,7 @@ def squares_about(tables: FloatArray, answers: FloatArray, ridge: float) -> Floa
     in units of their covariance.
     """
     H = information(tables)
-    scores = score(tables) - times(H, answers)
+    scores = score(tables) - se3.times(H, answers)
     return np.asarray((scores * solve(H + ridge * _OF_SHIFT, scores)).sum(axis=-1))
 
 
@@ -271,7 +271,7 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     joint = max(misfit, 1.0) * (before.covariance + after.covariance)[known, :6, :6]
     steps = (after.step - before.step)[known, :6]
     H = np.linalg.inv(joint)
-    S = times(H, steps)
+    S = se3.times(H, steps)
     tables = np.concatenate([H, S[..., None]], axis=2)
     ratios = log_ratio(tables)
     found = _probability(ratios)
@@ -282,7 +282,7 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     spread = found * squared / 4.0
     beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
-    scores = times(beside, steps)[..., None]
+    scores = se3.times(beside, steps)[..., None]
     if _probability(log_ratio(np.concatenate([beside, scores], axis=2))) < 0.5:
         return spread, ()
     best = int(np.argmax(ratios))

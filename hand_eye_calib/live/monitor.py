@@ -23,7 +23,7 @@ from hand_eye_calib.arrays import FloatArray, IntArray
 from hand_eye_calib.assessment import change, moved
 from hand_eye_calib.assessment.comparison import SEEN_TARGETS
 from hand_eye_calib.assessment.covariance import floor_of_pairs
-from hand_eye_calib.blocks import Blocks, information, inverse, score, shift_evidence, times
+from hand_eye_calib.blocks import Blocks, information, inverse, score, shift_evidence
 from hand_eye_calib.engine.calibrator import BufferLimits
 from hand_eye_calib.geometry import se3
 from hand_eye_calib.geometry.frames import Extrinsic
@@ -295,7 +295,7 @@ class MountMonitor:
         since = np.concatenate([since, [self._old + self._seconds.total]]) / self.long_run
         before = since[-1] - since
         covariances = inverse(inverse(self._covariance) + information(before))
-        known = times(covariances, score(before))
+        known = se3.times(covariances, score(before))
         tables = shift_evidence(since, known, covariances + self._wander)
         return np.append(lags, n_seconds), tables
 
