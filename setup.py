@@ -31,7 +31,7 @@ def files(pattern):
 def all_commands():
     """Names in the table of commands, which imports nothing but Python."""
     sys.path.insert(0, str(HERE))
-    from hand_eye_calib.registry import COMMANDS
+    from hand_eye_calib.core.base.registry import COMMANDS
 
     return tuple(COMMANDS)
 
@@ -84,10 +84,9 @@ setup(
     packages=find_packages(include=[name, f"{name}.*"]),
     package_data={
         name: ["py.typed", "*.pyi", "sample/*"],
-        f"{name}.report": ["templates/*.html", "templates/*.css"],
-        f"{name}.io": ["templates/*"],
-        f"{name}.results": ["*.yaml"],
-        f"{name}.watch": ["page/*"],
+        f"{name}.offline.report": ["templates/*.html", "templates/*.css"],
+        f"{name}.formats": ["templates/*", "*.yaml"],
+        f"{name}.online.watch": ["page/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
@@ -136,9 +135,9 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            f"{name} = hand_eye_calib.cli.main:main",
+            f"{name} = hand_eye_calib.offline.cli.main:main",
             *(
-                f"{command} = hand_eye_calib.cli.main:named_command"
+                f"{command} = hand_eye_calib.offline.cli.main:named_command"
                 for command in (all_commands() if is_for_ros else PIP_COMMANDS)
             ),
         ]

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.gls import positions
-from hand_eye_calib.gls.tuning import TUNING
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.extras.partial import positions
 from reproduction.ablation import Case, outcome, real_cases, simulated_cases
 from reproduction.writing import seed_of, study_parser, write_csv
 

@@ -40,11 +40,11 @@ sys.path[:0] = [str(PROJECT), str(PROJECT / "benchmarks"), str(PROJECT / "test")
 from suite.data import START_NS, STREAMS, T_PARENT_CHILD, parts  # noqa: E402
 from suite.table import Table, show  # noqa: E402
 
-from hand_eye_calib.config import CalibratorConfig  # noqa: E402
-from hand_eye_calib.engine.calibrator import Calibrator  # noqa: E402
-from hand_eye_calib.errors import InputError  # noqa: E402
-from hand_eye_calib.io.journal import read_journal  # noqa: E402
-from hand_eye_calib.io.results import load_result, save_result  # noqa: E402
+from hand_eye_calib.core.base.config import CalibratorConfig  # noqa: E402
+from hand_eye_calib.core.base.errors import InputError  # noqa: E402
+from hand_eye_calib.core.engine.calibrator import Calibrator  # noqa: E402
+from hand_eye_calib.formats.journal import read_journal  # noqa: E402
+from hand_eye_calib.formats.results import load_result, save_result  # noqa: E402
 
 PARTS = ("load", "share", "busy", "soak", "kill")
 
@@ -64,7 +64,7 @@ MOST_SLOWDOWN = 1.5
 SLOW = "HAND_EYE_CALIB_SLOW"
 SLOW_SOLVER = """
 import time
-from hand_eye_calib.live import solving
+from hand_eye_calib.online.live import solving
 excitation = solving.excitation
 def slow(pose_pairs):
     end = time.process_time() + 2.0
@@ -81,11 +81,11 @@ def measured_node(report, arguments):
     """The node as it is, with a stopwatch at its pose callback; writes what it saw when it is told
     to end.
     """
-    from hand_eye_calib.live import cycle
-    from hand_eye_calib.live.solving import SolvingProcess
-    from hand_eye_calib.ros.calibrator_node import CalibratorNode
-    from hand_eye_calib.ros.inputs import TopicInput
-    from hand_eye_calib.ros.node import main
+    from hand_eye_calib.online.live import cycle
+    from hand_eye_calib.online.live.solving import SolvingProcess
+    from hand_eye_calib.online.ros.calibrator_node import CalibratorNode
+    from hand_eye_calib.online.ros.inputs import TopicInput
+    from hand_eye_calib.online.ros.node import main
 
     if SLOW in os.environ:
         cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)

@@ -12,31 +12,31 @@ nothing but Python.
 from importlib import import_module
 from typing import Any
 
-from hand_eye_calib import extras, io, offline, online
-from hand_eye_calib.registry import PUBLIC_NAMES
+from hand_eye_calib import extras, formats, offline, online
+from hand_eye_calib.core.base.registry import PUBLIC_NAMES
 
 # Module of every public name; the extras register theirs.
 _MODULES = {
-    "CalibratorConfig": "hand_eye_calib.config",
-    "Calibrator": "hand_eye_calib.engine.calibrator",
-    "calibrate": "hand_eye_calib.engine.offline",
-    "cross_check": "hand_eye_calib.engine.offline",
-    "HandEyeCalibError": "hand_eye_calib.errors",
-    "Trajectory": "hand_eye_calib.geometry.trajectory",
-    "load": "hand_eye_calib.io.results",
-    "save": "hand_eye_calib.io.results",
-    "read_trajectory": "hand_eye_calib.io.trajectory_files.reading",
-    "write_trajectory": "hand_eye_calib.io.trajectory_files.table",
-    "plot": "hand_eye_calib.report.figures",
-    "Calibration": "hand_eye_calib.results.calibration",
-    "Residuals": "hand_eye_calib.results.records",
-    "SolveStatus": "hand_eye_calib.results.records",
-    "Reason": "hand_eye_calib.results.verdict",
-    "Verdict": "hand_eye_calib.results.verdict",
-    "compare": "hand_eye_calib.assessment.comparison",
+    "CalibratorConfig": "hand_eye_calib.core.base.config",
+    "Calibrator": "hand_eye_calib.core.engine.calibrator",
+    "calibrate": "hand_eye_calib.offline.calibrate",
+    "cross_check": "hand_eye_calib.offline.calibrate",
+    "HandEyeCalibError": "hand_eye_calib.core.base.errors",
+    "Trajectory": "hand_eye_calib.core.geometry.trajectory",
+    "load": "hand_eye_calib.formats.results",
+    "save": "hand_eye_calib.formats.results",
+    "read_trajectory": "hand_eye_calib.formats.trajectory_files.reading",
+    "write_trajectory": "hand_eye_calib.formats.trajectory_files.table",
+    "plot": "hand_eye_calib.offline.report.figures",
+    "Calibration": "hand_eye_calib.core.results.calibration",
+    "Residuals": "hand_eye_calib.core.results.records",
+    "SolveStatus": "hand_eye_calib.core.results.records",
+    "Reason": "hand_eye_calib.core.results.verdict",
+    "Verdict": "hand_eye_calib.core.results.verdict",
+    "compare": "hand_eye_calib.core.assessment.comparison",
 }
 
-for _layer in (io, offline, online, extras):
+for _layer in (formats, offline, online, extras):
     _layer.register()
 _MODULES |= PUBLIC_NAMES
 
@@ -45,7 +45,7 @@ __all__ = [*_MODULES]
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from hand_eye_calib.version import version_of
+        from hand_eye_calib.core.base.version import version_of
 
         return version_of()
     if name not in _MODULES:

@@ -16,9 +16,9 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig, other_names
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.option import check_value, option_name
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig, other_names
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.option import check_value, option_name
 
 PARAMETERS = {
     option_name(field): field

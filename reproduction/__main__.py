@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hand_eye_calib.cli.main import exit_code_of
-from hand_eye_calib.cli.options import note
-from hand_eye_calib.errors import ConfigError
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.offline.cli.main import exit_code_of
+from hand_eye_calib.offline.cli.options import note
 from reproduction import certificate, conclusions, faults, figures, findings, published, tables
 from reproduction.published import KITTI, METHODS, SIMULATED
 from reproduction.results import SIMULATION_METHODS, Results

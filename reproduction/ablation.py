@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.alignment.similarity import settle_scale
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.gls import estimator
-from hand_eye_calib.gls.tuning import TUNING
-from hand_eye_calib.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.alignment.similarity import settle_scale
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.noise import estimator
+from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import Rig, real_rigs
 from reproduction.writing import markdown_table, seed_of, show, study_parser

@@ -15,10 +15,10 @@ the one that was fitted (lengths between 0.5 and 1 are common with noise).
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers.all_pairs import Solution, residual_rows
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.solvers.all_pairs import Solution, residual_rows
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _MAX_ITERATIONS = 300

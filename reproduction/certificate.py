@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import quadratic_form
-from hand_eye_calib.solvers.all_pairs import Solution
-from hand_eye_calib.solvers.certificate import is_global
-from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.solvers import quadratic_form
+from hand_eye_calib.core.solvers.all_pairs import Solution
+from hand_eye_calib.core.solvers.certificate import is_global
+from hand_eye_calib.core.solvers.registry import Method
 from reproduction.published import KITTI, LEVELS, REFERENCES, SIMULATED
 from reproduction.results import Results
 from reproduction.runner import in_parallel

@@ -10,10 +10,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.drive import SimulatedDrive, simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.simulation.drive import SimulatedDrive, simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.coverage.classes import CLASSES, Simulated, make
 from reproduction.recordings import Rig, real_rigs
 

@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.engine.offline import MethodName, calibrate
-from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import HandEyeCalibError
+from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.checks.findings import Severity
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, NoiseConfig
+from hand_eye_calib.offline.calibrate import MethodName, calibrate
 from reproduction import clean_recordings
 from reproduction.fault_cases import GROUPS, Fault
 from reproduction.recordings import real_rigs

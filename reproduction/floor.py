@@ -11,9 +11,9 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.covariance import common_mode_floor, usual_speed
-from hand_eye_calib.geometry.se3 import deviation
+from hand_eye_calib.core.assessment.covariance import common_mode_floor, usual_speed
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry.se3 import deviation
 from reproduction.coverage.scores import answer
 from reproduction.gate import Case, real_cases
 from reproduction.writing import markdown_table, seed_of, show, study_parser

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import between, real_rigs
 from reproduction.writing import markdown_table, seed_of, show, study_parser

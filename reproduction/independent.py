@@ -19,10 +19,10 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.stops import read_arm_samples
-from hand_eye_calib.solvers.robot_world import Stops, solve
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops.robot_world import Stops, solve
+from hand_eye_calib.extras.stops.samples import read_arm_samples
 from reproduction.recordings import between
 from reproduction.writing import markdown_table, study_parser
 

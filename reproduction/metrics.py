@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry.se3 import absolute_errors
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry.se3 import absolute_errors
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 
 
 class Errors(NamedTuple):

@@ -15,12 +15,12 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 import hand_eye_calib as hec
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.cli.main import exit_code_of
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.results.records import Severity
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.records import Severity
+from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.coverage import motions
 from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas

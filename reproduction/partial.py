@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 import hand_eye_calib as hec
-from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.cli.main import exit_code_of
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.coverage import motions
 from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas

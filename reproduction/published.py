@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.solvers import all_pairs
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.core.solvers import all_pairs
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 from reproduction.metrics import Errors
 
 METHODS = ("ali", "dnl", "dnlo", "park", "taylor", "zhuang")

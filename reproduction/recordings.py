@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import (
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.trajectory_files.reading import (
     FileOptions,
     read_trajectory,
     read_trajectory_files,

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray
 from reproduction.published import METHODS, REFERENCES
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED
 from reproduction.sources import Source

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.session.rig import calibrate_rig
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.rig.rig import calibrate_rig
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
 from reproduction.partial import QUANTILE_90
 from reproduction.writing import markdown_table, show, study_parser
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers import all_pairs, dnlo
-from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.solvers import all_pairs, dnlo
+from hand_eye_calib.core.solvers.registry import Method
 from reproduction import ali_as_published
 from reproduction.metrics import Errors, errors
 from reproduction.published import KITTI, LEVELS, REFERENCES, Case, path_to

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
 from reproduction import published
 from reproduction.published import Case
 

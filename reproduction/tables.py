@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.geometry.se3 import absolute_errors
+from hand_eye_calib.core.geometry.se3 import absolute_errors
 from reproduction import comparison
 from reproduction.published import METHODS, RECTIFIED, REFERENCES
 from reproduction.results import Results

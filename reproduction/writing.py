@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.errors import InputError
+from hand_eye_calib.core.base.errors import InputError
 
 TableRow = Mapping[str, object]
 

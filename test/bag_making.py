@@ -6,9 +6,9 @@ import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.writer import write_streams
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.writer import write_streams
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(

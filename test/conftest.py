@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from hypothesis import settings
 
-from hand_eye_calib.cli.main import main
+from hand_eye_calib.offline.cli.main import main
 
 # Tests never time anything, and CI must not differ from run to run.
 settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
@@ -50,10 +50,10 @@ def run(capsys):
 @pytest.fixture
 def no_processes(monkeypatch):
     """Several recordings are calibrated in threads: each process would import for a second."""
-    monkeypatch.setattr("hand_eye_calib.cli.batch.work._processes", ThreadPoolExecutor)
+    monkeypatch.setattr("hand_eye_calib.extras.fleet.work._processes", ThreadPoolExecutor)
 
 
 @pytest.fixture
 def no_figures(monkeypatch):
     """Reports of this process have no figures: drawing takes several times as long as the solve."""
-    monkeypatch.setattr("hand_eye_calib.report.report.figures_of", lambda *_: [])
+    monkeypatch.setattr("hand_eye_calib.offline.report.report.figures_of", lambda *_: [])

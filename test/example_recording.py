@@ -10,10 +10,10 @@ from rosbags import rosbag2
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.writer import write_streams
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
+from hand_eye_calib.formats.bags.writer import write_streams
 
 # Lidar to camera on the pages: x 0.4 m, z 1.85 m, yaw -90 deg.
 T_LIDAR_CAMERA = se3.from_quat_xyzw(

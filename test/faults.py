@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 
 
 def reordered(stream):

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from result_making import calibration, dofs
 
-from hand_eye_calib.cli.batch.work import Outcome, Task
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import SolveStatus
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import SolveStatus
+from hand_eye_calib.extras.fleet.work import Outcome, Task
 
 DAY_NS = 86_400_000_000_000
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.trajectory_files.reading import FileOptions, read_trajectory_files
-from hand_eye_calib.io.trajectory_files.table import write_trajectory
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.geodetic import LocalOrigin
+from hand_eye_calib.formats.trajectory_files.reading import FileOptions, read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.table import write_trajectory
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from published_data import data_folder
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 from reproduction.recordings import BOREAS, EUROC, SIMPLE_KITTI, rigs_of
 
 # Differences that are really there and that the data's documentation does not give: found by this

@@ -5,7 +5,7 @@ import json
 import pytest
 from published_data import data_folder
 
-from hand_eye_calib.cli.main import main
+from hand_eye_calib.offline.cli.main import main
 
 
 def reports_folder(kind):

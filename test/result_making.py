@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from hand_eye_calib.assessment.excitation import Excitation
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import (
+from hand_eye_calib.core.assessment.excitation import Excitation
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import (
     Calibration,
     DofObservability,
     DofVerdict,

@@ -28,11 +28,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
 import hand_eye_calib
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import ns_of
-from hand_eye_calib.live import solving
-from hand_eye_calib.ros import conversions
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.messages import ns_of
+from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.online.live import solving
+from hand_eye_calib.online.ros import conversions
 
 # Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
 # busy with other things.
@@ -120,9 +120,9 @@ _FORKS.set_forkserver_preload(
     [
         "pytest",
         "ros_harness",
-        "hand_eye_calib.cli.calibrator",
-        "hand_eye_calib.ros.node",
-        "hand_eye_calib.ros.calibrator_node",
+        "hand_eye_calib.online.ros.calibrator",
+        "hand_eye_calib.online.ros.node",
+        "hand_eye_calib.online.ros.calibrator_node",
         "rosidl_generator_py",
         "type_description_interfaces.msg",
     ]

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import PosePairs, motion_pairs
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
 from reproduction.published import load_kitti_long, load_kitti_short
 
 REFERENCE = "B5"

@@ -8,7 +8,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from hand_eye_calib.io.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.table import write_trajectory
 from suite.baseline import NUMPY
 from suite.data import LONG, MESSAGES
 from suite.measuring import row_of
@@ -24,8 +24,8 @@ _MEMORY = """
 import sys
 import numpy as np
 from suite.data import simulated_drive
-from hand_eye_calib.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.solvers.registry import Method
 def peak():  # the maximum that resource tells includes this process's parent
     lines = open("/proc/self/status")
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))

@@ -10,17 +10,17 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from hand_eye_calib.assessment.covariance import assess
-from hand_eye_calib.assessment.reference_selection import select_reference
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import absolute_errors
-from hand_eye_calib.gls import estimator
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers import quadratic_form
-from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.core.assessment.covariance import assess
+from hand_eye_calib.core.assessment.reference_selection import select_reference
+from hand_eye_calib.core.engine.calibrator import Calibrator
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import absolute_errors
+from hand_eye_calib.core.noise import estimator
+from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.core.solvers import quadratic_form
+from hand_eye_calib.core.solvers.registry import Method
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.writer import write_bag
 from suite.baseline import FLOOR, OPENCV
 from suite.data import LONG, REFERENCE, SHORT, messages, parts
 from suite.measuring import measure, measure_in_turn, row_of

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.registry import COMMANDS, RESULT_METHODS, SESSION_PAGES, Command
+from hand_eye_calib.core.base.registry import COMMANDS, RESULT_METHODS, SESSION_PAGES, Command
 
 
 def register() -> None:
@@ -20,37 +20,37 @@ def register() -> None:
 
 
 def _calibrate() -> Any:
-    from hand_eye_calib.cli import calibrate
+    from hand_eye_calib.offline.cli import calibrate
 
     return calibrate
 
 
 def _check() -> Any:
-    from hand_eye_calib.cli import check
+    from hand_eye_calib.offline.cli import check
 
     return check
 
 
 def _info() -> Any:
-    from hand_eye_calib.cli import info
+    from hand_eye_calib.offline.cli import info
 
     return info
 
 
 def _plot(result: Any, ax: Any) -> Any:
-    from hand_eye_calib.report.figures import plot
+    from hand_eye_calib.offline.report.figures import plot
 
     return plot(result, ax)
 
 
 def _report(result: Any, path: Path) -> Path:
-    from hand_eye_calib.io.results import save_text
-    from hand_eye_calib.report.report import render
+    from hand_eye_calib.formats.results import save_text
+    from hand_eye_calib.offline.report.report import render
 
     return save_text(path, render(result, result.recording))
 
 
 def _session_report(directory: Path, session: Any) -> None:
-    from hand_eye_calib.cli.reporting import write_session_report
+    from hand_eye_calib.offline.cli.reporting import write_session_report
 
     write_session_report(directory, session)

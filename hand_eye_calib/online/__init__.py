@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hand_eye_calib.registry import COMMANDS, Command
+from hand_eye_calib.core.base.registry import COMMANDS, Command
 
 
 def register() -> None:
@@ -12,12 +12,12 @@ def register() -> None:
 
 
 def _calibrator() -> Any:
-    from hand_eye_calib.cli import calibrator
+    from hand_eye_calib.online.ros import calibrator
 
     return calibrator
 
 
 def _watch() -> Any:
-    from hand_eye_calib.cli import watch
+    from hand_eye_calib.online.ros import watch
 
     return watch

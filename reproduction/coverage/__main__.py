@@ -10,7 +10,7 @@ from operator import call
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.cli.main import exit_code_of
+from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.coverage import scores
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.measures import KINDS, POOLED, Row, pooled

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
 from reproduction.coverage.sensor_errors import DrawnErrors, SensorErrors, directions, scale_columns
 
 # Variances below this (m^2 or rad^2) count as this: a component without error has no inverse.

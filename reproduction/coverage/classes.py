@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.arrays import FloatArray, IntArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction.coverage import motions
 from reproduction.coverage.bound import Side, cramer_rao_bound
 from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail, draw, sigmas

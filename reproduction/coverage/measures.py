@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray
 
 # Medians of chi-squared with 6 and 3 degrees of freedom.
 MEDIAN_6, MEDIAN_3 = 5.348, 2.366

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray
 from reproduction.coverage import motions
 from reproduction.coverage.classes import RecordingClass, Simulated, simulate
 from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail, sigmas

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
 
 # Motions are made at this rate (Hz) and interpolated from there.
 _RATE = 100.0

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import absolute_errors, deviation
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import Calibration, DofVerdict, SolveStatus
-from hand_eye_calib.results.records import AXES
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.base.errors import HandEyeCalibError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import absolute_errors, deviation
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.coverage import classes
 from reproduction.coverage.measures import COVERAGE, Row
 from reproduction.published import load_simulated, path_to

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hand_eye_calib.arrays import BoolArray, FloatArray
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.geometry import se3
 
 
 def sigmas(metres: float | FloatArray, degrees: float | FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hand_eye_calib.cli.main import exit_code_of
+from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import in_parallel, kept
 from reproduction.session import mount, stop, together

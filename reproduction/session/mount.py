@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.monitor import MountMonitor
-from hand_eye_calib.pairing.motion_pairs import PosePairs, synchronise
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, synchronise
+from hand_eye_calib.extras.mount.monitor import MountMonitor
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.writing import markdown_table, triple
 

@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.excitation import Excitation, excitation
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.offline import prior_fields
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.session.goal import Goal
+from hand_eye_calib.core.assessment.excitation import Excitation, excitation
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import HandEyeCalibError
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.offline.calibrate import prior_fields
+from hand_eye_calib.online.live.goal import Goal
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.recordings import Recording, Rig, Truth
 from reproduction.writing import markdown_table

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.arrays import FloatArray
-from hand_eye_calib.assessment.comparison import compare
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.results.calibration import Calibration
-from hand_eye_calib.session.together import together
+from hand_eye_calib.core.assessment.comparison import compare
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.extras.fleet.together import together
+from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.recordings import Rig, Truth
 from reproduction.writing import markdown_table

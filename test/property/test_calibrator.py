@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motions import T_PARENT_CHILD, as_trajectory, child_of, messages, wandering_poses
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.engine.calibrator import Calibrator
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 
 CONFIG = CalibratorConfig(reference="B3", max_gap=0.15)
 

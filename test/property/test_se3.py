@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.geometry import se3
 
 ANGLES = st.one_of(
     st.sampled_from([0.0, 1e-12, 1e-8, 1e-4, 9.9e-3, 1.01e-2, np.pi - 1e-6, np.pi - 1e-3]),

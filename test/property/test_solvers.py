@@ -8,12 +8,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from motions import walked
 
-from hand_eye_calib.config import METHODS
-from hand_eye_calib.errors import NotEnoughDataError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.solvers.all_pairs import pair_costs
-from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.core.base.config import METHODS
+from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.core.solvers.all_pairs import pair_costs
+from hand_eye_calib.core.solvers.registry import Method
 
 PAPER_METHODS = [name for name, record in METHODS.items() if record.uses_reference]
 # Their answer depends on nothing but sums over the pairs. dnlo searches from random subsets.

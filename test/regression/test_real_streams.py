@@ -9,13 +9,13 @@ from faults import FAULTS
 from motions import as_trajectory
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.checks.streams import check_lengths
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
-from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.checks.findings import Severity
+from hand_eye_calib.core.checks.streams import check_lengths
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.independent import shrimp_sensors
 from reproduction.recordings import between
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from report_inputs import calibrated, reports_folder
 
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.geometry import se3
 
 
 def pose(position, rpy_deg):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from report_inputs import calibrated, reports_folder
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.reader import PoseBag
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.offline.cli.main import main
 
 # Position (m) and roll, pitch, yaw (deg) of the child in the parent.
 TRUTH = ((0.42, -0.11, 0.25), (-88.0, 3.0, -92.0))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from report_inputs import calibrated, reports_folder
 
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.geometry import se3
 
 # Translation (m) and roll, pitch, yaw (deg) of the child in the parent.
 ON_CAMERA = ([0.42, -0.11, 0.25], [-88.0, 3.0, -92.0])

@@ -10,8 +10,8 @@ import textwrap
 import yaml
 from source_code import ROOT
 
-from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.option import option_name
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.option import option_name
 
 HEADER = """\
 # Parameters of the node calibrator: all there are, at their defaults.

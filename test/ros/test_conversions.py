@@ -9,14 +9,14 @@ from rclpy.serialization import serialize_message
 from result_making import NAMES, dofs, good_calibration
 from sensor_msgs.msg import Imu, NavSatFix
 
-from hand_eye_calib import config
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import turned
-from hand_eye_calib.io.bags.messages import MESSAGE_TYPES, MessageReader, ns_of
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.ros import conversions
-from hand_eye_calib.ros.outputs import ResultTopics
+from hand_eye_calib.core.base import config
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import turned
+from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES, MessageReader, ns_of
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.ros import conversions
+from hand_eye_calib.online.ros.outputs import ResultTopics
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 

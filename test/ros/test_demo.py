@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import hand_eye_calib
-from hand_eye_calib.cli.demo import DRIVE, TOPICS
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import HandEyeCalibError
-from hand_eye_calib.ros.player import play
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import REALISTIC
+from hand_eye_calib.core.base.errors import HandEyeCalibError
+from hand_eye_calib.extras.simulation.demo import DRIVE, TOPICS
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import REALISTIC
+from hand_eye_calib.extras.simulation.player import play
+from hand_eye_calib.offline.cli.main import main
 
 # How long a hang takes to fail a test; the demo takes about 5 s.
 PATIENCE_S = 300.0
@@ -76,7 +76,8 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
 def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start(tmp_path):
     command = "demo", "--out", tmp_path / "out"
     program = (
-        "import sys; sys.modules['rclpy'] = None; from hand_eye_calib.cli.main import main; "
+        "import sys; sys.modules['rclpy'] = None; "
+        "from hand_eye_calib.offline.cli.main import main; "
         "sys.exit(main(sys.argv[1:]))"
     )
     without = run("-c", program, *command)
@@ -92,6 +93,6 @@ def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start
 
 def test_player_does_not_wait_for_ever(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    monkeypatch.setattr("hand_eye_calib.ros.player._PATIENCE_S", 0.1)
+    monkeypatch.setattr("hand_eye_calib.extras.simulation.player._PATIENCE_S", 0.1)
     with pytest.raises(HandEyeCalibError, match=r"waited 0\.1 s for the node to listen"):
         play(None, TOPICS, 1.0, 0, lambda: None)

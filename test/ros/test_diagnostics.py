@@ -11,10 +11,10 @@ from motions import disturbed
 from ros_harness import LATCHED, RELIABLE_INPUTS, drive, message, values_of
 from std_msgs.msg import String
 
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.live.state import Level
-from hand_eye_calib.ros.watcher import state_of
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.online.live.state import Level
+from hand_eye_calib.online.ros.watcher import state_of
 
 PARTS = ("extrinsic", "progress", "parent input", "child input", "stream checks", "journal")
 

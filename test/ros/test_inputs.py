@@ -16,7 +16,7 @@ from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from hand_eye_calib.ros import conversions
+from hand_eye_calib.online.ros import conversions
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 

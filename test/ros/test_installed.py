@@ -11,14 +11,14 @@ from result_making import SHIFTED_FROM as X
 from result_making import shifted
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, values_of
 
-from hand_eye_calib.config import NodeConfig
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict
-from hand_eye_calib.ros import tf as module
-from hand_eye_calib.ros.conversions import to_transform
-from hand_eye_calib.ros.tf import STATIC_TOPIC, Robot, RobotTree
+from hand_eye_calib.core.base.config import NodeConfig
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.ros import tf as module
+from hand_eye_calib.online.ros.conversions import to_transform
+from hand_eye_calib.online.ros.tf import STATIC_TOPIC, Robot, RobotTree
 
 NUMBERS = " ".join(
     f"{value:.9f}"

@@ -9,8 +9,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
-from hand_eye_calib.io.journal import count_poses, has_session, read_journal
-from hand_eye_calib.io.results import load_result
+from hand_eye_calib.formats.journal import count_poses, has_session, read_journal
+from hand_eye_calib.formats.results import load_result
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 

@@ -11,9 +11,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_harness import LATCHED, RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix, message, ns_of
 from sensor_msgs.msg import Imu, NavSatFix
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.journal import count_poses, has_session, read_journal
-from hand_eye_calib.ros import conversions
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.journal import count_poses, has_session, read_journal
+from hand_eye_calib.online.ros import conversions
 
 ORIGIN = (60.0, 25.0, 40.0)
 

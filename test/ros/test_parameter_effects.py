@@ -20,11 +20,11 @@ from nav_msgs.msg import Odometry
 from source_code import ROOT
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.journal import has_session
-from hand_eye_calib.option import option_name
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.journal import has_session
+from hand_eye_calib.offline.cli.main import main
 
 QUIET = ["-p solve_period:=1000.0", *ros_harness.RELIABLE_INPUTS]
 LAX = {"threshold": 1e-9}

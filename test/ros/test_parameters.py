@@ -6,8 +6,8 @@ import pytest
 from rcl_interfaces.srv import ListParameters
 from ros_harness import RELIABLE_INPUTS, drive
 
-from hand_eye_calib.config import METHODS, CalibratorConfig, NodeConfig
-from hand_eye_calib.option import option_name
+from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.option import option_name
 
 FIELDS = {
     option_name(field): field

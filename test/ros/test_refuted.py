@@ -9,9 +9,9 @@ from motions import disturbed
 from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, matrix, values_of
 from std_msgs.msg import String
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.results.calibration import Verdict
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import Verdict
+from hand_eye_calib.formats.results import load_result
 
 WRONG_Z = T_PARENT_CHILD[2, 3] + 1.7
 

@@ -9,10 +9,10 @@ from published_data import kitti_short
 from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, ns_of
 from std_msgs.msg import String
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.ros import conversions
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.engine.calibrator import Calibrator
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.online.ros import conversions
 
 FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive
 
-from hand_eye_calib.io.results import load_result
+from hand_eye_calib.formats.results import load_result
 
 # Generous: the promise is one second. On a busy machine, no longer than until it first answers.
 SOON_S = 5.0
@@ -71,7 +71,7 @@ def test_a_full_temporary_directory_costs_the_report_and_not_the_result(start_no
 
 # The first job hangs after five seconds; on a busy machine a solve may take longer.
 SOON = """
-from hand_eye_calib.live import solving
+from hand_eye_calib.online.live import solving
 restart, patience_s = solving.SolvingProcess._restart, solving.HANGS_AFTER_S
 solving.HANGS_AFTER_S = 5.0
 def restarted(self, hangs):

@@ -11,15 +11,15 @@ from motions import as_trajectory, child_of, feed, wandering_poses
 from ros_harness import LATCHED, RELIABLE_INPUTS, drive, matrix, values_of
 from std_msgs.msg import String
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.state import Broadcast
-from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.ros import tf
-from hand_eye_calib.ros.tf import RobotTree
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.engine.calibrator import Calibrator
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.state import Broadcast
+from hand_eye_calib.online.ros import tf
+from hand_eye_calib.online.ros.tf import RobotTree
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import pytest
 from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
 
-from hand_eye_calib.live.state import JournalState, Level, NodeState
-from hand_eye_calib.plain import json_text
-from hand_eye_calib.ros.watcher import Watcher
-from hand_eye_calib.watch.board import Board, state_of
+from hand_eye_calib.core.base.plain import json_text
+from hand_eye_calib.online.live.state import JournalState, Level, NodeState
+from hand_eye_calib.online.ros.watcher import Watcher
+from hand_eye_calib.online.watch.board import Board, state_of
 
 QUICK = ("-p solve_period:=0.2", *RELIABLE_INPUTS)
 

@@ -8,16 +8,16 @@ import real_data
 from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.covariance import assess_adaptive
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.gls import estimator, increments
-from hand_eye_calib.gls.noise_model import CENTRES
-from hand_eye_calib.gls.tuning import TUNING
-from hand_eye_calib.pairing.motion_pairs import PosePairs
-from hand_eye_calib.results.calibration import DofVerdict
-from hand_eye_calib.simulation.drive import add_noise, simulate_drive
-from hand_eye_calib.simulation.options import MIXTURE, DriveConfig
+from hand_eye_calib.core.assessment.covariance import assess_adaptive
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.noise import estimator, increments
+from hand_eye_calib.core.noise.noise_model import CENTRES
+from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.results.calibration import DofVerdict
+from hand_eye_calib.extras.simulation.drive import add_noise, simulate_drive
+from hand_eye_calib.extras.simulation.options import MIXTURE, DriveConfig
 
 VALUES = {
     "none": np.zeros(0),

@@ -9,22 +9,22 @@ import pytest
 import real_data
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment import covariance as uncertainty
-from hand_eye_calib.assessment.reference_selection import select_reference
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine import estimation
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import absolute_errors
-from hand_eye_calib.gls import estimator
-from hand_eye_calib.gls.normal import answers_without
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.pairing.motion_pairs import PosePairs, motion_pairs
-from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.solvers.registry import Method
-from hand_eye_calib.text import prior_as_typed
+from hand_eye_calib.core.assessment import covariance as uncertainty
+from hand_eye_calib.core.assessment.reference_selection import select_reference
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.text import prior_as_typed
+from hand_eye_calib.core.engine import estimation
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import absolute_errors
+from hand_eye_calib.core.noise import estimator
+from hand_eye_calib.core.noise.normal import answers_without
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
+from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.core.solvers.registry import Method
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.offline.calibrate import calibrate
+from hand_eye_calib.offline.cli.main import main
 
 DNL = Method("dnl")
 

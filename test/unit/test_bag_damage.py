@@ -24,14 +24,14 @@ from mcap.writer import CompressionType, IndexType, Writer
 from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
 from rosbags import rosbag1, rosbag2
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io import files
-from hand_eye_calib.io.bags import storage
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.writer import write_bag, write_streams
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats import files
+from hand_eye_calib.formats.bags import storage
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.writer import write_bag, write_streams
+from hand_eye_calib.offline.cli.main import main
 
 MIB = 1 << 20
 # What a command may take: LARGEST, the interpreter and its libraries.
@@ -269,7 +269,7 @@ BOMB = zstd.compress(bytes(64 * MIB)) * 48
 # Not ru_maxrss, which a process has from the one that started it.
 REPLAY = """
 import pathlib, re, sys
-from hand_eye_calib.cli.main import main
+from hand_eye_calib.offline.cli.main import main
 code = main(["replay", *sys.argv[1:]])
 peak = re.search(r"VmHWM:\\s+(\\d+) kB", pathlib.Path("/proc/self/status").read_text())
 print(code, int(peak[1]) // 1024)

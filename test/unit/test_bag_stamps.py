@@ -18,11 +18,11 @@ from bag_making import (
 )
 from motions import T_PARENT_CHILD, child_of, wandering_poses
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.sources import source_of
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.sources import source_of
+from hand_eye_calib.offline.cli.main import main
 
 N = 300
 STAMPS_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(N)

@@ -26,11 +26,11 @@ from published_data import data_folder
 from rosbags import rosbag1, rosbag2
 
 import hand_eye_calib as hec
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.writer import stamped_messages, write_bag, write_streams
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.writer import stamped_messages, write_bag, write_streams
 
 SECOND = 10**9
 POSES = wandering_poses(120)

@@ -22,17 +22,17 @@ import pytest
 from fleet_making import always_dies, dies_once, outcome, recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
-from hand_eye_calib.cli.batch import run as batch_run
-from hand_eye_calib.cli.batch import work as batch_work
-from hand_eye_calib.cli.batch.run import write_rows
-from hand_eye_calib.cli.batch.work import Outcome, Task, outcomes, tasks_of, work
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io import remote
-from hand_eye_calib.io.bags.patterns import matching
-from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.session.together import together
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.fleet import batch as batch_run
+from hand_eye_calib.extras.fleet import work as batch_work
+from hand_eye_calib.extras.fleet.batch import write_rows
+from hand_eye_calib.extras.fleet.together import together
+from hand_eye_calib.extras.fleet.work import Outcome, Task, outcomes, tasks_of, work
+from hand_eye_calib.formats import remote
+from hand_eye_calib.formats.bags.patterns import matching
+from hand_eye_calib.formats.bags.writer import write_bag
+from hand_eye_calib.formats.results import load_result
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -197,8 +197,8 @@ def ended(pidfd, within_s=120):
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="processes are awaited by Linux's pidfd")
 def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
     code = (
-        "from fleet_making import never_ends; from hand_eye_calib.cli.batch.work import Task\n"
-        "from hand_eye_calib.cli.batch.work import outcomes\n"
+        "from fleet_making import never_ends; from hand_eye_calib.extras.fleet.work import Task\n"
+        "from hand_eye_calib.extras.fleet.work import outcomes\n"
         "if __name__ == '__main__':\n"
         "    tasks = [Task(name=name, bags=(), options={'pipe': PIPE}) for name in 'ab']\n"
         "    list(outcomes(tasks, 2, do=never_ends))\n"
@@ -367,7 +367,7 @@ def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
 
 
 def test_the_index_page_shows_each_vehicle(tmp_path):
-    from hand_eye_calib.report.batch_page import render_batch
+    from hand_eye_calib.extras.fleet.batch_page import render_batch
 
     outcomes = [*fleet_outcomes("<b>", 6, 1, shift=(4, 5)), *fleet_outcomes("a", 2, 2)]
     outcomes.append(Outcome.of(Task(name="lost", bags=()), "no <bag>"))
@@ -392,7 +392,7 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
 
 
 def test_the_page_of_ten_thousand_recordings_stays_below_2_mb():
-    from hand_eye_calib.report.batch_page import render_batch
+    from hand_eye_calib.extras.fleet.batch_page import render_batch
 
     (one,) = fleet_outcomes("truck_17", 1, 1)
     rows = [{**one.row, "name": f"truck_017_2026-11-23T{n:05}"} for n in range(10_000)]

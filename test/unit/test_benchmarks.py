@@ -14,8 +14,8 @@ sys.path.insert(0, str(BENCHMARKS))
 from suite import baseline, data, rows  # noqa: E402
 from suite.measuring import Row  # noqa: E402
 
-from hand_eye_calib.geometry import se3  # noqa: E402
-from hand_eye_calib.solvers.registry import Method  # noqa: E402
+from hand_eye_calib.core.geometry import se3  # noqa: E402
+from hand_eye_calib.core.solvers.registry import Method  # noqa: E402
 
 ROWS = [
     Row("dnlo fast", 443, 0.01, 0.1, 5, 2.0),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hand_eye_calib.blocks import Blocks, jackknife_covariance, solve
+from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance, solve
 
 N_ROWS, N_BLOCKS = 37, 5
 

@@ -16,16 +16,16 @@ from motions import (
     wandering_poses,
 )
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.engine.examination import check
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.errors import InputError, NotEnoughDataError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.plain import plain
-from hand_eye_calib.results.calibration import SolveStatus
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
+from hand_eye_calib.core.base.plain import plain
+from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
+from hand_eye_calib.core.engine.examination import check
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import SolveStatus
+from hand_eye_calib.offline.calibrate import calibrate
 
 
 def drive(n_poses=200, seed=0):
@@ -274,7 +274,7 @@ def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     feed(calibrator, "child", child)
     snapshot = calibrator.snapshot().resolved
     calibrator.adopt(snapshot.time_offset)
-    monkeypatch.setattr("hand_eye_calib.engine.snapshot.estimated_time_offset", None)
+    monkeypatch.setattr("hand_eye_calib.core.engine.snapshot.estimated_time_offset", None)
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)
     assert calibrator.estimate().time_offset_s == snapshot.time_offset.seconds

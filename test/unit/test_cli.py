@@ -23,17 +23,17 @@ from motions import disturbed, walked, write_pair
 from source_code import ROOT
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.options import fail, note, print_result, waiting_for, with_progress
-from hand_eye_calib.cli.present import as_lines
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.option import option_name
-from hand_eye_calib.results.calibration import SolveStatus
-from hand_eye_calib.results.records import Finding, Severity
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import SolveStatus
+from hand_eye_calib.core.results.records import Finding, Severity
+from hand_eye_calib.formats.bags.writer import write_bag
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.offline.cli.options import fail, note, print_result, waiting_for, with_progress
+from hand_eye_calib.offline.cli.present import as_lines
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -219,7 +219,7 @@ def some_calibration(**changes):
 
 
 def test_a_solve_that_did_not_converge_fails(run, new_bag, monkeypatch):
-    from hand_eye_calib.engine.snapshot import Snapshot
+    from hand_eye_calib.core.engine.snapshot import Snapshot
 
     calibration = some_calibration(status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
     assert "\n".join(as_lines(calibration)).startswith(
@@ -316,7 +316,7 @@ def parsed(options):
     """The configuration that ``calibrate`` makes of its options."""
     import argparse
 
-    from hand_eye_calib.cli.options import add_config_arguments, options_from
+    from hand_eye_calib.offline.cli.options import add_config_arguments, options_from
 
     parser = argparse.ArgumentParser()
     add_config_arguments(parser)
@@ -419,7 +419,7 @@ def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
 
 def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     seen = []
-    monkeypatch.setattr("hand_eye_calib.ros.node.main", lambda args: seen.append(args) or 5)
+    monkeypatch.setattr("hand_eye_calib.online.ros.node.main", lambda args: seen.append(args) or 5)
     arguments = ["--ros-args", "-p", "method:=dnl", "-r", "parent_odom:=/lidar/odom"]
     assert main(["calibrator", *arguments]) == 5
     assert main(["calibrator"]) == 5
@@ -427,7 +427,7 @@ def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
 
 
 def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
-    for module in [name for name in sys.modules if name.startswith("hand_eye_calib.ros")]:
+    for module in [name for name in sys.modules if name.startswith("hand_eye_calib.online.ros")]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     line = refused("watch")

@@ -9,9 +9,9 @@ import pytest
 from bag_making import TF, path_message, tf_message, write_messages
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, messages, wandering_poses
 
-from hand_eye_calib.cli.bags import read_journal_of
-from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.io.journal import JournalWriter
+from hand_eye_calib.formats.bags.writer import write_bag
+from hand_eye_calib.formats.journal import JournalWriter
+from hand_eye_calib.offline.cli.bags import read_journal_of
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]

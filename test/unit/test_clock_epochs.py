@@ -5,12 +5,12 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, walked, wandering_poses, write_pair
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import ConfigError, InputError, NotEnoughDataError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.results import load_result
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.offline.cli.main import main
 
 # Seconds to add to the child's stamps.
 EPOCHS = {

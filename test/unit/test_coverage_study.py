@@ -7,11 +7,11 @@ import pytest
 from published_data import data_folder
 from result_making import calibration
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.records import AXES
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
 from reproduction import clean_recordings, faults
 from reproduction.coverage import __main__ as study
 from reproduction.coverage import classes, motions, sensor_errors

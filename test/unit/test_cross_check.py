@@ -10,16 +10,16 @@ from result_making import good_calibration
 
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
-from hand_eye_calib.engine.estimation import compare_answers
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.results.calibration import (
+from hand_eye_calib.core.engine.estimation import compare_answers
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import (
     Calibration,
     DofObservability,
     DofVerdict,
     SolveStatus,
     Verdict,
 )
-from hand_eye_calib.results.records import AXES, AxisScatter
+from hand_eye_calib.core.results.records import AXES, AxisScatter
 
 KINDS = ("methods", "halves", "model")
 

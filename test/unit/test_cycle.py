@@ -12,18 +12,23 @@ import pytest
 from result_making import calibration, seen
 from source_code import ROOT
 
-from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.findings import Finding, Severity
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.live import cycle as module
-from hand_eye_calib.live.cycle import SolveCycle
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.solving import Answer
-from hand_eye_calib.live.state import Broadcast, Level, NodeState
-from hand_eye_calib.plain import plain
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.records import AXES, AxisScatter
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.plain import plain
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.findings import Finding, Severity
+from hand_eye_calib.core.results.calibration import (
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
+from hand_eye_calib.core.results.records import AXES, AxisScatter
+from hand_eye_calib.online.live import cycle as module
+from hand_eye_calib.online.live.cycle import SolveCycle
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.session import LiveSession
+from hand_eye_calib.online.live.solving import Answer
+from hand_eye_calib.online.live.state import Broadcast, Level, NodeState
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers import all_pairs, dnlo, quadratic_form
-from hand_eye_calib.solvers.certificate import is_global
-from hand_eye_calib.solvers.registry import Method
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.core.solvers import all_pairs, dnlo, quadratic_form
+from hand_eye_calib.core.solvers.certificate import is_global
+from hand_eye_calib.core.solvers.registry import Method
 
 
 def brute_force_objective(costs, threshold, floor):

@@ -14,7 +14,7 @@ import yaml
 from source_code import ROOT
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
+from hand_eye_calib.offline.cli.main import main
 
 DOCS = ROOT / "docs"
 RUNS_ALL = os.environ.get("HAND_EYE_CALIB_ALL_PAGES") == "1"

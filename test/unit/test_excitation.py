@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, noisy_pair, planar_poses, wandering_poses
 
-from hand_eye_calib.assessment import excitation
-from hand_eye_calib.assessment.covariance import hidden_axes, lever_arm_products
-from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import PosePairs
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.core.assessment import excitation
+from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
+from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.offline.calibrate import calibrate
 
 
 def seen_in(poses):

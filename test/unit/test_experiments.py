@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.solvers.all_pairs import solve_park
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.solvers.all_pairs import solve_park
 from reproduction import comparison, metrics, results, runner
 from reproduction.__main__ import EXPERIMENTS, GROUPS, main
 from reproduction.published import REFERENCES

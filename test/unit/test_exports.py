@@ -10,14 +10,14 @@ from result_making import dofs, good_calibration
 from scipy.spatial.transform import Rotation
 from source_code import ROOT
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import EXPORT_FORMATS
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.installed import open_installed
-from hand_eye_calib.io.results import save_result
-from hand_eye_calib.results.calibration import SolveStatus
-from hand_eye_calib.results.exports import arranged, formats, role_of
+from hand_eye_calib.core.base.config import EXPORT_FORMATS
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import SolveStatus
+from hand_eye_calib.formats.exports import arranged, formats, role_of
+from hand_eye_calib.formats.installed import open_installed
+from hand_eye_calib.formats.results import save_result
+from hand_eye_calib.offline.cli.main import main
 
 OFFSET_S = 0.0125
 POINT = np.array([0.3, -1.2, 2.5, 1.0])

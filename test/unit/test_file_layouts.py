@@ -11,9 +11,9 @@ from motions import as_trajectory, geodetic, read_trajectory_file, wandering_pos
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
 
 N = 60
 START_NS = 1_700_000_000_250_000_000
@@ -377,7 +377,7 @@ def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, kind, separator)
 
 
 def test_many_rows_without_a_pose_are_warned_of(tmp_path, capsys):
-    from hand_eye_calib.cli.main import main
+    from hand_eye_calib.offline.cli.main import main
 
     lines = text_of(SECONDS, P, Q).splitlines()
     for row in range(0, N, 8):

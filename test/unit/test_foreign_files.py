@@ -17,11 +17,11 @@ from motions import as_trajectory, geodetic, read_trajectory_file, wandering_pos
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import InputError, MissingDependencyError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.reading import AUTO
+from hand_eye_calib.core.base.errors import InputError, MissingDependencyError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.trajectory_files.reading import AUTO
+from hand_eye_calib.offline.cli.main import main
 
 N = 40
 TRUTH = as_trajectory(wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000)

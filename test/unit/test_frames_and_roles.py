@@ -20,17 +20,17 @@ from bag_making import (
 from motions import T_PARENT_CHILD, child_of, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.engine.calibrator import Calibrator, Calibrators
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import FrameTree, StreamFrames
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.messages import MessageReader
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.installed import open_installed
-from hand_eye_calib.io.journal import read_journal, replay_journal
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.engine.calibrator import Calibrator, Calibrators
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.frames import FrameTree, StreamFrames
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.bags.messages import MessageReader
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.installed import open_installed
+from hand_eye_calib.formats.journal import read_journal, replay_journal
+from hand_eye_calib.offline.cli.main import main
 
 N = 200
 STAMPS_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(N)
@@ -324,7 +324,7 @@ def test_options_trees_results_and_installed_poses_have_no_slash(tmp_path):
 
 
 def test_a_journal_keeps_the_world_of_a_stream(tmp_path):
-    from hand_eye_calib.io.journal import JournalWriter
+    from hand_eye_calib.formats.journal import JournalWriter
 
     about = {
         "parent": {"frame": "tool0", "world": "base_link"},

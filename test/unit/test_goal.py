@@ -8,15 +8,15 @@ from result_making import calibration as made
 from result_making import seen
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.excitation import excitation, helpful_motion
-from hand_eye_calib.cli.present import as_lines
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import PosePairs
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus
-from hand_eye_calib.results.records import AXES, CorrelatedError, Noise
-from hand_eye_calib.session.goal import Goal
+from hand_eye_calib.core.assessment.excitation import excitation, helpful_motion
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.records import AXES, CorrelatedError, Noise
+from hand_eye_calib.offline.cli.present import as_lines
+from hand_eye_calib.online.live.goal import Goal
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 

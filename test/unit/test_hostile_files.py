@@ -12,13 +12,13 @@ import pytest
 import yaml
 from result_making import calibration
 
-from hand_eye_calib.cli.batch.run import stored
-from hand_eye_calib.cli.batch.work import Task
-from hand_eye_calib.engine import offline
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.results import load_result, save_result
-from hand_eye_calib.io.trajectory_files.table import write_trajectory
-from hand_eye_calib.io.yaml_files import read_yaml
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.extras.fleet.batch import stored
+from hand_eye_calib.extras.fleet.work import Task
+from hand_eye_calib.formats.results import load_result, save_result
+from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.yaml_files import read_yaml
+from hand_eye_calib.offline import calibrate as offline
 
 PARENT = motions.as_trajectory(motions.wandering_poses(30), sensor_frame="lidar")
 CHILD = motions.as_trajectory(

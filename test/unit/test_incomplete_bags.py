@@ -8,9 +8,9 @@ import pytest
 from bag_making import ODOMETRY, POSE_STAMPED, storage_file
 from motions import as_trajectory, child_of, wandering_poses
 
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.writer import write_bag
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.writer import write_bag
 
 POSES = wandering_poses(120)
 STREAMS = {

@@ -8,10 +8,10 @@ from motions import as_trajectory, child_of, wandering_poses
 from motions import messages as messages_of
 
 import hand_eye_calib as hec
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator, Calibrators
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.io.journal import (
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator, Calibrators
+from hand_eye_calib.formats.journal import (
     JournalWriter,
     count_poses,
     has_session,
@@ -19,7 +19,7 @@ from hand_eye_calib.io.journal import (
     read_journal,
     replay_journal,
 )
-from hand_eye_calib.live.journal import lock_directory
+from hand_eye_calib.online.live.journal import lock_directory
 
 CONFIG = CalibratorConfig(reference="B3")
 BOTH = {"parent": {}, "child": {}}

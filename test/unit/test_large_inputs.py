@@ -11,16 +11,16 @@ import zlib
 import numpy as np
 import pytest
 
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.npz import read_arrays
-from hand_eye_calib.io.target_images import images_in, read_image
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.extras.sensors.target_images import images_in, read_image
+from hand_eye_calib.formats.npz import read_arrays
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 
 READ_IMAGES = """
 import sys
 from pathlib import Path
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.io.target_images import read_image
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.extras.sensors.target_images import read_image
 for name in sys.argv[1:]:
     try:
         print(read_image(Path(name)).shape)

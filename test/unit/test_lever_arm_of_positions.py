@@ -5,13 +5,13 @@ import pytest
 from motions import geodetic, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.covariance import usual_speed
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.examination import check
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.document import usable_numbers
+from hand_eye_calib.core.assessment.covariance import usual_speed
+from hand_eye_calib.core.engine.examination import check
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.document import usable_numbers
+from hand_eye_calib.offline.cli.main import main
 from reproduction.partial import simulated_positions
 
 LEVER_ARM = np.array([0.8, -0.5, 1.2])

@@ -6,10 +6,16 @@ from bag_making import JAZZY, NOETIC, ODOMETRY, POSE_STAMPED, TF, header
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_eye_calib.errors import printable
-from hand_eye_calib.io.bags import messages as unpacking
-from hand_eye_calib.io.bags.messages import MALFORMED, MESSAGE_TYPES, POSE_TYPES, Run, unpack_poses
-from hand_eye_calib.io.bags.storage import MessageKind
+from hand_eye_calib.core.base.errors import printable
+from hand_eye_calib.formats.bags import messages as unpacking
+from hand_eye_calib.formats.bags.messages import (
+    MALFORMED,
+    MESSAGE_TYPES,
+    POSE_TYPES,
+    Run,
+    unpack_poses,
+)
+from hand_eye_calib.formats.bags.storage import MessageKind
 
 ENCODINGS = ("cdr", "ros1")
 TRANSFORM = "geometry_msgs/msg/TransformStamped"

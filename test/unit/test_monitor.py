@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.live.monitor import TUNING, MountMonitor
-from hand_eye_calib.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.extras.mount.monitor import TUNING, MountMonitor
 
 X = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 EXACT = np.zeros((6, 6))

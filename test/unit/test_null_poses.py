@@ -20,17 +20,17 @@ from bag_making import (
 )
 from motions import T_PARENT_CHILD, child_of, wandering_poses
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.messages import MessageReader
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.sources import source_of
-from hand_eye_calib.io.transforms import PoseFields
-from hand_eye_calib.live.input import PoseInput
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.state import Level
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.messages import MessageReader
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.sources import source_of
+from hand_eye_calib.formats.transforms import PoseFields
+from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.online.live.input import PoseInput
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.session import LiveSession
+from hand_eye_calib.online.live.state import Level
 
 N = 200
 STAMPS_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(N)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi, chi2, norm
 
-from hand_eye_calib import stats
-from hand_eye_calib import text as words
-from hand_eye_calib.stats import median, quantile
+from hand_eye_calib.core.base import stats
+from hand_eye_calib.core.base import text as words
+from hand_eye_calib.core.base.stats import median, quantile
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 10, 11])

@@ -12,11 +12,11 @@ from motions import as_trajectory, geodetic, smooth_poses
 from rosbags import rosbag2
 from rosbags.typesys import get_types_from_msg
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.transforms import TfSource
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.transforms import TfSource
+from hand_eye_calib.offline.cli.main import main
 
 TIMES = np.arange(0, 30, 0.05)
 TRUTH = as_trajectory(smooth_poses(TIMES), rate_hz=20.0)

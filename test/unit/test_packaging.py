@@ -16,8 +16,8 @@ import yaml
 from packaging.requirements import Requirement
 from source_code import ROOT
 
-from hand_eye_calib.registry import COMMANDS
-from hand_eye_calib.watch.board import AXES
+from hand_eye_calib.core.base.registry import COMMANDS
+from hand_eye_calib.online.watch.board import AXES
 
 PACKAGE = "hand_eye_calib"
 WHERE = "import hand_eye_calib; print(hand_eye_calib.__file__)"
@@ -145,7 +145,7 @@ def test_without_libraries_of_pip_one_line_says_what_is_missing(tmp_path):
     # In a process of its own: a library that is imported cannot be taken away.
     program = (
         "import sys; sys.modules |= {'casadi': None, 'rosbags': None}\n"
-        "from hand_eye_calib.cli.main import main\n"
+        "from hand_eye_calib.offline.cli.main import main\n"
         f"print([int(main(command)) for command in {commands}], file=sys.stderr)"
     )
     done = run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | {"PYTHONPATH": ROOT})
@@ -201,8 +201,8 @@ def test_pip_install_gives_the_commands(source, tmp_path):
     assert not (target / "lib" / PACKAGE).exists()
     where = run([sys.executable, "-c", WHERE], env=environment, cwd=tmp_path)
     assert Path(where.stdout.strip()).is_relative_to(site)
-    templates = "report/templates/report.html", "io/templates/extrinsic.urdf.xacro.in"
-    for kept in (*templates, "results/layouts.yaml", "sample/lidar.tum"):
+    templates = "offline/report/templates/report.html", "formats/templates/extrinsic.urdf.xacro.in"
+    for kept in (*templates, "formats/layouts.yaml", "sample/lidar.tum"):
         assert (site / PACKAGE / kept).is_file()
     for command, said in (
         ([target / "bin" / "replay", "--help"], "usage: hand_eye_calib replay"),

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, walked, wandering_poses
 
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.pairing.motion_pairs import (
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import (
     PosePairs,
     motion_pairs,
     select_keyframes,

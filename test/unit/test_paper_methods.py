@@ -8,10 +8,10 @@ from motions import child_of, disturbed, wandering_poses
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import absolute_errors
-from hand_eye_calib.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.solvers import all_pairs, zhuang
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import absolute_errors
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, motion_pairs
+from hand_eye_calib.core.solvers import all_pairs, zhuang
 from reproduction import ali_as_published
 from reproduction.metrics import relative_errors
 

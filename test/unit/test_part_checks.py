@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import hand_eye_calib as hec
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction import part_faults
 
 SEED = 31

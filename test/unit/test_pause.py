@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from result_making import good_calibration, seen
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.io.transforms import PoseFields
-from hand_eye_calib.live import cycle as cycle_module
-from hand_eye_calib.live import input as module
-from hand_eye_calib.live.cycle import SolveCycle, pause_of
-from hand_eye_calib.live.input import PoseInput
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.solving import Answer
-from hand_eye_calib.live.state import Broadcast, Level, NodeState
-from hand_eye_calib.watch.board import Board, Tone
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.formats.transforms import PoseFields
+from hand_eye_calib.online.live import cycle as cycle_module
+from hand_eye_calib.online.live import input as module
+from hand_eye_calib.online.live.cycle import SolveCycle, pause_of
+from hand_eye_calib.online.live.input import PoseInput
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.session import LiveSession
+from hand_eye_calib.online.live.solving import Answer
+from hand_eye_calib.online.live.state import Broadcast, Level, NodeState
+from hand_eye_calib.online.watch.board import Board, Tone
 
 RATE_HZ = 10.0
 

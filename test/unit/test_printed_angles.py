@@ -5,11 +5,11 @@ import pytest
 from result_making import calibration as made
 from result_making import dofs
 
-from hand_eye_calib.cli.present import as_lines
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
-from hand_eye_calib.results.calibration import SolveStatus
-from hand_eye_calib.results.document import printed_numbers, transforms_of
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
+from hand_eye_calib.core.results.calibration import SolveStatus
+from hand_eye_calib.core.results.document import printed_numbers, transforms_of
+from hand_eye_calib.offline.cli.present import as_lines
 
 SAMPLES = 20_000
 # A camera that looks ahead on a lidar: z of the camera is x of the lidar.

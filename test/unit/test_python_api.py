@@ -11,14 +11,14 @@ import pytest
 import result_making
 
 import hand_eye_calib as hec
-from hand_eye_calib.config import BACKENDS, METHODS, CalibratorConfig
-from hand_eye_calib.engine.offline import prior_fields
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.solvers.all_pairs import pair_costs
-from hand_eye_calib.solvers.registry import Method
-from hand_eye_calib.text import AXIS_UNITS
+from hand_eye_calib.core.base.config import BACKENDS, METHODS, CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.base.text import AXIS_UNITS
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.core.solvers.all_pairs import pair_costs
+from hand_eye_calib.core.solvers.registry import Method
+from hand_eye_calib.offline.calibrate import prior_fields
 
 PRIOR_FIELDS = {f"prior_{axis}" for axis in AXIS_UNITS}
 
@@ -50,11 +50,11 @@ class TestOptionsOfCalibrate:
         """Every keyword reaches the configuration that is solved with."""
         seen = []
         monkeypatch.setattr(
-            "hand_eye_calib.engine.offline.whole_snapshot",
+            "hand_eye_calib.offline.calibrate.whole_snapshot",
             lambda *given: seen.append(whole_snapshot(*given).config),
         )
         solved = SimpleNamespace(calibration=result_making.calibration(), snapshot=None)
-        monkeypatch.setattr("hand_eye_calib.engine.offline.run", lambda *_, **__: solved)
+        monkeypatch.setattr("hand_eye_calib.offline.calibrate.run", lambda *_, **__: solved)
         numbers = ["threshold", "min_inlier_fraction", "max_gap", "scale", "parent_scale"]
         numbers += [f"keyframe_min_{each}" for each in ("translation", "rotation", "interval")]
         numbers += ["target_translation", "target_rotation"]

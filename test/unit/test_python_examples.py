@@ -9,8 +9,8 @@ import pytest
 from source_code import ROOT
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.offline.cli.main import main
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 T_CAMERA_REAR = se3.exp(np.array([-0.5, 0.1, 0.2, 0.1, 0.2, 0.3]))

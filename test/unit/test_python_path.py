@@ -7,18 +7,18 @@ import sys
 import pytest
 from source_code import SOURCE
 
-from hand_eye_calib.python_path import starting_trusted
+from hand_eye_calib.core.base.python_path import starting_trusted
 
 # Modules of the standard library that the commands and their processes import late.
 STRANGERS = ("queue.py", "bisect.py", "csv.py", "heapq.py", "multiprocessing.py", "numpy.py")
 # As pip installs it: Python looks for modules beside this file first.
 PROGRAM = """
-from hand_eye_calib.cli.main import main
+from hand_eye_calib.offline.cli.main import main
 if __name__ == "__main__":
     raise SystemExit(main())
 """
 SOLVER = """
-from hand_eye_calib.live.solving import SolvingProcess
+from hand_eye_calib.online.live.solving import SolvingProcess
 process = SolvingProcess(lambda: None, "import queue, csv, bisect; raise SystemExit(7)")
 print(process._process.wait())
 process._process.communicate()

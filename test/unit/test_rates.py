@@ -10,16 +10,16 @@ from motions import T_PARENT_CHILD, child_of, planar_poses, read_trajectory_file
 from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.examination import check
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.rates import RateIntegrator
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.messages import MessageReader, unpack_poses
-from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.results.document import usable_numbers
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.engine.examination import check
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.rates import RateIntegrator
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.document import usable_numbers
+from hand_eye_calib.formats.bags.messages import MessageReader, unpack_poses
+from hand_eye_calib.formats.bags.writer import write_bag
+from hand_eye_calib.offline.cli.main import main
 
 BIAS = np.array([0.02, -0.01, 0.03])
 OFFSET_S = 0.02

@@ -7,17 +7,17 @@ import pytest
 from motions import as_trajectory, disturbed, feed, smooth_poses
 from result_making import good_calibration, seen
 
-from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.findings import Finding, Severity, finding
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.live import cycle as module
-from hand_eye_calib.live.cycle import SolveCycle, StreamChecks
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.solving import Answer, Job, answer
-from hand_eye_calib.results.calibration import Verdict
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import Verdict
+from hand_eye_calib.online.live import cycle as module
+from hand_eye_calib.online.live.cycle import SolveCycle, StreamChecks
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.session import LiveSession
+from hand_eye_calib.online.live.solving import Answer, Job, answer
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 QUICK = BufferLimits(pairing_starts=400, batch=100, batch_every=10)

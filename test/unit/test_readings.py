@@ -10,16 +10,16 @@ from motions import as_trajectory, child_of, wandering_poses
 from published_data import data_folder
 
 import hand_eye_calib as hec
-from hand_eye_calib.checks import hypotheses
-from hand_eye_calib.checks.hypotheses import PLAIN, Hypothesis, Readings, StreamPair
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.readings import decide
-from hand_eye_calib.engine.run import review
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.gls.readings import loss_difference
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.checks import hypotheses
+from hand_eye_calib.core.checks.hypotheses import PLAIN, Hypothesis, Readings, StreamPair
+from hand_eye_calib.core.engine.readings import decide
+from hand_eye_calib.core.engine.run import review
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.noise.readings import loss_difference
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 from reproduction.coverage import mixed
 from reproduction.coverage.classes import make
 
@@ -172,7 +172,7 @@ class TestUnclear:
 def test_right_streams_are_not_solved_twice(name, monkeypatch):
     drive = make(name, 71)
     monkeypatch.setattr(
-        "hand_eye_calib.engine.readings.loss_difference",
+        "hand_eye_calib.core.engine.readings.loss_difference",
         lambda *poses: pytest.fail("compared"),
     )
     result = hec.calibrate(drive.parent, drive.child)

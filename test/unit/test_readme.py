@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from source_code import ROOT
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.io import files
-from hand_eye_calib.option import option_name
-from hand_eye_calib.registry import COMMANDS
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.base.registry import COMMANDS
+from hand_eye_calib.formats import files
+from hand_eye_calib.offline.cli.main import main
 
 NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
 PAGES = {
@@ -22,7 +22,7 @@ PAGES = {
 }
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 FEWEST_WORDS, MOST_WORDS = 700, 900
-LIMITS = ROOT / "hand_eye_calib" / "io" / "files.py"
+LIMITS = ROOT / "hand_eye_calib" / "formats/files.py"
 HINT = "PYTHONPATH=. python test/unit/test_readme.py writes it"
 
 
@@ -96,7 +96,7 @@ def test_parameter_tables_have_no_other_rows():
 
 
 def limits_table():
-    """The Markdown table of ``io/files.py``: its sections, comments and values."""
+    """The Markdown table of ``formats/files.py``: its sections, comments and values."""
     lines, section, text = ["| Of | What | Limit |", "| --- | --- | ---: |"], "", []
     for line in LIMITS.read_text(encoding="utf-8").splitlines():
         if line.startswith("# ---- "):
@@ -178,7 +178,7 @@ def test_every_command_has_its_line():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_launch_arguments_make_targets_and_files_exist(page):
-    """Pages name files of the package from its root, such as ``solvers/ipopt.py``."""
+    """Pages name files of the package from its root, such as ``core/solvers/ipopt.py``."""
     launch_file = (ROOT / "launch" / "calibrator.launch.py").read_text(encoding="utf-8")
     lines = [line for line in PAGES[page].splitlines() if line.startswith("ros2 launch")]
     names = {name for line in lines for name in re.findall(r"(\w+):=", line)}

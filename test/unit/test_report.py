@@ -19,21 +19,21 @@ from matplotlib.lines import Line2D
 from result_making import NAMES, calibration, dofs
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.comparison import with_comparison
-from hand_eye_calib.cli import main as cli
-from hand_eye_calib.cli.demo import DRIVE
-from hand_eye_calib.cli.reporting import write_report
-from hand_eye_calib.engine import evidence
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import Extrinsic
-from hand_eye_calib.report.figures import _VIEWS
-from hand_eye_calib.report.report import render
-from hand_eye_calib.results.calibration import DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.records import Finding, Severity
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import REALISTIC
-from hand_eye_calib.text import amount, change, with_sigma
+from hand_eye_calib.core.assessment.comparison import with_comparison
+from hand_eye_calib.core.base.text import amount, change, with_sigma
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.frames import Extrinsic
+from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.core.results.records import Finding, Severity
+from hand_eye_calib.extras.simulation.demo import DRIVE
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import REALISTIC
+from hand_eye_calib.offline.cli import main as cli
+from hand_eye_calib.offline.cli.reporting import write_report
+from hand_eye_calib.offline.report import evidence
+from hand_eye_calib.offline.report.figures import _VIEWS
+from hand_eye_calib.offline.report.report import render
 
 FIGURES = ("views", "trajectories", "residuals", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}

@@ -15,16 +15,16 @@ import yaml
 from result_making import calibration, dofs, good_calibration
 from source_code import ROOT
 
-from hand_eye_calib.checks import findings as wording
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.results import load_result, save_result
-from hand_eye_calib.io.yaml_files import yaml_text
-from hand_eye_calib.plain import json_text, plain
-from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.results.context import AxisProgress, Progress, RateBias
-from hand_eye_calib.results.records import AxisScatter, CorrelatedError, Noise
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.plain import json_text, plain
+from hand_eye_calib.core.checks import findings as wording
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
+from hand_eye_calib.core.results.context import AxisProgress, Progress, RateBias
+from hand_eye_calib.core.results.records import AxisScatter, CorrelatedError, Noise
+from hand_eye_calib.formats.results import load_result, save_result
+from hand_eye_calib.formats.yaml_files import yaml_text
+from hand_eye_calib.offline.cli.main import main
 
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.cli.rig import as_lines
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.writer import write_bag
-from hand_eye_calib.io.results import save_rig
-from hand_eye_calib.report.rig_page import render_rig
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.rig.command import as_lines
+from hand_eye_calib.extras.rig.page import render_rig
+from hand_eye_calib.formats.bags.writer import write_bag
+from hand_eye_calib.formats.results import save_rig
+from hand_eye_calib.offline.cli.main import main
 from reproduction.rig import simulated, unequal
 
 

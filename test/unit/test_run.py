@@ -9,16 +9,16 @@ from motions import as_trajectory, child_of, disturbed, walked, wandering_poses
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
-from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.streams import check_lengths
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.attempts import with_options
-from hand_eye_calib.engine.run import review, run
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.results.calibration import Verdict
-from hand_eye_calib.results.records import Severity
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.streams import check_lengths
+from hand_eye_calib.core.engine.attempts import with_options
+from hand_eye_calib.core.engine.run import review, run
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Verdict
+from hand_eye_calib.core.results.records import Severity
 from reproduction.coverage.classes import make
 
 
@@ -181,10 +181,10 @@ def test_a_given_reference_solves_nothing_else_unless_cross_checks_are_asked_for
     parent, child, _ = streams
     solved = []
     monkeypatch.setattr(
-        "hand_eye_calib.gls.estimator.solve", lambda *_, **__: solved.append("adaptive")
+        "hand_eye_calib.core.noise.estimator.solve", lambda *_, **__: solved.append("adaptive")
     )
     monkeypatch.setattr(
-        "hand_eye_calib.engine.run.check", lambda *_: solved.append("check") or CheckResult(())
+        "hand_eye_calib.core.engine.run.check", lambda *_: solved.append("check") or CheckResult(())
     )
     result = hec.calibrate(parent, child, method="dnlo", reference="B5", checks=checks)
     assert solved == ([] if checks is False else ["check"])

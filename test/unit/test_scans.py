@@ -9,9 +9,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.reader import PoseBag
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.offline.cli.main import main
 
 pytest.importorskip("small_gicp", reason="needs small_gicp")
 

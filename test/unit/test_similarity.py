@@ -8,15 +8,15 @@ import motions
 import numpy as np
 import pytest
 
-from hand_eye_calib.alignment.similarity import estimate_scale
-from hand_eye_calib.alignment.time_offset import correlate_rates, estimate_time_offset
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.engine.offline import calibrate
-from hand_eye_calib.errors import NotEnoughDataError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.alignment.similarity import estimate_scale
+from hand_eye_calib.core.alignment.time_offset import correlate_rates, estimate_time_offset
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.offline.calibrate import calibrate
 
 
 def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=motions.wandering_poses):

@@ -10,12 +10,12 @@ import pytest
 from published_data import data_folder
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.cli import simulate as simulate_command
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.trajectory_files.reading import read_trajectory
-from hand_eye_calib.pairing.motion_pairs import motion_pairs
-from hand_eye_calib.simulation import options
-from hand_eye_calib.simulation.drive import simulate_drive, surface
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.extras.simulation import options
+from hand_eye_calib.extras.simulation import simulate as simulate_command
+from hand_eye_calib.extras.simulation.drive import simulate_drive, surface
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 
 # --- the drive ------------------------------------------------------------------------
 
@@ -157,7 +157,7 @@ def test_command_writes_the_published_layout(tmp_path, run):
     ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
 )
 def test_command_writes_bags(tmp_path, run, storage, name):
-    from hand_eye_calib.io.bags.reader import PoseBag
+    from hand_eye_calib.formats.bags.reader import PoseBag
 
     given = f"--drive hilly --poses 30 --bag {storage}".split()
     assert run("simulate", "--out", tmp_path / "sims", *given)[0] == 0

@@ -12,24 +12,24 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
 
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.engine.run import review
-from hand_eye_calib.live import solving
-from hand_eye_calib.live.solving import Answer, Failure, Job, SolvingProcess, answer
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
+from hand_eye_calib.core.engine.run import review
+from hand_eye_calib.online.live import solving
+from hand_eye_calib.online.live.solving import Answer, Failure, Job, SolvingProcess, answer
 
 PATIENCE_S = 120.0
 
 # Solvers of the test's own.
 SLOW = """
 import time
-from hand_eye_calib.live import solving
+from hand_eye_calib.online.live import solving
 solving.answer = lambda job: time.sleep(3600.0)
 solving.main()
 """
 NOISY = """
 import os
-from hand_eye_calib.live import solving
+from hand_eye_calib.online.live import solving
 excitation = solving.excitation
 def noisy(pose_pairs):
     print("a library that prints", flush=True)
@@ -160,8 +160,8 @@ def test_it_ends_with_the_node_however_that_ends(command):
     """In a program that is killed: nothing there can clean up."""
     program = f"""
 import time
-from hand_eye_calib.engine.calibrator import Calibrator
-from hand_eye_calib.live.solving import Job, SolvingProcess
+from hand_eye_calib.core.engine.calibrator import Calibrator
+from hand_eye_calib.online.live.solving import Job, SolvingProcess
 process = SolvingProcess(lambda: None, {SLOW!r})
 if {command == "busy"}:
     process.submit(Job(0, Calibrator()))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_eye_calib.live.input import NEAR_NS, WITNESSES, StampGuard
+from hand_eye_calib.online.live.input import NEAR_NS, WITNESSES, StampGuard
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -8,17 +8,17 @@ import sys
 
 import pytest
 
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.io.trajectory_files.table import write_trajectory
-from hand_eye_calib.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.offline.cli.main import main
 
 # Each takes from a tenth of a second to a second to load.
 HEAVY = {"casadi", "matplotlib", "numpy", "rclpy", "rich", "rosbags", "scipy", "yaml"}
 
 SHOW_HELP = """
 import sys
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.registry import COMMANDS
+from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.core.base.registry import COMMANDS
 for command in ((), *((each,) for each in COMMANDS)):
     try:
         main([*command, "--help"])
@@ -42,9 +42,9 @@ def test_the_help_of_every_command_loads_no_library():
 @pytest.mark.parametrize(
     "code",
     [
-        "import hand_eye_calib.engine.calibrator, hand_eye_calib.live.solving; "
+        "import hand_eye_calib.core.engine.calibrator, hand_eye_calib.online.live.solving; "
         "import hand_eye_calib as hec; hec.Trajectory; hec.Calibration; hec.calibrate",
-        "import hand_eye_calib.ros.calibrator_node",
+        "import hand_eye_calib.online.ros.calibrator_node",
     ],
 )
 def test_engine_and_node_load_only_what_they_compute_with(code):
@@ -60,7 +60,7 @@ def test_calibrating_two_files_loads_no_writer_of_results(tmp_path):
     for name, trajectory in (("parent", drive.parent), ("child", drive.child)):
         write_trajectory(tmp_path / name, trajectory)
     code = (
-        "import sys; from hand_eye_calib.cli.main import main; "
+        "import sys; from hand_eye_calib.offline.cli.main import main; "
         "main(sys.argv[1:]); print('loaded', *sys.modules, file=sys.stderr)"
     )
     loaded = loaded_by(code, "calibrate", str(tmp_path / "parent"), str(tmp_path / "child"))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hand_eye_calib.blocks import Blocks
-from hand_eye_calib.gls import reml
-from hand_eye_calib.gls.normal import Factor, NormalEquations
-from hand_eye_calib.gls.outliers import innovations
-from hand_eye_calib.gls.state_space import Posterior, StateSpace
+from hand_eye_calib.core.base.blocks import Blocks
+from hand_eye_calib.core.noise import reml
+from hand_eye_calib.core.noise.normal import Factor, NormalEquations
+from hand_eye_calib.core.noise.outliers import innovations
+from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 
 N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
 N_LEVELS, SIZES = 5 + 2 * 4, (3, 3, 3, 1)

@@ -7,13 +7,13 @@ import pytest
 from real_data import data_folder
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
-from hand_eye_calib.errors import InputError, NotEnoughDataError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.stops import read_arm_samples
-from hand_eye_calib.solvers.robot_world import Stops, solve
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
+from hand_eye_calib.extras.stops.robot_world import Stops, solve
+from hand_eye_calib.extras.stops.samples import read_arm_samples
+from hand_eye_calib.offline.cli.main import main
 
 NOISE = np.repeat([0.0005, 0.001], 3)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.config import CalibratorConfig
-from hand_eye_calib.engine.stops import calibrate_arm, calibrate_stops
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
+from hand_eye_calib.offline.cli.main import main
 
 # Errors of twenty stops; five standard deviations.
 WITHIN_M = 0.006

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
 
-from hand_eye_calib.alignment.similarity import EXPLAINED, fit_similarity
-from hand_eye_calib.alignment.time_offset import estimate_time_offset
-from hand_eye_calib.checks import hypotheses
-from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.checks.streams import check_frozen, check_stream, frozen_share
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.engine.evidence import summarise
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.drive import simulate, simulate_drive
-from hand_eye_calib.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.core.alignment.similarity import EXPLAINED, fit_similarity
+from hand_eye_calib.core.alignment.time_offset import estimate_time_offset
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.checks import hypotheses
+from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.checks.findings import Severity
+from hand_eye_calib.core.checks.streams import check_frozen, check_stream, frozen_share
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.simulation.drive import simulate, simulate_drive
+from hand_eye_calib.extras.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.offline.report.evidence import summarise
 
 
 def drive(seed=0, noise=0.001, wander=motions.wandering_poses, n_poses=500):

@@ -9,16 +9,16 @@ from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, noisy_pa
 from scipy.ndimage import gaussian_filter1d
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.moved import SIGNIFICANT, find_change, possible_shift
-from hand_eye_calib.checks.check import check_streams
-from hand_eye_calib.checks.findings import Severity
-from hand_eye_calib.checks.streams import check_stream
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.pairing.motion_pairs import synchronise
-from hand_eye_calib.results.calibration import Verdict
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
+from hand_eye_calib.core.assessment.moved import SIGNIFICANT, find_change, possible_shift
+from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.checks.findings import Severity
+from hand_eye_calib.core.checks.streams import check_stream
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import synchronise
+from hand_eye_calib.core.results.calibration import Verdict
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
 from reproduction.coverage.classes import make
 from reproduction.fault_cases import FAULTS, LATER, SILENT, heading_drift
 

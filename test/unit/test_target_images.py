@@ -6,14 +6,20 @@ from bag_making import JAZZY, header, write_messages
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.bags.reader import PoseBag
-from hand_eye_calib.io.bags.writer import stamped_messages
-from hand_eye_calib.io.target_images import Camera, Target, TargetFinder, images_in, read_camera
-from hand_eye_calib.io.trajectory_files.table import write_trajectory
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.sensors.target_images import (
+    Camera,
+    Target,
+    TargetFinder,
+    images_in,
+    read_camera,
+)
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.writer import stamped_messages
+from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.offline.cli.main import main
 
 cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from motions import wandering_poses
 
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.transforms import PoseFields, TfSource, TfStream
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.transforms import PoseFields, TfSource, TfStream
 
 MOUNT = se3.exp(np.array([1.2, 0.1, 0.8, 0.2, -0.1, 1.5]))
 MS = 1_000_000

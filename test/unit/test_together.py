@@ -13,15 +13,15 @@ from result_making import shift
 from result_making import shifted as result
 
 import hand_eye_calib as hec
-from hand_eye_calib.assessment.agreement import agreement_of
-from hand_eye_calib.assessment.comparison import compare, with_comparison
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.frames import Extrinsic
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.results.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.results.records import AXES
-from hand_eye_calib.session.together import together
+from hand_eye_calib.core.assessment.agreement import agreement_of
+from hand_eye_calib.core.assessment.comparison import compare, with_comparison
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.frames import Extrinsic
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.extras.fleet.together import together
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from motions import as_trajectory, wandering_poses
 
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import REACH, Trajectory
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import REACH, Trajectory
 
 STAMPS = np.array([0, 10, 20], dtype=np.int64)
 POSES = wandering_poses(3)

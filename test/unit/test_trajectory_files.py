@@ -9,12 +9,12 @@ import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.io.trajectory_files.dates import seconds
-from hand_eye_calib.io.trajectory_files.table import write_trajectory
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.trajectory_files.dates import seconds
+from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.offline.cli.main import main
 
 POSE = "1 2 3 0 0 0 1"
 START_NS = 1_700_000_000_123_456_789

@@ -8,11 +8,11 @@ from motions import as_trajectory, geodetic, planar_poses, read_trajectory_file,
 from published_data import data_folder
 
 import hand_eye_calib as hec
-from hand_eye_calib.cli.main import main
-from hand_eye_calib.errors import InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.geodetic import LocalOrigin
-from hand_eye_calib.io.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.geodetic import LocalOrigin
+from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.offline.cli.main import main
 
 SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
 

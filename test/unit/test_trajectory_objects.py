@@ -10,9 +10,9 @@ from motions import as_trajectory, child_of, wandering_poses
 from result_making import calibration
 
 import hand_eye_calib as hec
-from hand_eye_calib.errors import ConfigError, InputError, MissingDependencyError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.bags.writer import write_bag
+from hand_eye_calib.core.base.errors import ConfigError, InputError, MissingDependencyError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.writer import write_bag
 
 EPOCH_NS = 1_700_000_000_123_456_789
 POSES = wandering_poses(30)

@@ -58,9 +58,12 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
     program, config = tmp_path / "program.py", tmp_path / "mypy.ini"
     program.write_text(PROGRAM, encoding="utf-8")
     public = {getattr(hec, name).__module__ for name in hec.__all__}
-    of_arguments = {"hand_eye_calib.arrays", "hand_eye_calib.results.result"}
-    of_arguments |= {"hand_eye_calib.engine.run"}
-    of_arguments |= {"hand_eye_calib.text", "hand_eye_calib.option"}  # Prior, OptionSet
+    of_arguments = {"hand_eye_calib.core.base.arrays", "hand_eye_calib.core.results.result"}
+    of_arguments |= {"hand_eye_calib.core.engine.run"}
+    of_arguments |= {
+        "hand_eye_calib.core.base.text",
+        "hand_eye_calib.core.base.option",
+    }  # Prior, OptionSet
     followed = [hec.__name__, *sorted(public | of_arguments), "numpy", "numpy.*"]
     config.write_text(
         "[mypy]\nfollow_imports = skip\n"

@@ -5,15 +5,15 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
-from hand_eye_calib.alignment.similarity import estimate_scale
-from hand_eye_calib.checks.check import in_other_units
-from hand_eye_calib.checks.streams import check_lengths, is_too_fast, is_too_slow
-from hand_eye_calib.engine.snapshot import whole_snapshot
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.geometry.se3 import deviation
-from hand_eye_calib.geometry.trajectory import Trajectory
-from hand_eye_calib.simulation.drive import simulate_drive
-from hand_eye_calib.simulation.options import HILLY_DRIVE, NoiseConfig
+from hand_eye_calib.core.alignment.similarity import estimate_scale
+from hand_eye_calib.core.checks.check import in_other_units
+from hand_eye_calib.core.checks.streams import check_lengths, is_too_fast, is_too_slow
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.simulation.drive import simulate_drive
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.coverage import classes, mixed
 from reproduction.coverage.classes import make
 

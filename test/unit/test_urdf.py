@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from bag_making import TF, tf_message, write_messages
 
-from hand_eye_calib.errors import ConfigError, InputError
-from hand_eye_calib.geometry import se3
-from hand_eye_calib.io.installed import open_installed, read_urdf
+from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.installed import open_installed, read_urdf
 
 URDF = """<?xml version="1.0" encoding="utf-8"?>
 <!-- origin xyz="9 9 9": a decoy; the mast's <joint> is bent -->

@@ -12,11 +12,11 @@ from result_making import NAMES, dofs
 from result_making import good_calibration as good
 from source_code import ROOT
 
-from hand_eye_calib.results import verdict as rules
-from hand_eye_calib.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.results.context import Together
-from hand_eye_calib.results.records import AxisScatter, Finding, Severity
-from hand_eye_calib.results.verdict import RULES
+from hand_eye_calib.core.results import verdict as rules
+from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
+from hand_eye_calib.core.results.context import Together
+from hand_eye_calib.core.results.records import AxisScatter, Finding, Severity
+from hand_eye_calib.core.results.verdict import RULES
 
 PAGE = ROOT / "docs" / "verdict.md"
 TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")

@@ -15,9 +15,11 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
-from hand_eye_calib.cli.watch import Session, _display, qr_code
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.live.state import (
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.plain import from_plain, plain
+from hand_eye_calib.core.results import context
+from hand_eye_calib.core.results.context import AxisProgress, Comparison, Difference, Progress
+from hand_eye_calib.online.live.state import (
     Broadcast,
     ChecksState,
     ExtrinsicState,
@@ -30,12 +32,10 @@ from hand_eye_calib.live.state import (
     ResultState,
     SavedState,
 )
-from hand_eye_calib.plain import from_plain, plain
-from hand_eye_calib.results import context
-from hand_eye_calib.results.context import AxisProgress, Comparison, Difference, Progress
-from hand_eye_calib.watch import terminal
-from hand_eye_calib.watch.board import AXES, Board, Tone, state_of
-from hand_eye_calib.watch.web import WebServer, fragment
+from hand_eye_calib.online.ros.watch import Session, _display, qr_code
+from hand_eye_calib.online.watch import terminal
+from hand_eye_calib.online.watch.board import AXES, Board, Tone, state_of
+from hand_eye_calib.online.watch.web import WebServer, fragment
 
 NODE = "/calibrator"
 INF = float("inf")

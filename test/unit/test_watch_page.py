@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hand_eye_calib.watch import web
+from hand_eye_calib.online.watch import web
 
 FOLDER = Path(web.__file__).parent / "page"
 SCRIPT = (FOLDER / "page.js").read_text(encoding="utf-8")

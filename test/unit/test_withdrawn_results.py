@@ -9,22 +9,27 @@ import pytest
 from result_making import calibration, seen
 from rich.console import Console
 
-from hand_eye_calib.checks.check import CheckResult
-from hand_eye_calib.checks.findings import Finding, Severity
-from hand_eye_calib.config import CalibratorConfig, NodeConfig
-from hand_eye_calib.io.results import load_result
-from hand_eye_calib.live import cycle as module
-from hand_eye_calib.live.cycle import SolveCycle
-from hand_eye_calib.live.log import NodeLog
-from hand_eye_calib.live.saving import Saver
-from hand_eye_calib.live.session import LiveSession
-from hand_eye_calib.live.solving import Answer, Failure
-from hand_eye_calib.live.state import Broadcast, Level, NodeState, Standing
-from hand_eye_calib.results.calibration import DofObservability, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.results.records import AXES
-from hand_eye_calib.watch import terminal
-from hand_eye_calib.watch.board import Board, Tone
-from hand_eye_calib.watch.web import fragment
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.findings import Finding, Severity
+from hand_eye_calib.core.results.calibration import (
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.online.live import cycle as module
+from hand_eye_calib.online.live.cycle import SolveCycle
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.saving import Saver
+from hand_eye_calib.online.live.session import LiveSession
+from hand_eye_calib.online.live.solving import Answer, Failure
+from hand_eye_calib.online.live.state import Broadcast, Level, NodeState, Standing
+from hand_eye_calib.online.watch import terminal
+from hand_eye_calib.online.watch.board import Board, Tone
+from hand_eye_calib.online.watch.web import fragment
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
 INVERSE = Finding(

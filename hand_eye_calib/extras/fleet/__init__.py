@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.registry import (
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.registry import (
     COMMANDS,
     PUBLIC_NAMES,
     ROUTES,
@@ -15,8 +15,8 @@ from hand_eye_calib.registry import (
 
 def register() -> None:
     """Register the command ``compare``, and batches and recordings of one rig for ``calibrate``."""
-    PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.session.together"
-    PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.session.together"
+    PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.extras.fleet.together"
+    PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.extras.fleet.together"
     COMMANDS["compare"] = Command(
         "compare results with what is installed, or with each other", _compare
     )
@@ -25,13 +25,13 @@ def register() -> None:
 
 
 def _compare() -> Any:
-    from hand_eye_calib.cli import compare
+    from hand_eye_calib.extras.fleet import compare
 
     return compare
 
 
 def _add_arguments(parser: Any) -> None:
-    from hand_eye_calib.cli.options import at_least
+    from hand_eye_calib.offline.cli.options import at_least
 
     add = parser.add_argument_group("many recordings").add_argument
     batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
@@ -56,12 +56,12 @@ def _is_batch(arguments: Any) -> bool:
 
 
 def _run_batch(arguments: Any, _: Any) -> int:
-    from hand_eye_calib.cli.batch.run import run_batch
+    from hand_eye_calib.extras.fleet.batch import run_batch
 
     return run_batch(arguments)
 
 
 def _run_together(arguments: Any, groups: Any) -> int:
-    from hand_eye_calib.cli.batch.run import run_together
+    from hand_eye_calib.extras.fleet.batch import run_together
 
     return run_together(arguments, groups)

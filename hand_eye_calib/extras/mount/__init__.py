@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hand_eye_calib.registry import MOUNT_MONITORS
+from hand_eye_calib.core.base.registry import MOUNT_MONITORS
 
 
 def register() -> None:
@@ -11,7 +11,7 @@ def register() -> None:
 
 
 def _watch(session: Any, *parts: Any) -> Any:
-    from hand_eye_calib.live.monitor import LIMITS, MountWatch
+    from hand_eye_calib.extras.mount.monitor import LIMITS, MountWatch
 
     session.watch_only(LIMITS)
     return MountWatch(session, *parts)

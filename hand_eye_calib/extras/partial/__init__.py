@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hand_eye_calib.registry import ESTIMATORS
+from hand_eye_calib.core.base.registry import ESTIMATORS
 
 
 def register() -> None:
@@ -13,12 +13,12 @@ def register() -> None:
 
 def _lever_arm(pose_pairs: Any, config: Any, cross_check: bool) -> Any:
     """Estimate the lever arm; positions have no cross-check."""
-    from hand_eye_calib.engine.partial import estimate_lever_arm
+    from hand_eye_calib.extras.partial.partial import estimate_lever_arm
 
     return estimate_lever_arm(pose_pairs, config)
 
 
 def _rotation(pose_pairs: Any, config: Any, cross_check: bool) -> Any:
-    from hand_eye_calib.engine.partial import estimate_rotation
+    from hand_eye_calib.extras.partial.partial import estimate_rotation
 
     return estimate_rotation(pose_pairs, config, cross_check=cross_check)

@@ -3,21 +3,21 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.registry import PUBLIC_NAMES, ROUTES, SESSION_PAGES, Route
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.registry import PUBLIC_NAMES, ROUTES, SESSION_PAGES, Route
 
 
 def register() -> None:
     """Register rigs for ``calibrate``, and the pages of a session with further sensors."""
-    PUBLIC_NAMES["RigCalibration"] = "hand_eye_calib.session.rig"
-    PUBLIC_NAMES["calibrate_rig"] = "hand_eye_calib.session.rig"
+    PUBLIC_NAMES["RigCalibration"] = "hand_eye_calib.extras.rig.rig"
+    PUBLIC_NAMES["calibrate_rig"] = "hand_eye_calib.extras.rig.rig"
     ROUTES["rig"] = Route(_add_arguments, _is_rig, _calibrate_rig)
     SESSION_PAGES["rig"] = _session_rig
 
 
 def _session_rig(directory: Path, session: Any) -> None:
     if session.others:
-        from hand_eye_calib.report.rig_page import write_session_rig
+        from hand_eye_calib.extras.rig.page import write_session_rig
 
         write_session_rig(directory, session)
 
@@ -39,12 +39,12 @@ def _is_rig(arguments: Any) -> bool:
         return True
     if len(arguments.paths) < 3 or arguments.command == "replay":
         return False
-    from hand_eye_calib.cli.reading import are_bags
+    from hand_eye_calib.offline.cli.reading import are_bags
 
     return not are_bags(arguments.paths)
 
 
 def _calibrate_rig(arguments: Any, as_given: Any) -> int:
-    from hand_eye_calib.cli.rig import calibrate_rig
+    from hand_eye_calib.extras.rig.command import calibrate_rig
 
     return calibrate_rig(arguments, as_given)

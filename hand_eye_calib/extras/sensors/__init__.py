@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.registry import BAG_READINGS, FILE_READERS
+from hand_eye_calib.core.base.registry import BAG_READINGS, FILE_READERS
 
 
 def register() -> None:
@@ -14,18 +14,18 @@ def register() -> None:
 
 
 def _scans(bag: Any, stream: str, topic: str, _: str) -> Any:
-    from hand_eye_calib.io.bags.scans import ScanReading
+    from hand_eye_calib.extras.sensors.scans import ScanReading
 
     return ScanReading(stream, topic, bag.paths[0], bag.files)
 
 
 def _images(bag: Any, stream: str, topic: str, text: str) -> Any:
-    from hand_eye_calib.io.bags.images import read_images
+    from hand_eye_calib.extras.sensors.images import read_images
 
     return read_images(bag, stream, topic, text)
 
 
 def _other_programs(path: str | Path, data: bytes, options: Any) -> Any:
-    from hand_eye_calib.io.trajectory_files.foreign import table_of_program
+    from hand_eye_calib.extras.sensors.foreign import table_of_program
 
     return table_of_program(path, data, options)

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from hand_eye_calib.registry import COMMANDS, PUBLIC_NAMES, Command
+from hand_eye_calib.core.base.registry import COMMANDS, PUBLIC_NAMES, Command
 
 
 def register() -> None:
     """Register the commands ``simulate`` and ``demo``."""
-    PUBLIC_NAMES["simulate"] = "hand_eye_calib.simulation.drive"
+    PUBLIC_NAMES["simulate"] = "hand_eye_calib.extras.simulation.drive"
     COMMANDS["simulate"] = Command("simulate trajectories or a bag with known truth", _simulate)
     COMMANDS["demo"] = Command(
         "simulate a recording and calibrate from it, offline and live", _demo
@@ -15,12 +15,12 @@ def register() -> None:
 
 
 def _simulate() -> Any:
-    from hand_eye_calib.cli import simulate
+    from hand_eye_calib.extras.simulation import simulate
 
     return simulate
 
 
 def _demo() -> Any:
-    from hand_eye_calib.cli import demo
+    from hand_eye_calib.extras.simulation import demo
 
     return demo

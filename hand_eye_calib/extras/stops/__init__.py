@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.errors import ConfigError
-from hand_eye_calib.registry import PUBLIC_NAMES, ROUTES, Route
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.registry import PUBLIC_NAMES, ROUTES, Route
 
 # Files of an arm's samples.
 _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
@@ -12,9 +12,9 @@ _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 def register() -> None:
     """Register stops for ``calibrate``."""
-    PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.engine.stops"
-    PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.engine.stops"
-    PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.io.stops"
+    PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.extras.stops.calibrate"
+    PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.extras.stops.calibrate"
+    PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.extras.stops.samples"
     ROUTES["stops"] = Route(_add_arguments, _are_stops, _calibrate)
 
 
@@ -45,9 +45,9 @@ def _are_stops(arguments: Any) -> bool:
 
 
 def _calibrate(arguments: Any, _: Any) -> int:
-    from hand_eye_calib.cli import stops
-    from hand_eye_calib.cli.options import refuse_stamps
-    from hand_eye_calib.cli.present import deliver
+    from hand_eye_calib.extras.stops import command as stops
+    from hand_eye_calib.offline.cli.options import refuse_stamps
+    from hand_eye_calib.offline.cli.present import deliver
 
     refuse_stamps(arguments)
     return deliver(*stops.solved(arguments), arguments)

@@ -1,1 +1,0 @@
-"""``calibrate --batch`` and several recordings: tasks, workers, results (docs/bags.md)."""

@@ -1,0 +1,1 @@
+"""Two pose streams in, a judged extrinsic out: no file, no ROS."""

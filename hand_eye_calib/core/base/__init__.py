@@ -1,0 +1,1 @@
+"""Errors, options, texts and plain values that every layer uses."""

@@ -1,0 +1,166 @@
+"""Evidence of blocks of time, added up: of all blocks, of all but one, before and since a time.
+
+The evidence of a block on p unknowns x, which minimise the squares of ``W^(1/2) (J x - y)``, is the
+table of products ``[J y]' W [J y]`` (p + 1, p + 1). Its first p rows ``[H S]`` are the information
+and the score. Tables add over blocks. So the answer of any set of blocks is one small solve away.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+
+# Damping of directions without evidence, in units in which the diagonal is 1: above rounding.
+_DAMPING = 1e-10
+
+# Smallest root of a diagonal element that counts as evidence.
+_LEAST_SIZE = 1e-30
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Sums (B, ...) of B blocks in order of time: tables of products, or other evidence that adds.
+
+    Examples
+    --------
+    >>> rows = np.array([[[1.0, 2.0]], [[1.0, 4.0]]])  # 1 x = 2, then 1 x = 4
+    >>> Blocks.of_rows(rows, 2).solve([0]).tolist()
+    [3.0]
+    """
+
+    sums: FloatArray
+
+    @classmethod
+    def of_rows(cls, rows: FloatArray, n_blocks: int, probes: FloatArray | None = None) -> "Blocks":
+        """Tables of products of weighted rows (K, d, p + 1), in blocks of equally many rows.
+
+        ``probes`` (K, d, p + 1) take the place of the rows on the left: instrumental variables.
+        """
+        pairs = zip(
+            np.array_split(rows if probes is None else probes, n_blocks),
+            np.array_split(rows, n_blocks),
+            strict=True,
+        )
+        n_columns = rows.shape[-1]
+        tables = [
+            probe.reshape(-1, n_columns).T @ row.reshape(-1, n_columns) for probe, row in pairs
+        ]
+        return cls(np.stack(tables))
+
+    @classmethod
+    def gathered(cls, values: FloatArray, block_of: IntArray, n_blocks: int) -> "Blocks":
+        """Sums of values (K, ...) by the block (K,) of each."""
+        sums = np.zeros((n_blocks, *values.shape[1:]))
+        np.add.at(sums, block_of, values)
+        return cls(sums)
+
+    def merged(self, n_blocks: int) -> "Blocks":
+        """Fewer blocks, each of neighbours."""
+        starts = np.arange(n_blocks) * len(self.sums) // n_blocks
+        return Blocks(np.add.reduceat(self.sums, starts))
+
+    @property
+    def total(self) -> FloatArray:
+        """Sum (...) of all blocks."""
+        return np.asarray(self.sums.sum(axis=0))
+
+    def without(self) -> FloatArray:
+        """Sums (B, ...) of all blocks but one."""
+        return self.total - self.sums
+
+    def before(self, cuts: IntArray) -> FloatArray:
+        """Sums (C, ...) of the blocks before each cut, at least 1."""
+        return np.asarray(np.cumsum(self.sums, axis=0)[cuts - 1])
+
+    def since(self, cuts: IntArray) -> FloatArray:
+        """Sums (C, ...) of the blocks since each cut, at most B - 1."""
+        return np.asarray(np.cumsum(self.sums[::-1], axis=0)[::-1][cuts])
+
+    def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
+        """Evidence (C, p, p + 1) of a shift of the unknowns at each cut, whatever they were before.
+
+        ``prior`` (p, p) is information that holds besides about the unknowns before.
+        """
+        before = self.before(cuts)
+        covariances = inverse(information(before) + prior)
+        known = (covariances @ score(before)[..., None])[..., 0]
+        return shift_evidence(self.since(cuts), known, covariances)
+
+    def solve(self, columns: Sequence[int]) -> FloatArray:
+        """Answer (k,) of all blocks for some of the unknowns, the others being zero."""
+        return solve(self.total, columns)
+
+    def jackknife(self, columns: Sequence[int]) -> FloatArray:
+        """Covariance (k, k) of :meth:`solve` by the answers without each block."""
+        return jackknife_covariance(solve(self.without(), columns))
+
+
+def information(tables: FloatArray) -> FloatArray:
+    """Information H (..., p, p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
+    n_unknowns = tables.shape[-1] - 1
+    return tables[..., :n_unknowns, :n_unknowns]
+
+
+def score(tables: FloatArray) -> FloatArray:
+    """Score S (..., p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
+    return tables[..., : tables.shape[-1] - 1, -1]
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Inverses (..., p, p) of matrices (..., p, p)."""
+    return np.asarray(np.linalg.inv(matrices), dtype=float)
+
+
+def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from those that are known.
+
+    Parameters
+    ----------
+    tables : (..., p, p + 1) or (..., p + 1, p + 1) array
+        Evidence since the shift; H may be singular.
+    known : (..., p) array
+        The unknowns before the shift.
+    covariance : (..., p, p) array
+        Of the errors of ``known``.
+    """
+    H = information(tables)
+    scores = score(tables)[..., None] - H @ known[..., None]
+    from_known = np.concatenate([H, scores], axis=-1)
+    return inverse(np.eye(H.shape[-1]) + H @ covariance) @ from_known
+
+
+def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> FloatArray:
+    """Least-squares solution (..., k) of a target column by k others.
+
+    Parameters
+    ----------
+    tables : (..., p + 1, p + 1) array
+        Products of the columns.
+    columns : sequence of int
+    target : int
+        The column that the others are fitted to.
+
+    Returns
+    -------
+    (..., k) array
+        Zero along directions without evidence.
+    """
+    normal = tables[..., columns, :][..., columns]
+    sizes = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
+    units = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > _LEAST_SIZE)
+    balanced = normal * units[..., :, None] * units[..., None, :] + _DAMPING * np.eye(len(columns))
+    score = (units * tables[..., columns, target])[..., None]
+    return np.asarray(units * np.linalg.solve(balanced, score)[..., 0])
+
+
+def jackknife_covariance(answers: FloatArray) -> FloatArray:
+    """Covariance (p, p) from the answers (B, p) without each of B blocks.
+
+    B. Efron, R. J. Tibshirani, *An introduction to the bootstrap*, 1993, eq. 11.5:
+    ``(B - 1) / B * sum (x_b - mean) (x_b - mean)'``.
+    """
+    n_blocks = len(answers)
+    deviations = answers - answers.mean(axis=0)
+    return np.asarray((n_blocks - 1) / n_blocks * deviations.T @ deviations)

@@ -1,0 +1,401 @@
+"""Every option of the package, once: name, unit, range, default and meaning.
+
+The node's parameters, the options of the command line, ``config/calibrator.yaml`` and the tables of
+the documentation are made from these dataclasses or tested against them.
+"""
+
+import math
+from collections.abc import Collection
+from dataclasses import InitVar, dataclass
+from typing import Any, NamedTuple, Self
+
+import hand_eye_calib.core.base.text as text
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.option import OptionSet, option
+
+TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
+# As of formats/layouts.yaml.
+EXPORT_FORMATS = (
+    *("autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins", "orbslam3"),
+    *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),
+    *("easy_handeye2", "opencv", "numpy"),
+)
+MEASURES = ("poses", "positions", "rotations", "rates")
+PAIR_BY = ("time", "row", "name")
+STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+POSE_TYPES = (
+    "auto",
+    "nav_msgs/msg/Odometry",
+    *(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform")),
+    *("sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped"),
+)
+
+BACKENDS = ("fast", "ipopt")
+
+# Largest time offset (s): that between any two stamps of 64 bits of nanoseconds which are not
+# negative. Clocks may count from 1970, 1904, the start of the computer or of the GPS week.
+_LONGEST_OFFSET_S = 9.2e9
+
+
+class MethodRecord(NamedTuple):
+    """What other code has to know about a method: it solves the motion pairs of a reference alone,
+    or (False) uses the pose stream as a whole; outliers are left out, so that a few jumps of a
+    stream hardly change the answer; and the values of the option ``backend`` that it takes.
+    """
+
+    uses_reference: bool = True
+    rejects_outliers: bool = False
+    backends: tuple[str, ...] = BACKENDS[:1]
+
+
+METHODS = {
+    "auto": MethodRecord(uses_reference=False, rejects_outliers=True),
+    "dnlo": MethodRecord(rejects_outliers=True, backends=BACKENDS),
+    "dnl": MethodRecord(backends=BACKENDS),
+    **dict.fromkeys(("park", "taylor", "zhuang", "ali"), MethodRecord()),
+    "adaptive": MethodRecord(uses_reference=False, rejects_outliers=True),
+}
+
+
+def require_backend(method: str, backend: str) -> None:
+    """Check that a method has a backend; otherwise a ConfigError names those that have."""
+    if backend not in METHODS[method].backends:
+        able = [name for name, record in METHODS.items() if backend in record.backends]
+        raise ConfigError(
+            f"method {method} has no {backend} backend; only {' and '.join(able)} have"
+        )
+
+
+def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
+    """An option of each stream, whose name takes the place of {} in its meaning."""
+    return {
+        stream: option(default, doc.format(stream), **settings) for stream in ("parent", "child")
+    }
+
+
+_TF_SOURCE = _both(
+    "",
+    "Take the poses of the {0} sensor from /tf and /tf_static instead of {0}_odom: "
+    "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
+    read_only=True,
+    parse=text.split_frames,
+)
+_TYPE = _both(
+    "auto",
+    "Message type of {}_odom; auto takes it from the publisher.",
+    choices=POSE_TYPES,
+    read_only=True,
+)
+_MEASURES = _both(
+    "auto",
+    "What the {} sensor measures: poses; positions (a GNSS antenna, a prism); rotations "
+    "without positions; or angular rates. auto takes it from the message type or the columns.",
+    choices=("auto", *MEASURES),
+    read_only=True,
+)
+_INVERT = _both(
+    "none",
+    "Invert the {}'s poses, if they are those of the world in the sensor, or its "
+    "orientations alone.",
+    choices=("none", "poses", "orientations"),
+)
+_QUATERNION = _both(
+    "xyzw",
+    "Order in which the {}'s quaternions were written: wxyz puts right what was read as x y z w, "
+    "yzwx values x y z w under names w x y z.",
+    choices=("xyzw", "wxyz", "yzwx"),
+)
+_KIND = _both(
+    "odometry",
+    "How the poses of the {} sensor were made. odometry (lidar, camera, wheels) has "
+    "constant errors that no recording shows: they are part of every standard deviation. exact "
+    "(motion capture, surveyed, an INS with RTK, simulated) has none.",
+    choices=("odometry", "exact"),
+)
+
+
+_EXAMPLES = {"m": "1.85+/-0.02 or 185cm+/-2cm", "rad": "-90deg+/-2deg"}
+_UNITS_NEEDED = {"m": "More than 5 m needs its unit, as in 8m+/-0.02m. ", "rad": ""}
+_PRIOR: dict[str, Any] = {
+    axis: option(
+        "",
+        f"Prior on {axis} of the child sensor in the parent sensor's frame: VALUE+/-SIGMA, "
+        f"such as {_EXAMPLES[unit]}. {_UNITS_NEEDED[unit]}Empty for none.",
+        unit=unit,
+        parse=text.parse_prior,
+    )
+    for axis, unit in text.AXIS_UNITS.items()
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibratorConfig(OptionSet):
+    """Options of the engine: the same for the node, the replay of bags, files and Python.
+
+    Attributes
+    ----------
+    given : frozenset of str
+        Those that the user set, at their defaults or not; ``dataclasses.replace`` keeps them.
+
+    Examples
+    --------
+    >>> config = hec.CalibratorConfig(method="dnlo", prior_z="1.85+-0.02")
+    >>> config.prior()
+    {'z': (1.85, 0.02)}
+    """
+
+    given: InitVar[Collection[str] | None] = None
+
+    def __new__(cls, **values: Any) -> Self:
+        """Note which options are passed."""
+        config = super().__new__(cls)
+        given = values if values.get("given") is None else values["given"]
+        object.__setattr__(config, "given", frozenset(given) - {"given"})
+        return config
+
+    method: str = option(
+        "auto",
+        "How the extrinsic is solved; auto: adaptive, dnlo where its noise model cannot work, and "
+        "dnlo if a reference is given; dnlo rejects outliers, adaptive estimates the noise and "
+        "uses no reference, the others use all motion pairs.",
+        choices=tuple(METHODS),
+    )
+    reference: str = option(
+        "auto",
+        "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
+        "it), C<n> (each with the first of its segment of n), or auto (the one with the "
+        "estimate nearest to adaptive's).",
+        parse=lambda name, value: value == "auto" or text.parse_reference(name, value),
+    )
+    backend: str = option(
+        "fast",
+        "fast: the quadratic-form solver; ipopt: the paper's CasADi + Ipopt formulation, for dnlo "
+        "and dnl.",
+        choices=BACKENDS,
+    )
+    threshold: float = option(
+        0.01,
+        "DNLO: pairs with a larger cost are outliers (c of eq. 5).",
+        unit="m^2",
+        within=(1e-12, 1e6),
+    )
+    min_inlier_fraction: float = option(
+        0.5,
+        "DNLO: at least this share of the pairs counts as inliers (d of eq. 5 over the pairs).",
+        within=(0.0, 1.0),
+    )
+    min_pairs: int = option(
+        10, "Smallest number of synchronised pose pairs to solve with.", within=(3, 1_000_000)
+    )
+    max_pairs: int = option(
+        5000,
+        "Largest number of synchronised pose pairs kept; more are downsampled.",
+        within=(10, 100_000_000),
+    )
+    keyframe_min_translation: float = option(
+        0.0,
+        "Keep a pose pair if the parent sensor has moved this far since the last one kept, or "
+        "rotated by keyframe.min_rotation. 0 switches this off.",
+        unit="m",
+        within=(0.0, 100.0),
+    )
+    keyframe_min_rotation: float = option(
+        0.0,
+        "Keep a pose pair if the parent sensor has rotated by this angle since the last one kept, "
+        "or moved keyframe.min_translation. 0 switches this off.",
+        unit="rad",
+        within=(0.0, math.pi),
+    )
+    keyframe_min_interval: float = option(
+        0.0, "Smallest time between pose pairs that are kept.", unit="s", within=(0.0, 60.0)
+    )
+    max_gap: float = option(
+        0.5,
+        "Longest time between two poses of a stream across which it is interpolated.",
+        unit="s",
+        within=(1e-3, 60.0),
+    )
+    time_offset: float | str = option(
+        0.0,
+        "Added to the child's stamps to get the parent's clock; estimate finds it from the angular "
+        "rates of both streams, of any size.",
+        unit="s",
+        words=("estimate",),
+        within=(-_LONGEST_OFFSET_S, _LONGEST_OFFSET_S),
+    )
+    scale: float | str = option(
+        "none",
+        "Factor from the child's lengths to metres; estimate finds it; auto finds it and uses it "
+        "only if it clearly differs from 1.",
+        words=("none", "auto", "estimate"),
+        within=(1e-6, 1e6),
+    )
+    parent_scale: float = option(
+        1.0,
+        "Factor from the parent's lengths to metres, such as 0.001 for millimetres.",
+        within=(1e-6, 1e6),
+    )
+    parent_measures: str = _MEASURES["parent"]
+    child_measures: str = _MEASURES["child"]
+    parent_invert: str = _INVERT["parent"]
+    child_invert: str = _INVERT["child"]
+    parent_quaternion: str = _QUATERNION["parent"]
+    child_quaternion: str = _QUATERNION["child"]
+    parent_kind: str = _KIND["parent"]
+    child_kind: str = _KIND["child"]
+    prior_x: str = _PRIOR["x"]
+    prior_y: str = _PRIOR["y"]
+    prior_z: str = _PRIOR["z"]
+    prior_roll: str = _PRIOR["roll"]
+    prior_pitch: str = _PRIOR["pitch"]
+    prior_yaw: str = _PRIOR["yaw"]
+    target_translation: float = option(
+        0.02,
+        "Standard deviation along each axis that is good enough; the verdict and the stop rule use "
+        "it.",
+        unit="m",
+        within=(1e-6, 100.0),
+    )
+    target_rotation: float = option(
+        0.00524,
+        "Standard deviation about each axis that is good enough, 0.3 deg unless set; the verdict "
+        "and the stop rule use it.",
+        unit="rad",
+        within=(1e-6, math.pi),
+    )
+    target_axes: str = option(
+        "",
+        "Targets of single axes in place of target.translation and target.rotation, such as z=10cm "
+        "yaw=0.5deg. Empty for none.",
+        parse=text.parse_targets,
+    )
+    parent_frame: str = option(
+        "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
+    )
+    child_frame: str = option(
+        "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
+    )
+
+    def is_known(self, name: str) -> bool:
+        """Whether the user set ``time_offset`` or ``scale`` to what it is: not to be estimated."""
+        return name in self.given and getattr(self, name) not in ("auto", "estimate")
+
+    @property
+    def measured(self) -> str:
+        """What both sensors measure together: poses, rotations or positions.
+
+        Raises
+        ------
+        ConfigError
+            If that is nothing: positions without poses.
+        """
+        found = {self.parent_measures, self.child_measures} - {"auto", "poses"}
+        if not found:
+            return "poses"
+        if "positions" not in found:
+            return "rotations"
+        if found != {"positions"} or self.parent_measures == self.child_measures:
+            raise ConfigError(
+                "positions determine a lever arm only beside poses of the other sensor; the parent "
+                f"measures {self.parent_measures}, the child {self.child_measures}"
+            )
+        return "positions"
+
+    def require_poses(self, what: str) -> None:
+        """Check that both sensors measure whole poses.
+
+        Raises
+        ------
+        ConfigError
+            If one does not; the message begins with ``what`` needs them.
+        """
+        if self.measured != "poses":
+            raise ConfigError(
+                f"{what} needs poses of both sensors; the parent measures "
+                f"{self.parent_measures}, the child {self.child_measures}"
+            )
+
+    @property
+    def targets(self) -> tuple[float, ...]:
+        """Targets of x, y, z (m), roll, pitch and yaw (rad)."""
+        single = text.parse_targets("target.axes", self.target_axes)
+        of_unit = {"m": self.target_translation, "rad": self.target_rotation}
+        return tuple(single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items())
+
+    def prior(self) -> dict[str, tuple[float, float]]:
+        """The prior: axis name to (value, standard deviation), in m and rad."""
+        told = {axis: getattr(self, f"prior_{axis}") for axis in text.AXIS_UNITS}
+        return {
+            axis: text.parse_prior(f"prior.{axis}", each) for axis, each in told.items() if each
+        }
+
+
+MOST_OTHERS = 7  # further child sensors of the node
+
+
+def other_names(count: int = MOST_OTHERS) -> list[str]:
+    """Names of the inputs of so many further child sensors."""
+    return [f"child{number}" for number in range(2, count + 2)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeConfig(OptionSet):
+    """Options that only the node has."""
+
+    solve_period: float = option(2.0, "Time between solves.", unit="s", within=(0.05, 3600.0))
+    parent_type: str = _TYPE["parent"]
+    child_type: str = _TYPE["child"]
+    other_children: int = option(
+        0,
+        "Number of further child sensors, with poses on child2_odom, child3_odom and so on. "
+        "Whenever the result is saved, all sensors are also solved together, into rig/ of "
+        "output_directory, in a process of its own.",
+        within=(0, MOST_OTHERS),
+        read_only=True,
+    )
+    parent_tf: str = _TF_SOURCE["parent"]
+    child_tf: str = _TF_SOURCE["child"]
+    output_directory: str = option(
+        "",
+        "Directory of the journal and of the result files, which ~/save and the end of the node "
+        "write; empty for none.",
+    )
+    journal: str = option(
+        "new",
+        "Journal of the session, in journal/ of output_directory; with it a crash loses less than "
+        "a second. new: start a session and keep the previous journal aside; resume: continue the "
+        "session on disk; off: no journal.",
+        choices=("new", "resume", "off"),
+        read_only=True,
+    )
+    enabled: bool = option(
+        True, "Accept poses from the start; false waits for ~/set_enabled.", read_only=True
+    )
+    report: bool = option(
+        True,
+        "Also write report.html whenever the result is saved, in a process of its own that goes on "
+        "for some seconds after the end of the node.",
+    )
+    publish_tf: bool = option(
+        False,
+        "Broadcast the result on /tf_static once the targets are reached; leave it off if the "
+        "robot description has this transform.",
+    )
+    installed: str = option(
+        "",
+        "What the robot uses now, to compare the result with: tf (from /tf_static), a URDF, an "
+        "earlier extrinsic.yaml, a file of another program, a bag, or X Y Z ROLL PITCH YAW in m "
+        "and rad. Empty for nothing.",
+        read_only=True,
+    )
+    base_frame: str = option(
+        "",
+        "State the child sensor's pose in this frame, too, as /tf_static has it; saved files and "
+        "publish_tf are about that edge then. Empty for none.",
+        read_only=True,
+    )
+    monitor: bool = option(
+        False,
+        "Watch the mount against installed, and raise an alarm when it has moved, instead of "
+        "calibrating; false ends that, and calibrates anew.",
+    )

@@ -1,0 +1,155 @@
+"""What an option is: a dataclass field that knows its name, unit, range, default and meaning."""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, Self, TypeAlias
+
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.text import frame_name, shown_value
+
+OptionValue: TypeAlias = bool | int | float | str
+#: Values of options by their public names: the dataclass that takes them checks their types.
+Options: TypeAlias = Mapping[str, Any]
+OptionField: TypeAlias = dataclasses.Field[Any]
+
+# Whole numbers are smaller: those of parameters of ROS have 64 bits.
+_LARGEST_INT = 1 << 63
+
+_GROUPS = ("keyframe", "prior", "target")
+_TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+
+
+def option(
+    default: OptionValue,
+    doc: str,
+    *,
+    unit: str = "",
+    within: tuple[float, float] | None = None,
+    choices: tuple[str, ...] | None = None,
+    words: tuple[str, ...] = (),
+    read_only: bool = False,
+    parse: Callable[[str, str], object] | None = None,
+) -> Any:
+    """Make a dataclass field with everything there is to know about an option.
+
+    Parameters
+    ----------
+    default
+        Its type is the option's type.
+    doc, unit
+        One line for a person who is about to set it; unit of the value, empty for none.
+    within, choices
+        Smallest and largest allowed value; the allowed values.
+    words
+        Words that may stand for a number, such as "none".
+    read_only
+        The node cannot change the option while it runs.
+    parse
+        For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
+    """
+    metadata = dict(locals())
+    return dataclasses.field(default=metadata.pop("default"), metadata=metadata)
+
+
+def option_name(field: OptionField) -> str:
+    """Public name of an option: the ROS parameter, the YAML key. Those of a group have a dot, as in
+    ``keyframe.min_translation``.
+    """
+    group, _, name = field.name.partition("_")
+    return f"{group}.{name}" if group in _GROUPS else field.name
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """``; did you mean X?`` for a misspelt word; empty if no known word is close."""
+    import difflib
+
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _of_python(value: object) -> object:
+    """Return the Python value of a scalar of NumPy, such as ``np.float64(0.1)``; others as is."""
+    is_scalar = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
+    return value.item() if is_scalar else value  # type: ignore[attr-defined]
+
+
+def check_value(field: OptionField, value: object) -> OptionValue:
+    """Check a value of an option and give it the option's own type.
+
+    Raises
+    ------
+    ConfigError
+        If the value has the wrong type, is out of range or is not among the choices; one line that
+        says what is allowed.
+    """
+    meta, name, words = field.metadata, option_name(field), field.metadata["words"]
+    value = _of_python(value)
+    if type(value) is int and not -_LARGEST_INT < value < _LARGEST_INT:
+        raise ConfigError(f"{name}: the number is too large")
+    kind: type = float if words else type(field.default)
+    if isinstance(value, str) and (value in words or kind is str):
+        if meta["choices"] is not None and value not in meta["choices"]:
+            raise ConfigError(
+                f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
+                f"{did_you_mean(value, meta['choices'])}"
+            )
+        if meta["parse"] is not None and value:
+            meta["parse"](name, value)
+        return frame_name(value) if name.endswith("_frame") else value
+    if words and isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind or not isinstance(value, bool | int | float):
+        expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
+        raise ConfigError(
+            f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
+        )
+    if not math.isfinite(value):
+        raise ConfigError(f"{name} must be a finite number; got {value}")
+    least, most = meta["within"] or (value, value)
+    if not least <= value <= most:
+        bound = f"at least {least}" if value < least else f"at most {most}"
+        raise ConfigError(f"{name} must be {' '.join([bound, meta['unit']]).rstrip()}; got {value}")
+    return value
+
+
+class OptionSet:
+    """Base of dataclasses made of options: checks every value and knows the public names."""
+
+    given: frozenset[str]
+    __dataclass_fields__: ClassVar[dict[str, OptionField]]
+
+    def __post_init__(self, _: object = None) -> None:
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
+
+    @classmethod
+    def by_name(cls) -> dict[str, OptionField]:
+        """The options' fields by their public names."""
+        return {option_name(field): field for field in dataclasses.fields(cls)}
+
+    @classmethod
+    def from_options(cls, options: Mapping[str, object]) -> Self:
+        """Build from a mapping of public names to values.
+
+        Raises
+        ------
+        ConfigError
+            If a name is unknown, with a list of the known ones, or a value is not allowed.
+        """
+        known = cls.by_name()
+        unknown = [name for name in options if name not in known]
+        if unknown:
+            raise ConfigError(
+                f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], known)}; known are "
+                f"{', '.join(sorted(known))}"
+            )
+        return cls(**{known[name].name: value for name, value in options.items()})
+
+    def to_options(self) -> dict[str, OptionValue]:
+        """Mapping of public names to values."""
+        return {name: getattr(self, field.name) for name, field in self.by_name().items()}

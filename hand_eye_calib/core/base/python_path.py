@@ -1,0 +1,58 @@
+"""Where Python looks for modules, without the folder that a command happens to run in.
+
+Python puts the current folder first for ``python -m`` and ``python -c``. A file ``queue.py`` beside
+a bag would then run as code of the standard library.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+_PACKAGE_PARENT = str(Path(__file__).resolve().parents[3])
+
+
+def trusted_path() -> list[str]:
+    """Return the folders of ``sys.path`` without the current folder.
+
+    The current folder stays if the package itself lies there, or if ``PYTHONPATH`` names it.
+    """
+    current = os.path.realpath(os.getcwd())
+    named = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    kept = {os.path.realpath(folder) for folder in named if folder}
+    kept.add(_PACKAGE_PARENT)
+    if current in kept:
+        return [folder or current for folder in sys.path]
+    return [folder for folder in sys.path if os.path.realpath(folder) != current]
+
+
+def trusted_environment() -> dict[str, str]:
+    """Return the environment for another Python with the modules of this process.
+
+    ``PYTHONSAFEPATH`` keeps that Python from adding its current folder.
+    """
+    return {**os.environ, **_settings()}
+
+
+@contextmanager
+def starting_trusted() -> Iterator[None]:
+    """Give processes that are started here that environment, and put this one's back at the end.
+
+    For ``multiprocessing``, which takes no environment.
+    """
+    settings = _settings()
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _settings() -> dict[str, str]:
+    return {"PYTHONPATH": os.pathsep.join(trusted_path()), "PYTHONSAFEPATH": "1"}

@@ -1,0 +1,253 @@
+"""Checks that two streams are independent: that neither was computed from the other, nor fused with
+it through an assumed transform. Such a result only returns that transform.
+"""
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
+from hand_eye_calib.core.base.stats import median, quantile, robust_weights
+from hand_eye_calib.core.base.text import angle, length
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
+from hand_eye_calib.core.checks.streams import USUAL, coarse
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_between,
+    pairs_over,
+)
+from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
+
+# Orientations that are copies agree to this angle (rad), which is rounding to five digits, and to
+# this share of the rotation.
+_ROUNDING_RAD = 0.01 * np.radians(0.08)
+_SMALL_SHARE = 0.005
+
+# Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
+# compared: a hundredth of them, at least and at most so many.
+_NEAREST = (40, 300)
+
+# Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
+# upper half of their spectra both have so many times more than what remains, in positions or
+# orientations; sensors that shake together at most 1.2 and 16 times more. They are white (the
+# quarters of that half differ by less than the first), or what remains is not: it falls as motion
+# does, more steeply than errors that add up. Times when both accelerate so many times more than
+# usual are left out: an impulse is white as well. So is motion that intervals are too long for:
+# noise of orientations is a small share of the squared rotation.
+_FLAT, _ABRUPT, _LITTLE_NOISE = 1.75, 4.0, 1e-3
+_SHARED = np.array([3.0, 30.0])
+
+# A filter that corrects one stream by the other through an assumed mount shows the true mount in
+# short motions and the assumed one in long motions. Durations (s) of both, most motions of each.
+_SHORT_S = 0.05
+_LONG_S = 3.0
+_MOST_MOTIONS = 6000
+
+# The two mounts differ from this angle (rad) and this many standard deviations (of the jackknife
+# over so many blocks of time) on. 177 clean recordings have at most 5.2 standard deviations.
+_OTHER_MOUNT_RAD = float(np.radians(0.04))
+_OTHER_MOUNT_SIGMAS = 6.5
+_BLOCKS = 20
+_ROUNDS = 4
+
+# Two odometries drift against each other: on a path at least this long (m, in steps of so many
+# seconds), positions differ by at least this share of it after alignment, in the median. Recordings
+# of two sensors have 5e-5 to 6e-3; two poses of one INS have 2e-8. Most poses that are compared.
+_LONG_PATH_M = 400.0
+_STEP_S = 1.0
+_LEAST_DRIFT = 2.5e-5
+_MOST_POSES = 2000
+
+
+def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> list[Finding]:
+    """Find out whether one of two streams was computed from the other.
+
+    Two sensors differ by their noise, whatever the extrinsic is. Poses that were computed from
+    others agree with them to the rounding of their numbers, on the transform that was used; with
+    noise of their own, they share more white noise than two sensors do. Orientations alone show
+    it: they follow from the other stream's if the poses do.
+
+    Parameters
+    ----------
+    given, aligned : StreamPair
+        Sound streams with their stamps as they are, and on one clock.
+    are_exact : bool
+        The user called both streams exact, such as motion capture: only rounding counts.
+    """
+    # Programs interpolate at the stamps of the new stream.
+    pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
+    pairs += [both[::-1] for both in pairs]
+    left_rad = min(_left_at_nearest(slow, fast) for slow, fast in pairs)
+    if left_rad < _ROUNDING_RAD:
+        severity = Severity.WARNING if are_exact else Severity.ERROR
+        text = f"both streams agree to {angle(left_rad)}, which two sensors hardly do"
+        return [_doubt(text, severity, residual_rad=left_rad)]
+    if are_exact:
+        return []
+    more = max(_shared_noise(_second_half(slow, fast), fast) for slow, fast in pairs)
+    if more > 1.0:
+        return [_doubt("the noise of both streams is unusually alike", more=more)]
+    return []
+
+
+def check_fusion(pose_pairs: PosePairs, X: FloatArray, is_one_axis: bool) -> list[Finding]:
+    """Find out whether one of two odometries follows the other through an assumed transform.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock, in one unit of length.
+    X : (4, 4) array
+        The extrinsic.
+    is_one_axis : bool
+        The sensors rotate about one axis only: their rotations do not show the mount.
+    """
+    other_mount = None if is_one_axis else _other_mount(pose_pairs)
+    found = other_mount or _no_drift(pose_pairs, X)
+    return [found] if found else []
+
+
+def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Finding:
+    return finding("not_independent", "both", severity, None, evidence=text, **evidence)
+
+
+def _within(slow: Trajectory, fast: Trajectory) -> IntArray:
+    """Return the rows of one stream whose stamps lie within another stream."""
+    first_ns, last_ns = fast.stamps_ns[[0, -1]]
+    return np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
+
+
+def _second_half(slow: Trajectory, fast: Trajectory) -> Trajectory:
+    rows = _within(slow, fast)
+    return slow[rows[len(rows) // 2 :][: _NEAREST[1]]]
+
+
+def _left_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
+    """Return the angle (rad) that remains between the rotations of both streams, of motions
+    between stamps of ``slow`` at which a pose of ``fast`` is nearest.
+    """
+    rows = _within(slow, fast)
+    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
+    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[rows]).min(axis=0)
+    nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
+    rows = rows[around <= nearest.max(initial=0)]
+    slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
+    between = fast.at(slow.stamps_ns, straight=True)
+    start = np.arange(len(slow) - 1)
+    return _left(pairs_between(between, slow.poses, start, start + 1))
+
+
+def _left(motions: MotionPairs) -> float:
+    """Angle (rad) that remains between the rotations of both; infinite unless a small share."""
+    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
+    is_clear = angles < MAX_ROTATION_RAD
+    motions = motions[is_clear]
+    angles = angles[is_clear]
+    if len(motions) < MIN_PAIRS:
+        return np.inf
+    X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
+    left_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
+    return left_rad if left_rad < _SMALL_SHARE * quantile(angles, USUAL) else np.inf
+
+
+def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
+    """How many times more noise a part of one stream has in common with the other than two sensors
+    have; 0 if it is motion that makes them rough, or a pose is missing.
+    """
+    intervals_ns = np.diff(slow.stamps_ns)
+    if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
+        return 0.0
+    both = slow.poses, fast.at(slow.stamps_ns, straight=True)
+    steps = (se3.log(se3.inverse(Ts[:-1]) @ Ts[1:]) for Ts in both)
+    a, b = (np.diff(each, 2, axis=0).reshape(-1, 2, 3) for each in steps)
+    b = b @ se3.nearest_rotation(b[:, 1].T @ a[:, 1])
+    left, arms = b - a, se3.skew(a[:, 1])
+    left[:, 0] -= arms @ np.linalg.lstsq(arms.reshape(-1, 3), left[:, 0].ravel(), rcond=None)[0]
+    sizes = np.linalg.norm([a, b], axis=3)
+    usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
+    is_calm = (sizes <= usual).any(axis=0).all(axis=1)[:, None, None]
+    spectra = (np.abs(np.fft.rfft(is_calm * [a, b, left], axis=1)) ** 2).sum(axis=3)
+    # Of poses, as differences raise it.
+    spectra /= (2.0 * np.sin(np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])))[:, None] ** 6
+    half = np.stack([each.mean(axis=1) for each in np.array_split(spectra, 4, axis=1)[2:]])
+    is_white = (half.max(axis=0) < _FLAT * half.min(axis=0))[:2].all()
+    turned = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
+    is_noise = half[1, :2, 1].max() < _LITTLE_NOISE * turned
+    common = (half[:, :2].min(axis=1) / np.maximum(half[:, 2], 1e-300)).min(axis=0)
+    follows = half[0, 2, 1] > _FLAT**2 * half[1, 2, 1]
+    found = common**0.5 / _SHARED * [is_white, is_white or follows]
+    return float(is_noise * found.max())
+
+
+def _other_mount(pose_pairs: PosePairs) -> Finding | None:
+    """Return the doubt about streams whose short motions show another mount than long ones."""
+    rotations = [
+        _rotations_of_blocks(pairs_over(pose_pairs, lag_s, _MOST_MOTIONS), len(pose_pairs))
+        for lag_s in (_SHORT_S, _LONG_S)
+    ]
+    if any(stack is None for stack in rotations):
+        return None
+    of_short, of_long = (stack for stack in rotations if stack is not None)
+    turns = se3.rotation_log(np.swapaxes(of_long, 1, 2) @ of_short)
+    covariance = jackknife_covariance(turns[1:]) + 1e-12 * np.eye(3)
+    sigmas = float(np.sqrt(turns[0] @ np.linalg.solve(covariance, turns[0])))
+    turn_rad = float(np.linalg.norm(turns[0]))
+    if turn_rad < _OTHER_MOUNT_RAD or sigmas < _OTHER_MOUNT_SIGMAS:
+        return None
+    text = (
+        f"short motions show a mount that is turned by {angle(turn_rad)} against that of long ones"
+    )
+    return _doubt(text, turn_rad=turn_rad, sigmas=sigmas)
+
+
+def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | None:
+    """Return rotations (1 + blocks, 3, 3) of X: by all motions, and without each block of time;
+    None if there are too few motions.
+    """
+    of_parent = se3.rotation_log(motions.Ts_parenti_parentj[:, :3, :3])
+    of_child = se3.rotation_log(motions.Ts_childi_childj[:, :3, :3])
+    is_clear = np.linalg.norm(of_parent, axis=1) < MAX_ROTATION_RAD
+    blocks = motions.i * _BLOCKS // n_poses
+    if is_clear.sum() < MIN_PAIRS or len(np.unique(blocks[is_clear])) < _BLOCKS:
+        return None
+    weights = is_clear.astype(float)
+    for _ in range(_ROUNDS):
+        outer = weights[:, None, None] * of_parent[:, :, None] * of_child[:, None, :]
+        products = Blocks.gathered(outer, blocks, _BLOCKS)
+        R = se3.nearest_rotation(products.total)
+        residuals = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
+        usual = 2.0 * median(residuals[is_clear]) + 1e-12
+        weights = is_clear * robust_weights("cauchy", (residuals / usual) ** 2)
+    return se3.nearest_rotation(np.concatenate([products.total[None], products.without()]))
+
+
+def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:
+    """Return the doubt about streams that hardly drift against each other on a long path."""
+    path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
+    path_m = float(np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0), axis=1).sum())
+    if path_m < _LONG_PATH_M:
+        return None
+    few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
+    apart_m = _after_alignment((few.Ts_pw_p @ X)[:, :3, 3], few.Ts_cw_c[:, :3, 3])
+    if apart_m > _LEAST_DRIFT * path_m:
+        return None
+    text = f"the streams drift apart by only {length(apart_m)} over {length(path_m)}"
+    return _doubt(text, drift_m=apart_m, path_m=path_m)
+
+
+def _after_alignment(points: FloatArray, others: FloatArray) -> float:
+    """Return the median distance (m) of points (N, 3) that were aligned robustly by a rotation and
+    a translation.
+    """
+    weights = np.ones(len(points))
+    for _ in range(_ROUNDS):
+        from_mean = points - np.average(points, axis=0, weights=weights)
+        others_from_mean = others - np.average(others, axis=0, weights=weights)
+        R = se3.nearest_rotation((weights[:, None] * from_mean).T @ others_from_mean)
+        distances = np.linalg.norm(from_mean - others_from_mean @ R.T, axis=1)
+        usual_m = 2.0 * median(distances) + 1e-9
+        weights = robust_weights("cauchy", (distances / usual_m) ** 2)
+    return median(distances)

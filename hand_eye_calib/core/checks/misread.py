@@ -1,0 +1,180 @@
+"""Streams that are not what they seem: motions in place of poses, and positions in other axes than
+the orientations by any angle. They are looked for where no usual mistake explains the streams.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.alignment.similarity import fit_similarity
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.base.stats import robust_weights
+from hand_eye_calib.core.checks.findings import Finding, finding
+from hand_eye_calib.core.checks.hypotheses import HOLDS, LAGS_S, MAX_PAIRS, StreamPair
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+
+# Motions between two poses turn by less than this (rad); a sensor with such poses hardly moves.
+_MOST_TURN_RAD = 1.0
+
+# Axes that are turned by less (rad) are those of :func:`agreement.check_coordinates`.
+_LEAST_TURN_RAD = 0.05
+
+# Distance (m) from the centre of the earth of places on it, and of aircraft.
+_EARTH_M = (6.3e6, 6.45e6)
+
+# Rounds of weights of the turned positions, and the smallest residual (m) of full weight.
+_ROUNDS = 5
+_LEAST_RESIDUAL_M = 1e-3
+
+
+def misreadings(streams: StreamPair, aligned: StreamPair) -> list[Finding]:
+    """What either stream is in truth, if that explains both; nothing if it does not.
+
+    Parameters
+    ----------
+    streams : StreamPair
+        Streams that no usual mistake explains, with the clock offset that is given.
+    aligned : StreamPair
+        The same at the offset where their angular rates agree best, if they do.
+    """
+    for stream, given in _both_ways(streams):
+        if _are_motions(given.child, given):
+            return [finding("motions", stream)]
+    return _turned_positions(_both_ways(aligned))
+
+
+def earth_centred(aligned: StreamPair) -> list[Finding]:
+    """Positions from the centre of the earth with orientations in other axes. They are looked for
+    first: with such a lever arm nearly any motion of inverse poses is explained.
+    """
+    ways = _both_ways(aligned)
+    return _turned_positions([way for way in ways if _is_earth_centred(way[1].child)])
+
+
+def _both_ways(streams: StreamPair) -> list[tuple[str, StreamPair]]:
+    """The streams by what the second of them is: the child, and, exchanged, the parent."""
+    swapped = replace(streams, parent=streams.child, child=streams.parent)
+    return [("child", streams), ("parent", swapped)]
+
+
+def _turned_positions(ways: Sequence[tuple[str, StreamPair]]) -> list[Finding]:
+    """The finding that positions of a stream are in other axes than its orientations: of the
+    stream that is explained better, as either may explain motion in a plane.
+    """
+    turns = [(stream, streams, _turn_of_positions(streams)) for stream, streams in ways]
+    explained = [
+        (turn.unexplained, stream, streams, turn.rotation)
+        for stream, streams, turn in turns
+        if turn
+    ]
+    if not explained:
+        return []
+    _, stream, streams, rotation = min(explained, key=lambda way: way[0])
+    angle_rad = float(se3.rotation_angle(rotation))
+    if angle_rad < _LEAST_TURN_RAD:
+        return []
+    values = {"turned_deg": float(np.degrees(angle_rad))}
+    if _is_earth_centred(streams.child):
+        return [finding("earth_centred", stream, None, None, **values)]
+    exchanged = np.round(rotation)
+    if np.abs(rotation - exchanged).max() < _LEAST_TURN_RAD:
+        return [finding("axes", stream, detail=" ".join(map(_axis_in_words, exchanged)))]
+    return [finding("positions_turned", stream, None, None, **values)]
+
+
+def _axis_in_words(row: FloatArray) -> str:
+    """The axis of the file that a row of a rotation by right angles takes, such as -x."""
+    column = int(np.argmax(np.abs(row)))
+    sign = "-" if row[column] < 0 else ""
+    return f"{sign}{'xyz'[column]}"
+
+
+def _are_motions(child: Trajectory, streams: StreamPair) -> bool:
+    """Whether the child's poses are motions since the pose before, of this or of the other
+    direction.
+    """
+    if len(child) < 2 or se3.rotation_angle(child.poses[:, :3, :3]).max() > _MOST_TURN_RAD:
+        return False
+    ways = (child.poses[1:], se3.inverse(child.poses[1:]))
+    chains = (replace(child, poses=se3.chained(steps)) for steps in ways)
+    return any(_unexplained(replace(streams, child=chain)) < HOLDS for chain in chains)
+
+
+def _unexplained(streams: StreamPair) -> float:
+    """The least share of the motion that stays unexplained over one of the lags."""
+    shares = [1.0]
+    for lag_s in LAGS_S:
+        with suppress(NotEnoughDataError):
+            shares.append(fit_similarity(streams.pairs(lag_s, MAX_PAIRS)).unexplained)
+    return min(shares)
+
+
+class _Turn(NamedTuple):
+    """A rotation (3, 3) of positions, and the share of the motion that stays unexplained."""
+
+    rotation: FloatArray
+    unexplained: float
+
+
+def _turn_of_positions(streams: StreamPair) -> _Turn | None:
+    """From the axes of the child's positions to those of its orientations, if that explains the
+    streams.
+    """
+    child = streams.child
+    for lag_s in LAGS_S:
+        try:
+            rotation = _fitted_turn(streams, lag_s)
+        except (NotEnoughDataError, np.linalg.LinAlgError):
+            continue
+        positions = child.poses[:, :3, 3] @ rotation.T
+        poses = se3.from_rotation_translation(child.poses[:, :3, :3], positions)
+        unexplained = _unexplained(replace(streams, child=replace(child, poses=poses)))
+        if unexplained < HOLDS:
+            return _Turn(rotation, unexplained)
+    return None
+
+
+def _is_earth_centred(stream: Trajectory) -> bool:
+    """Whether positions count from the centre of the earth."""
+    distances = np.linalg.norm(stream.poses[:, :3, 3], axis=1)
+    least, most = _EARTH_M
+    return bool(((distances > least) & (distances < most)).all())
+
+
+def _fitted_turn(streams: StreamPair, lag_s: float) -> FloatArray:
+    """Rotation W (3, 3) from the axes of the child's positions to those of its orientations, by
+    robust least squares of ``R_X R_ci' W d = (R_A - I) t_X + t_A`` for displacements d over a time.
+    """
+    pairs = streams.pairs(lag_s, MAX_PAIRS)
+    poses: PosePairs = streams.synchronised
+    R_X = _rotation_between(
+        se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3]),
+        se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3]),
+    )
+    displacements = poses.Ts_cw_c[pairs.j, :3, 3] - poses.Ts_cw_c[pairs.i, :3, 3]
+    to_parent = R_X @ np.swapaxes(poses.Ts_cw_c[pairs.i, :3, :3], 1, 2)
+    # Columns of W row by row: (K, 3, 3, 3) to (K, 3, 9).
+    of_turn = np.einsum("kab,kc->kabc", to_parent, displacements).reshape(len(pairs), 3, 9)
+    of_lever = -(pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3))
+    rows = np.concatenate([of_turn, of_lever], axis=2)
+    target = pairs.Ts_parenti_parentj[:, :3, 3]
+    weights = np.ones(len(pairs))
+    unknowns = np.zeros(12)
+    for _ in range(_ROUNDS):
+        roots = np.sqrt(weights)[:, None]
+        weighted = (roots[:, :, None] * rows).reshape(-1, 12)
+        unknowns = np.linalg.lstsq(weighted, (roots * target).ravel(), rcond=1e-9)[0]
+        residuals = np.linalg.norm(rows @ unknowns - target, axis=1)
+        weights = robust_weights("huber", (residuals / _LEAST_RESIDUAL_M) ** 2)
+    return se3.nearest_rotation(unknowns[:9].reshape(3, 3))
+
+
+def _rotation_between(parent: FloatArray, child: FloatArray) -> FloatArray:
+    """Rotation R_X with ``parent = R_X child`` for rotation vectors (K, 3)."""
+    return se3.nearest_rotation(parent.T @ child)

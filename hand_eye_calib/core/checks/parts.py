@@ -1,0 +1,490 @@
+"""Checks of two streams of which one has only positions, only rotations or only angular rates.
+
+A stream of positions borrows the orientations of the other stream, aligned to the world frame of
+the positions window by window. Both streams are poses then. The regressions of
+:mod:`~hand_eye_calib.core.checks.response` detect a wrong scale of a coordinate, a delay and
+smoothing.
+
+For rotations and rates, the rotation vectors of one stream are regressed on those of the other.
+The antisymmetric part of the matrix is a correction of the extrinsic rotation. The symmetric part
+is a fault: gains on the diagonal, misaligned axes off the diagonal.
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.covariance import BLOCKS, usual_speed
+from hand_eye_calib.core.assessment.moved import find_change
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.stats import median, robust_sigma
+from hand_eye_calib.core.base.text import angle, length
+from hand_eye_calib.core.checks import agreement
+from hand_eye_calib.core.checks.findings import (
+    LIMITS,
+    Finding,
+    Severity,
+    finding,
+    graded,
+    gravest_first,
+)
+from hand_eye_calib.core.checks.hypotheses import LAGS_S, MAX_ROTATION_RAD, MIN_PAIRS
+from hand_eye_calib.core.checks.response import Regression, delays, response
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.noise.increments import without_rate_bias
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over, synchronise
+from hand_eye_calib.core.results.calibration import Calibration
+
+# Duration of a window in which positions are aligned (s). The heading of an odometry drifts little
+# in 30 s, and most motions of 3 s lie within one window.
+_WINDOW_S = 30.0
+
+# Fewest positions of a window that is aligned without its neighbours.
+_LEAST_ALIGNED = 10
+
+# A lever arm is zero if every axis is below one of two limits: this distance (m) ...
+_ZERO_M = 0.005
+# ... or this many standard deviations. The limit serves rotations, too.
+_ZERO_SIGMAS = 3.0
+
+# A zero lever arm is an error if the upper bounds of two axes are below this distance (m): two
+# housings hardly fit closer. An upper bound is the value plus two standard deviations.
+_HOUSING_M = 0.03
+# Limit of the upper bound of the third axis (m). Without two axes below this limit, the lever arm
+# is unknown rather than zero.
+_UNKNOWN_M = 0.06
+
+# Median residual (m) below which positions were computed from the poses: no receiver or total
+# station measures to a twentieth of a millimetre.
+_COPIED_M = 5e-5
+# The same limit as a share of the median motion, for slow streams.
+_COPIED_SHARE = 0.01
+
+# Median residual (rad) below which rotations were computed from those of the other stream. It
+# corresponds to quaternions with five digits.
+_COPIED_RAD = 2e-5
+
+# Codes of findings about positions, rather than about both streams.
+_POSITION_CODES = ("axis_scale", "axis_lag", "smoothed_positions")
+
+# Positions are interpolated if more than this share lies on the line through both neighbours.
+_STRAIGHT_SHARE = 0.5
+# Largest distance from that line (m). Recorded positions scatter more, also on a motorway.
+_STRAIGHT_M = 1e-5
+
+# Shortest step that has a direction (m).
+_MOVES_M = 1e-3
+
+# Largest number of motions in a regression of rotations.
+_MOST_MOTIONS = 3000
+
+# Rates have left-handed axes if the residual of the best reflection is below this share of the
+# residual of the best rotation. Noise alone makes both about equal.
+_MIRRORED = 0.5
+# Least residual of the best rotation of such rates, as a share of the rotation vectors. If all
+# motion is about one axis, a reflection only changes the sign of the noise about the others.
+_UNMIRRORED = 0.1
+
+# Scale factor of a coordinate below which its sign is wrong.
+_MIRRORED_FACTOR = -0.5
+
+# Index pairs of the planes between two principal axes.
+_PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+def check_solved(
+    parent: Trajectory,
+    child: Trajectory,
+    calibration: Calibration,
+    config: CalibratorConfig,
+    least_share: float = 0.0,
+) -> list[Finding]:
+    """Check two streams against their result if one stream does not measure full poses.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        Each on its own clock.
+    calibration : Calibration
+        The result from both streams.
+    config : CalibratorConfig
+        The options of that result.
+    least_share : float
+        Share of the squared residuals that a fault of positions must explain, to be reported.
+
+    Returns
+    -------
+    list of Finding
+    """
+    child = child.shifted(calibration.time_offset_s)
+    pairs = synchronise(parent, child, config.max_gap).child_scaled(calibration.scale)
+    if len(pairs) < MIN_PAIRS:
+        return []
+    stream = "parent" if child.measures == "poses" else "child"
+    priors = {*config.prior()}
+    if calibration.measured == "rotations":
+        has_rates = "rates" in (parent.measures, child.measures)
+        return _check_turning(pairs, calibration, stream, priors, has_rates)
+    measured = {"parent": parent, "child": child}[stream]
+    interpolated = check_interpolated(measured.poses[:, :3, 3], stream)
+    return _check_moving(pairs, calibration, stream, priors, least_share, interpolated)
+
+
+def _check_turning(
+    pairs: PosePairs,
+    calibration: Calibration,
+    stream: str,
+    priors: Collection[str],
+    has_rates: bool,
+) -> list[Finding]:
+    """Check rotations or rates; return the findings of the first check that has any."""
+    T_parent_child = calibration.T_parent_child
+    sigmas = calibration.sigmas_measured[3:]
+    same = check_rotation(T_parent_child[:3, :3], sigmas, priors, has_rates)
+    if copied := _copied_rotations(pairs, T_parent_child):
+        return [replace(found, severity=Severity.ERROR) for found in same] or copied
+    if found := same or _check_handedness(pairs, stream):
+        return found
+    return check_rotations(_without_bias(pairs, calibration), T_parent_child, stream, has_rates)
+
+
+def _check_moving(
+    pairs: PosePairs,
+    calibration: Calibration,
+    stream: str,
+    priors: Collection[str],
+    least_share: float,
+    interpolated: list[Finding],
+) -> list[Finding]:
+    """Check positions; return the findings of the first check that has any."""
+    T_parent_child = calibration.T_parent_child
+    same = check_position(T_parent_child[:3, 3], calibration.sigmas_measured[:3], priors)
+    pairs = _with_orientations(pairs, T_parent_child, stream)
+    if copied := _copied_positions(pairs, T_parent_child):
+        return [replace(found, severity=Severity.ERROR) for found in same] or copied
+    if found := [*interpolated, *same]:
+        return found
+    return check_positions(pairs, T_parent_child, stream, least_share)
+
+
+def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
+    """Remove the estimated gyroscope bias from pose pairs."""
+    if not calibration.rate_bias:
+        return pairs
+    bias = np.array(calibration.rate_bias.rad_per_s)
+    if calibration.rate_bias.of == "parent":
+        return replace(pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias))
+    return replace(pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias))
+
+
+def check_position(
+    lever_arm: FloatArray, sigmas: FloatArray, given: Collection[str]
+) -> list[Finding]:
+    """Detect a lever arm of zero, which suggests that positions were copied between the streams.
+
+    Parameters
+    ----------
+    lever_arm, sigmas : (3,) array
+        Lever arm and its standard deviations (m), infinite for unobservable axes.
+    given : collection of str
+        Axes with a prior; these are not checked.
+    """
+    axes = [k for k, axis in enumerate("xyz") if np.isfinite(sigmas[k]) and axis not in given]
+    if len(axes) < 2:
+        return []
+    sizes = np.abs(lever_arm[axes])
+    spreads = sigmas[axes]
+    if (sizes > np.maximum(_ZERO_M, _ZERO_SIGMAS * spreads)).any():
+        return []
+    uppers_m = np.sort(sizes + 2.0 * spreads)
+    if uppers_m[1] > _UNKNOWN_M:
+        return []
+    # Two axes are not enough for an error: an antenna may be right above the other sensor.
+    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNKNOWN_M
+    severity = Severity.ERROR if is_sure else Severity.WARNING
+    distance_m = float(np.linalg.norm(sizes))
+    size = f"{length(distance_m)} +/- {length(float(spreads.max()))}"
+    return [finding("no_lever_arm", "both", severity, size=size, translation_m=distance_m)]
+
+
+def check_rotation(
+    rotation: FloatArray, sigmas: FloatArray, given: Collection[str], has_rates: bool
+) -> list[Finding]:
+    """Detect a rotation of zero, which suggests that both streams come from one sensor.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+    sigmas : (3,) array
+        Standard deviations (rad), infinite for unobservable axes.
+    given : collection of str
+        Axes with a prior; with one about a rotation, nothing is checked.
+    has_rates : bool
+        Whether a stream has rates. The finding is an error then, otherwise a warning: the axes of
+        two cameras may well be parallel.
+    """
+    limit_rad = agreement.MAX_SIGMA_RAD
+    # The standard deviations must be small on all axes: if two level sensors turn only about the
+    # vertical, yaw is unobservable, and roll and pitch are zero for any two sensors.
+    if {"roll", "pitch", "yaw"} & {*given} or not sigmas.max() < limit_rad:
+        return []
+    turned = np.abs(se3.rotation_log(rotation))
+    if (turned > np.maximum(agreement.SAME_RAD, _ZERO_SIGMAS * sigmas)).any():
+        return []
+    angle_rad = float(np.linalg.norm(turned))
+    severity = Severity.ERROR if has_rates else Severity.WARNING
+    return [finding("parallel_axes", "both", severity, size=angle(angle_rad), angle_rad=angle_rad)]
+
+
+def check_positions(
+    pairs: PosePairs, T_parent_child: FloatArray, stream: str, least_share: float = 0.0
+) -> list[Finding]:
+    """Check a stream of positions against poses, on one clock and in one unit of length.
+
+    Parameters
+    ----------
+    pairs : PosePairs
+        The stream of positions has the orientations of the other stream.
+    T_parent_child : (4, 4) array
+        The lever arm, without a rotation.
+    stream : {"parent", "child"}
+        The stream of positions.
+    least_share : float
+        Share of the squared residuals that a fault must explain, to be reported.
+
+    Returns
+    -------
+    list of Finding
+        At most one finding.
+    """
+    motions = pairs_over(pairs, LAGS_S[0], agreement.MOST_SHORT)
+    if len(motions) < MIN_PAIRS:
+        return []
+    slow, _ = response(pairs, motions, T_parent_child)
+    other = {"child": "parent", "parent": "child"}[stream]
+    suspects = [
+        (slow.share(f"axes_{stream}"), agreement.axis_gain(slow, stream)),
+        # A large factor fits better as its inverse, a factor of the other stream.
+        (slow.share(f"axes_{other}"), agreement.axis_gain(slow, other, stream)),
+    ]
+    short = pairs_over(pairs, agreement.SHORT_S, agreement.MOST_SHORT)
+    if fast := delays(pairs, short, T_parent_child):
+        speed = usual_speed(pairs.stamps_ns, pairs.Ts_pw_p[:, :3, 3])
+        interval_s = median(np.diff(pairs.stamps_ns)) * 1e-9
+        suspects += agreement.delay_suspects(fast, pairs, speed, 0.0)
+        suspects += agreement.smoothing_suspects(fast, interval_s, speed)
+    candidates = [
+        (suspect.code == "smoothed_positions", share, _for_positions(suspect))
+        for share, suspect in suspects
+        if suspect and share > least_share and suspect.stream == stream
+        if suspect.code in _POSITION_CODES
+    ]
+    # Smoothing comes first: it also shrinks a coordinate that changes fast, like a wrong scale.
+    return [max(candidates, key=lambda candidate: candidate[:2])[2]] if candidates else []
+
+
+def _for_positions(suspect: Finding) -> Finding:
+    """Return a finding about poses as it applies to positions.
+
+    Smoothed positions are an error, because the lever arm follows from the positions in turns.
+    A negative scale factor is a mirrored axis.
+    """
+    if suspect.code == "smoothed_positions":
+        return replace(suspect, severity=Severity.ERROR)
+    if suspect.code == "axis_scale" and suspect.evidence["factor"] < _MIRRORED_FACTOR:
+        return finding("mirrored_positions", suspect.stream)
+    return suspect
+
+
+def _with_orientations(pairs: PosePairs, T_parent_child: FloatArray, stream: str) -> PosePairs:
+    """Replace the orientations in the stream of positions by those of the other stream.
+
+    They are rotated to the world frame of the positions, window by window.
+    """
+    if stream == "child":
+        predicted, measured = pairs.Ts_pw_p @ T_parent_child, pairs.Ts_cw_c
+    else:
+        predicted, measured = pairs.Ts_cw_c @ se3.inverse(T_parent_child), pairs.Ts_pw_p
+    windows = (pairs.stamps_ns - pairs.stamps_ns[0]) // round(_WINDOW_S * 1e9)
+    borrowed = measured.copy()
+    for window in np.unique(windows):
+        inside = windows == window
+        used = inside if inside.sum() >= _LEAST_ALIGNED else np.abs(windows - window) <= 1
+        path, positions = (Ts[used, :3, 3] for Ts in (predicted, measured))
+        products = (positions - positions.mean(axis=0)).T @ (path - path.mean(axis=0))
+        borrowed[inside, :3, :3] = se3.nearest_rotation(products) @ predicted[inside, :3, :3]
+    if stream == "child":
+        return replace(pairs, Ts_cw_c=borrowed)
+    return replace(pairs, Ts_pw_p=borrowed)
+
+
+def _copied_positions(pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:
+    """Detect positions that were computed from the poses: residuals are as small as rounding."""
+    motions = pairs_over(pairs, 0.0, agreement.MOST_SHORT)
+    if len(motions) < MIN_PAIRS:
+        return []
+    residual_m = median(np.linalg.norm(motions.residuals(T_parent_child)[0], axis=1))
+    moved_m = median(np.linalg.norm(motions.Ts_parenti_parentj[:, :3, 3], axis=1))
+    if residual_m > min(_COPIED_M, _COPIED_SHARE * moved_m):
+        return []
+    text = "The positions agree with the poses to rounding"
+    return [
+        finding("not_independent", "both", Severity.ERROR, evidence=text, residual_m=residual_m)
+    ]
+
+
+def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
+    """Detect positions (N, 3) that were interpolated between few measured positions."""
+    steps = np.diff(positions, axis=0)
+    sizes = np.linalg.norm(steps, axis=1)
+    moving = np.minimum(sizes[1:], sizes[:-1]) > _MOVES_M
+    if moving.sum() < MIN_PAIRS:
+        return []
+    # Distance of each position from the line through its two neighbours.
+    chord = steps[1:] + steps[:-1]
+    along = np.linalg.norm(chord, axis=1)
+    off = np.linalg.norm(se3.cross(steps[:-1], chord), axis=1) / np.maximum(along, 1e-12)
+    share = float((off[moving] < _STRAIGHT_M).mean())
+    return [finding("interpolated", stream, share=share)] if share > _STRAIGHT_SHARE else []
+
+
+def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:
+    """Detect rotations that were computed from the other stream: only rounding differs."""
+    of_parent, of_child = _rotation_vectors(pairs)
+    if len(of_parent) < MIN_PAIRS:
+        return []
+    remaining = np.linalg.norm(of_child @ T_parent_child[:3, :3].T - of_parent, axis=1)
+    left_rad = median(remaining)
+    if left_rad > min(_COPIED_RAD, _COPIED_SHARE * median(np.linalg.norm(of_parent, axis=1))):
+        return []
+    text = "The rotations of both streams agree to rounding"
+    return [
+        finding("not_independent", "both", Severity.ERROR, evidence=text, residual_rad=left_rad)
+    ]
+
+
+def check_rotations(
+    pairs: PosePairs, T_parent_child: FloatArray, stream: str, has_rates: bool
+) -> list[Finding]:
+    """Check rotations for a moved mount and, with rates, for wrong gains and misaligned axes.
+
+    Parameters
+    ----------
+    pairs : PosePairs
+        On one clock and without gyroscope bias. The positions are ignored.
+    T_parent_child : (4, 4) array
+    stream : {"parent", "child"}
+        The stream of rotations or rates, which a finding names.
+    has_rates : bool
+        Whether a stream has rates. Orientations come from an odometry or a filter, which has no
+        sensor axes to misalign: only a moved mount is checked then.
+
+    Returns
+    -------
+    list of Finding
+        At most one finding.
+    """
+    rotation = T_parent_child[:3, :3]
+    of_parent, of_child = _rotation_vectors(pairs)
+    if len(of_parent) < BLOCKS * MIN_PAIRS:
+        return []
+    suspects: list[Finding | None] = []
+    if has_rates:
+        suspects = _matrix_suspects(of_parent, of_child @ rotation.T, stream)
+    still = np.zeros((len(pairs), 3))
+    turning = PosePairs(
+        pairs.stamps_ns,
+        se3.from_rotation_translation(pairs.Ts_pw_p[:, :3, :3], still),
+        se3.from_rotation_translation(pairs.Ts_cw_c[:, :3, :3], still),
+    )
+    change = find_change(turning, se3.from_rotation_translation(rotation, np.zeros(3)))
+    moved = agreement.moved_mount(change, int(pairs.stamps_ns[0])) if change else None
+    if moved:
+        return [moved]
+    findings = gravest_first([suspect for suspect in suspects if suspect])
+    return [*findings[:1]]
+
+
+def _rotation_vectors(pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors (K, 3) of parent and child over 1 s, each in its own sensor frame."""
+    motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
+    turns = [
+        se3.rotation_log(Ts[:, :3, :3])
+        for Ts in (motions.Ts_parenti_parentj, motions.Ts_childi_childj)
+    ]
+    angles = np.max([np.linalg.norm(vectors, axis=1) for vectors in turns], axis=0)
+    usable = angles < MAX_ROTATION_RAD
+    return turns[0][usable], turns[1][usable]
+
+
+def _check_handedness(pairs: PosePairs, stream: str) -> list[Finding]:
+    """Detect rates about left-handed axes: a reflection fits far better than any rotation."""
+    of_parent, of_child = _rotation_vectors(pairs)
+    if len(of_parent) < BLOCKS * MIN_PAIRS:
+        return []
+    # Subtract the mean, which contains the bias: a wrong rotation spoils the estimate of the bias.
+    of_parent, of_child = (vectors - vectors.mean(axis=0) for vectors in (of_parent, of_child))
+    left, _, right = np.linalg.svd(of_child.T @ of_parent)
+    rotating = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+    mirroring = rotating * [1.0, 1.0, -1.0]
+    by_rotation, by_mirror = (
+        median(np.linalg.norm(of_child @ left @ signs @ right - of_parent, axis=1))
+        for signs in (rotating, mirroring)
+    )
+    usual = median(np.linalg.norm(of_parent, axis=1))
+    is_mirrored = by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
+    return [finding("mirrored_rates", stream)] if is_mirrored else []
+
+
+def _matrix_suspects(
+    of_parent: FloatArray, of_child: FloatArray, stream: str
+) -> list[Finding | None]:
+    """Detect misaligned axes and wrong gains of a stream of rotations or rates.
+
+    Parameters
+    ----------
+    of_parent, of_child : (K, 3) array
+        Rotation vectors of both sensors, in the parent sensor's frame.
+    stream : {"parent", "child"}
+        The stream of rotations or rates. Its rotation vectors are the regressors, because a
+        gyroscope has less noise.
+
+    Notes
+    -----
+    The regression estimates 3 small rotations, which correct the extrinsic, 3 gains along the
+    principal axes of rotation, and 3 elements of the symmetric part off the diagonal.
+    """
+    if stream == "child":
+        reference, measured = of_child, of_parent
+    else:
+        reference, measured = of_parent, of_child
+    axes = np.linalg.eigh(reference.T @ reference)[1][:, ::-1]
+    x = reference @ axes
+    y = measured @ axes
+    gains = x[:, None, :] * np.eye(3)
+    shears = np.zeros((len(x), 3, 3))
+    for column, (k, m) in enumerate(_PLANES):
+        shears[:, k, column] = x[:, m]
+        shears[:, m, column] = x[:, k]
+    rows = np.concatenate([se3.skew(x), gains, shears, (y - x)[:, :, None]], axis=2)
+    where = {"rotation": [0, 1, 2], "gain": [3, 4, 5], "shear": [6, 7, 8]}
+    unit = np.full((3, 1), max(float(robust_sigma(y - x)), 1e-8))
+    fit = Regression(rows, rows, unit, where, "rotation")
+    gain = agreement.rotation_gain(fit, axes, inverse=stream == "child")
+    return [_shear(fit, stream), gain]
+
+
+def _shear(fit: Regression, stream: str) -> Finding | None:
+    """Detect sensor axes that are not perpendicular."""
+    values, sigmas = fit.fit("shear", "gain")
+    limits = agreement.BIASES * fit.biases("shear")
+    significant = np.where(
+        np.abs(values) > np.maximum(LIMITS["misaligned"][0] * sigmas, limits), values, 0
+    )
+    size = float(np.abs(significant).max())
+    # If the symmetric part is s, the angle between two axes is wrong by 2 s.
+    degrees = float(np.degrees(2.0 * size))
+    return graded("misaligned", stream, size, degrees=degrees)

@@ -1,0 +1,296 @@
+"""How the child's motion follows the parent's, beyond an extrinsic and a scale: one linear
+regression, with a column for each thing that may be wrong.
+
+Two sensors on one rigid body feel the same motion at the same time. With motions A, B of parent and
+child over a span, in the parent's axes (B turned by X), and chords a, b,
+
+    b - a - (R_A - I) t = ...,        Log(R_B R_A') = ...
+
+where the dots are columns: a small rotation of X, a scale, and one group of columns per fault. All
+groups are in one table of products, summed over blocks of time: to fit a group is to solve a small
+part of it, and the jackknife over the blocks gives standard deviations. Motions over some seconds
+show gains, scales by axis, worlds that are turned or that move; those over a second show delays and
+smoothing, which change a motion of angular frequency f by ``1 - i f d - f^2 c``: -d times the
+velocity and c times the acceleration at both ends. These come from poses around the ends, not from
+those themselves: white noise has no part in both sides. Noise of a column makes its value smaller,
+unless it is probed with what the other stream shows of it (an instrumental variable): so are lever
+arms and delays. Noise that accumulates makes the stream that a column comes from look less smooth
+than it is, never smoother. So columns of the child alone show that the child is smoothed.
+"""
+
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.covariance import BLOCKS
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.blocks import Blocks, solve
+from hand_eye_calib.core.base.stats import median, robust_sigma, robust_weights
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs
+
+# Step (s) of the differences that velocities and accelerations come from; an interval of the poses
+# if that is longer. Stamps may be off by this share of a step.
+_STEP_S, TOLERANCE = 0.05, 0.3
+
+# Residuals of this many standard deviations have a quarter of the weight.
+_TUNING, _ROUNDS = 3.0, 4
+
+# Scales by axis stand in place of the scale.
+_INSTEAD = {"axes_child": "scale", "axes_parent": "scale"}
+
+_Columns: TypeAlias = Mapping[str, FloatArray]
+_Where: TypeAlias = Mapping[str, list[int]]
+
+
+class Regression:
+    """Robust linear regression of rows (K, 6, p + 1) of displacements and rotations, the values
+    last, in ``units`` (6, 1), on groups of the p columns: by name, where they are; those of
+    ``base`` in every fit. Rows are in order of time. What is left is to be orthogonal to the
+    ``probes``, a table like that of the rows: of columns without their noise, if there are such.
+    """
+
+    def __init__(
+        self, rows: FloatArray, probes: FloatArray, units: FloatArray, where: _Where, *base: str
+    ) -> None:
+        self._where, self._base = where, base
+        self._displaced = np.sqrt((rows[:, :3] ** 2).sum(axis=1).mean(axis=0))
+        rows, probes = rows / units, probes / units
+        n_rows, size, n_columns = rows.shape
+        flat = rows.reshape(-1, n_columns)
+        known = flat[:, [*self._columns(), n_columns - 1]]
+        weights = np.ones(n_rows)
+        for _ in range(_ROUNDS):
+            products = (known * np.repeat(weights, size)[:, None]).T @ known
+            values = solve(products, range(len(products) - 1))
+            left = (known[:, -1] - known[:, :-1] @ values).reshape(n_rows, size)
+            lengths = np.sqrt((left**2).sum(axis=1))
+            self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
+            squared = (lengths / self._sigma) ** 2 / (size * _TUNING**2)
+            weights = robust_weights("geman_mcclure", squared)
+        self._weight = float(weights.sum())
+        weighted = rows * weights[:, None, None]
+        self._squares = flat.T @ weighted.reshape(flat.shape)
+        self._blocks = Blocks.of_rows(weighted, BLOCKS, probes)
+
+    def _columns(self, group: str = "", *beside: str) -> list[int]:
+        """Columns that a group is fitted beside."""
+        base = (name for name in self._base if name != _INSTEAD.get(group))
+        return [column for name in (*base, *beside) for column in self._where[name]]
+
+    def biases(self, group: str) -> FloatArray:
+        """Errors (m,) that noise in the columns of a group can cause in its values. The noise is
+        taken to be as large as that of the rows.
+        """
+        at = self._where[group]
+        return np.asarray(self._sigma**2 * self._weight / np.maximum(self._squares[at, at], 1e-300))
+
+    def displaced(self, group: str) -> FloatArray:
+        """Root mean square (m,) of the displacements that each value of a group makes, per unit."""
+        return np.asarray(self._displaced[self._where[group]])
+
+    def share(self, group: str, *beside: str) -> float:
+        """The share of the squared residuals that a group takes away."""
+        before, costs = self._columns(group, *beside), []
+        for columns in (before, [*before, *self._where[group]]):
+            x, at = np.append(-self._blocks.solve(columns), 1.0), [*columns, -1]
+            costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
+        return 1.0 - costs[1] / max(costs[0], 1e-300)
+
+    def fit(self, group: str, *beside: str) -> tuple[FloatArray, FloatArray]:
+        """What a group of m columns is fitted with, beside the base or what is left of it, and
+        ``beside`` other groups: values and standard deviations (m,), by the jackknife over blocks.
+        """
+        before = self._columns(group, *beside)
+        columns = [*before, *self._where[group]]
+        # Without each block, and without each two: errors may last longer than one.
+        covariances = [
+            blocks.jackknife(columns) for blocks in (self._blocks, self._blocks.merged(BLOCKS // 2))
+        ]
+        variances = np.max([np.diag(covariance) for covariance in covariances], axis=0)
+        return self._blocks.solve(columns)[len(before) :], np.sqrt(variances[len(before) :])
+
+
+class _Stream:
+    """Motions of a stream over a span, in the parent's axes: ``turned`` (3, 3) by X or not at all.
+    Displacements are seen from the pose half-way, whose errors are not those of the ends.
+    """
+
+    def __init__(self, poses: FloatArray, pairs: MotionPairs, turned: FloatArray) -> None:
+        self._poses, self._turned = poses, turned
+        self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
+        start, middle, end = (poses[rows] for rows in self.rows)
+        self.from_world = turned @ np.swapaxes(middle[:, :3, :3], 1, 2)
+        self.ends = self.from_world @ start[:, :3, :3], self.from_world @ end[:, :3, :3]
+        self.chords = self.ends[1] - self.ends[0]
+        self.rotations = turned @ np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3] @ turned.T
+        self.displaced = end[:, :3, 3] - start[:, :3, 3]
+        self.moved = se3.times(self.from_world, self.displaced)
+
+    def back(self, vectors: FloatArray) -> FloatArray:
+        """Vectors (N, 3) of the poses at the start less those at the end, in axes of the start."""
+        start, _, end = (vectors[rows] for rows in self.rows)
+        return start - se3.times(self.rotations, end)
+
+    def derivatives(self, step: int, h: float) -> tuple[FloatArray, ...]:
+        """Velocity and acceleration (N, 3) of all poses in their world, angular velocity and
+        acceleration in the parent's axes, by differences over steps of ``h`` seconds.
+        """
+        p, n = self._poses[:, :3, 3], len(self._poses)
+        rows = {k: np.clip(np.arange(n) + k * step, 0, n - 1) for k in (-2, -1, 1, 2)}
+        turned = [
+            se3.rotation_log(
+                np.swapaxes(self._poses[rows[k], :3, :3], 1, 2) @ self._poses[rows[m], :3, :3]
+            )
+            @ self._turned.T
+            for k, m in ((-1, 1), (-2, -1), (1, 2))
+        ]
+        return (
+            (p[rows[1]] - p[rows[-1]]) / (2 * h),
+            (p[rows[2]] - p[rows[1]] - p[rows[-1]] + p[rows[-2]]) / (3 * h**2),
+            turned[0] / (2 * h),
+            (turned[2] - turned[1]) / (3 * h**2),
+        )
+
+
+def response(
+    pose_pairs: PosePairs,
+    motions: MotionPairs,
+    T_parent_child: FloatArray,
+    moved_at_ns: int | None = None,
+) -> tuple[Regression, FloatArray]:
+    """Regression of motions over some seconds, and the principal axes of the rotations (columns,
+    parent's frame).
+
+    Groups: ``turned_child``, ``turned_parent``, ``turned_both``: positions turned against
+    orientations, a rotation vector in the stream's world, of both in the parent's; ``axes_child``,
+    ``axes_parent``: factors, less 1, of the coordinates of a stream's positions; ``drift``:
+    velocity and angular rate of the child's world; ``gain``: factors, less 1, of the child's
+    rotations about the principal axes; ``moved``: lever arm and rotation of X after a time, if one
+    is given.
+    """
+    parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
+    child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
+    # What the other stream makes of the displacements of each.
+    arm = se3.times(parent.chords, T_parent_child[:3, 3])
+    p_seen = se3.times(np.swapaxes(parent.from_world, 1, 2), child.moved - arm)
+    c_seen = se3.times(np.swapaxes(child.from_world, 1, 2), parent.moved + arm)
+    stamps_ns = pose_pairs.stamps_ns
+    seconds = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
+    drifted = child.from_world * seconds[:, None, None]
+    middle = pose_pairs.Ts_cw_c[motions.i, :3, 3] + 0.5 * child.displaced
+    middle = middle - middle.mean(axis=0)
+    x = se3.rotation_log(parent.rotations)
+    axes = np.linalg.eigh(x.T @ x)[1][:, ::-1]
+    turned_child = -child.from_world @ se3.skew(child.displaced)
+    turned_parent = parent.from_world @ se3.skew(parent.displaced)
+    worlds = (np.swapaxes(child.from_world, 1, 2) @ parent.from_world).mean(axis=0)
+    groups = {
+        "turned_child": _rows(turned_child),
+        "turned_parent": _rows(turned_parent),
+        "turned_both": _rows(turned_parent + turned_child @ se3.nearest_rotation(worlds)),
+        "axes_child": _rows(child.from_world * c_seen[:, None, :]),
+        "axes_parent": _rows(-parent.from_world * p_seen[:, None, :]),
+        "drift": np.concatenate(
+            [_rows(drifted), _rows(-drifted @ se3.skew(middle), drifted)], axis=2
+        ),
+        "gain": _rows(np.zeros_like(drifted), (x @ axes)[:, None, :] * axes[None]),
+    }
+    if moved_at_ns is not None:
+        after = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2 >= moved_at_ns
+        of_x = [part for name, part in _of_mount(parent, child).items() if name != "scale"]
+        groups["moved"] = after[:, None, None] * np.concatenate(of_x, axis=2)
+    return _regression(parent, child, T_parent_child, groups, {}), axes
+
+
+def delays(
+    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
+) -> Regression | None:
+    """Regression of motions over about a second; None if too few poses follow each other.
+
+    Groups: ``late_child``, ``late_parent``: positions are late against the orientations of their
+    stream (s), by velocities that the other stream shows; ``late_axes_child``,
+    ``late_axes_parent``: those by coordinate; ``positions_child``, ``positions_parent``,
+    ``orientations_child``, ``orientations_parent``: smoothed (s^2).
+    """
+    stamps_ns = pose_pairs.stamps_ns
+    interval_s = median(np.diff(stamps_ns)) * 1e-9
+    step = max(round(_STEP_S / interval_s), 1)
+    h = step * interval_s
+    follow = np.zeros(len(stamps_ns), dtype=bool)
+    inner, around = np.arange(2 * step, len(stamps_ns) - 2 * step), np.array([-2, -1, 1, 2])
+    elapsed_s = (stamps_ns[inner[:, None] + step * around] - stamps_ns[inner, None]) * 1e-9
+    follow[inner] = (np.abs(elapsed_s - h * around) < TOLERANCE * h).all(axis=1)
+    motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
+    if len(motions) < BLOCKS**2:
+        return None
+    X, Ts_parent, Ts_child = T_parent_child, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X  # by the other stream
+    own, seen = (
+        (_Stream(of_parent, motions, np.eye(3)), _Stream(of_child, motions, X[:3, :3]))
+        for of_parent, of_child in ((Ts_parent, Ts_child), as_seen)
+    )
+    groups, probes = (_of_filters(*each, X[:3, 3], step, h) for each in (own, seen))
+    late = {name: probes[name] for name in ("late_child", "late_parent")}
+    return _regression(*own, X, groups, late, "late")
+
+
+def _of_filters(
+    parent: _Stream, child: _Stream, arm: FloatArray, step: int, h: float
+) -> dict[str, FloatArray]:
+    """Columns of delays and smoothing, and of a ``late`` child as a whole; ``arm`` (3,) to it."""
+    groups = {}
+    for name, sign, stream in (("child", -1.0, child), ("parent", 1.0, parent)):
+        velocity, acceleration, rate, bend = stream.derivatives(step, h)
+        start, middle, end = stream.rows
+        faster = sign * (velocity[end] - velocity[start])
+        bent = sign * (acceleration[start] - acceleration[end])
+        late, positions = se3.times(stream.from_world, faster), se3.times(stream.from_world, bent)
+        orientations = sign * se3.cross(bend[middle], stream.moved)
+        if name == "child":
+            groups["late"] = _rows(late + se3.cross(rate[middle], stream.moved), stream.back(rate))
+        else:
+            arms = [se3.cross(bend[rows], arm) for rows in (start, end)]
+            orientations += se3.times(stream.ends[0], arms[0]) - se3.times(stream.ends[1], arms[1])
+        groups[f"late_{name}"] = _rows(late)
+        groups[f"late_axes_{name}"] = _rows(stream.from_world * faster[:, None, :])
+        groups[f"positions_{name}"] = _rows(positions)
+        groups[f"orientations_{name}"] = _rows(orientations, sign * stream.back(bend))
+    return groups
+
+
+def _of_mount(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
+    """Columns of X, and of the scale."""
+    return {
+        "lever": _rows(parent.chords),
+        "rotation": _rows(se3.skew(child.moved), child.rotations - np.eye(3)),
+        "scale": _rows(child.moved),
+    }
+
+
+def _rows(of_t: FloatArray, of_r: FloatArray | None = None) -> FloatArray:
+    """Columns (K, 6, m) from those of displacements and of rotations: (K, 3, m), or one (K, 3)."""
+    both = np.concatenate([of_t, np.zeros_like(of_t) if of_r is None else of_r], axis=1)
+    return both.reshape(len(of_t), 6, -1)
+
+
+def _regression(
+    parent: _Stream, child: _Stream, X: FloatArray, groups: _Columns, probes: _Columns, *base: str
+) -> Regression:
+    """Regression on groups of columns, and on those of X and the scale."""
+    displaced = child.moved - parent.moved
+    turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
+    unexplained = displaced - se3.times(parent.chords, X[:3, 3])
+    of_both = ((unexplained, 1e-7), (turned, 1e-8))
+    sizes = [max(float(robust_sigma(v)), least) for v, least in of_both]
+    units, of_mount = np.repeat(sizes, 3)[:, None], _of_mount(parent, child)
+    columns = of_mount | dict(groups) | {"target": _rows(displaced, turned)}
+    ends = np.cumsum([each.shape[2] for each in columns.values()]).tolist()
+    starts = zip(columns, [0, *ends], ends, strict=False)
+    where = {name: list(range(start, end)) for name, start, end in starts}
+    rows = np.concatenate([*columns.values()], axis=2)
+    probing = rows.copy()
+    for name, each in (_of_mount(child, child) | dict(probes)).items():
+        probing[:, :, where[name]] = each
+    return Regression(rows, probing, units, where, *of_mount, *base)

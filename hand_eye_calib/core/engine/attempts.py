@@ -1,0 +1,130 @@
+"""Attempts: a snapshot that was solved with some options, checked, and compared with others."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.option import Options
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.findings import Finding, Severity, gravest_first
+from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.core.results.calibration import Calibration
+
+#: Options that put a stream right before it is paired.
+STREAM_REPAIRS = (
+    "parent_scale",
+    *(f"{stream}_{option}" for stream in STREAMS for option in ("invert", "quaternion")),
+)
+
+# Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
+# model holds, and less if there is no noise.
+_MAX_MISFIT = 2.0
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A snapshot, solved and checked.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        The result, with the findings of the check.
+    snapshot : Snapshot
+        The streams and the options that gave the result.
+    check : CheckResult
+    options : mapping
+        Options that were set because a check is certain of them, by name.
+    messages : tuple of str
+        What was set and why. The warnings of the calibration begin with them.
+    """
+
+    calibration: Calibration
+    snapshot: Snapshot
+    check: CheckResult = field(default_factory=lambda: CheckResult(()))
+    options: Options = field(default_factory=dict)
+    messages: tuple[str, ...] = ()
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether no finding forbids the use of the result."""
+        return not any(found.makes_unusable for found in self.check.findings)
+
+    @property
+    def n_objections(self) -> int:
+        """Number of findings graver than a note."""
+        return sum(found.severity is not Severity.NOTE for found in self.check.findings)
+
+    @property
+    def noise_fits(self) -> bool:
+        """Whether the residuals fit the noise model; False without a noise model."""
+        noise = self.calibration.noise
+        return noise is not None and (noise.misfit or 0.0) <= _MAX_MISFIT
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing speaks against the result."""
+        return self.is_usable and self.n_objections == 0 and self.noise_fits
+
+    def is_better_than(self, other: "Attempt", n_fewer: int) -> bool:
+        """Return whether this attempt is usable and the other is not, or whether ``n_fewer``
+        objections or more are gone and the noise model fits no worse.
+        """
+        if self.is_usable and not other.is_usable:
+            return True
+        is_improved = self.n_objections <= other.n_objections - n_fewer
+        return is_improved and self.noise_fits >= other.noise_fits
+
+    def with_findings(self, findings: Collection[Finding]) -> "Attempt":
+        """Return the attempt with other findings, and with no reading left to choose."""
+        sorted_findings = gravest_first(tuple(findings))
+        return replace(
+            self,
+            calibration=replace(self.calibration, findings=sorted_findings),
+            check=replace(self.check, findings=sorted_findings, readings=None),
+        )
+
+    def with_doubts(self, doubts: Collection[Finding]) -> "Attempt":
+        """Return the attempt with further findings, about options that were set."""
+        if not doubts:
+            return self
+        findings = gravest_first((*self.calibration.findings, *doubts))
+        return replace(
+            self,
+            calibration=replace(self.calibration, findings=findings),
+            check=replace(self.check, findings=gravest_first((*self.check.findings, *doubts))),
+        )
+
+    def with_messages(self, options: Options, messages: Collection[str]) -> "Attempt":
+        """Return the attempt with options that were set, and with warnings that say so."""
+        warnings = tuple(dict.fromkeys((*messages, *self.calibration.warnings)))
+        calibration = replace(self.calibration, warnings=warnings)
+        return replace(
+            self, calibration=calibration, options=dict(options), messages=tuple(messages)
+        )
+
+
+def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
+    """Return the snapshot with other options.
+
+    Poses that were paired with another time offset are paired anew, from the stamps of the pairs.
+    """
+    if not options:
+        return snapshot
+    config = replace(snapshot.config, **options)
+    if "time_offset" not in options:
+        return replace(snapshot, config=config)
+    if not len(snapshot.kept):
+        return replace(snapshot, config=config, time_offset=None)
+    # The poses as they came in: repairs apply once.
+    usual: Options = {name: getattr(CalibratorConfig, name) for name in STREAM_REPAIRS}
+    parent, child = replace(snapshot, config=replace(snapshot.config, **usual)).streams
+    return replace(
+        snapshot,
+        config=replace(config, max_gap=snapshot.max_gap_s),
+        kept=PosePairs.empty(),
+        buffered_parent=parent,
+        buffered_child=child,
+        paired_at=None,
+        time_offset=None,
+    )

@@ -1,0 +1,1 @@
+"""The estimator that models the noise of the trajectories."""

@@ -1,0 +1,365 @@
+"""The adaptive estimator: X by generalised least squares under a noise model that is estimated
+along with it.
+
+Instead of choosing which poses to compare, all evidence is weighed as the noise of these very
+trajectories asks for: white noise favours long baselines, drift short ones, time-correlated errors
+neither, and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.base.text import angle, counted, length
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.noise.increments import (
+    BIAS,
+    N_SYSTEMATIC,
+    PARAMETERS,
+    RATE,
+    SCALE,
+    SYSTEMATIC,
+    TIME,
+    Streams,
+)
+from hand_eye_calib.core.noise.noise_model import (
+    JITTER,
+    N_FAST,
+    ROTATION,
+    TRANSLATION,
+    WALK_ROTATION,
+    WALK_TRANSLATION,
+    NoiseModel,
+)
+from hand_eye_calib.core.noise.stages import STAGES, Fit, Problem, is_settled, start
+from hand_eye_calib.core.noise.tuning import TUNING, Tuning
+from hand_eye_calib.core.results.records import CorrelatedError, Noise
+
+# Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
+_SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
+
+_FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSolution:
+    """What the answers for poses and for positions have in common.
+
+    Attributes
+    ----------
+    model : NoiseModel
+    levels : (m,) array
+        Log levels of the model.
+    parameters, parameter_sigmas : (8 or more,) arrays
+        Parameters of all systematic errors, see :mod:`~hand_eye_calib.core.noise.increments`, and
+        their standard deviations; zero for those that are not there.
+    scale, scale_sigma : float
+        Factor from the child's lengths to the parent's, and its standard deviation.
+    time_offset_s, time_offset_sigma_s : float
+        Seconds to add to the child's stamps, and their standard deviation.
+    jumps : (n,) bool array
+        Increments (from pose i to i + 1) across which a trajectory jumped for good.
+    spikes : (n + 1,) bool array
+        Poses that are wrong by themselves, and left out.
+    misfit : float
+        Weighted squared residual over its degrees of freedom. The covariance has this factor in it.
+    part_products : (K, p + 1, p + 1) array
+        What each part of the recording adds, see
+        :func:`~hand_eye_calib.core.noise.state_space.Posterior.part_products`.
+    objective : float
+        Negative log likelihood.
+    converged : bool
+    """
+
+    model: NoiseModel
+    levels: FloatArray
+    parameters: FloatArray
+    parameter_sigmas: FloatArray
+    scale: float
+    scale_sigma: float
+    time_offset_s: float
+    time_offset_sigma_s: float
+    jumps: BoolArray
+    spikes: BoolArray
+    misfit: float
+    part_products: FloatArray
+    objective: float
+    converged: bool
+
+    def events(self, stamps_ns: IntArray) -> list[str]:
+        """Jumps and outliers in words, with the times (s) of the first."""
+        said, stamps_s = [], stamps_ns * 1e-9
+        for times_s, what, told in (
+            (stamps_s[1:][self.jumps], "jump", " of a trajectory, just before"),
+            (stamps_s[self.spikes], "outlier pose", ", left out, at"),
+        ):
+            if count := len(times_s):
+                first = ", ".join(f"{each:.3f}" for each in times_s[:5].tolist())
+                said.append(f"{counted(count, what)}{told} {first}{' ...' if count > 5 else ''} s")
+        return said
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveSolution(ModelSolution):
+    """Answer of the adaptive estimator.
+
+    Attributes
+    ----------
+    T_parent_child : (4, 4) array
+    cov_parent_child_in_child : (6, 6) array
+        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, systematic errors and misfit
+        accounted for.
+    unseen : (6, U) array
+        Directions of xi that no increment says anything about.
+    weights : (n + 1,) array
+        Of the poses' white errors; other than 1 where tails are heavy.
+    is_noise_dominated : bool
+        Whether single poses are noisier than the rotation between them: only some were used.
+    metres_per_pose : float
+        Path of the parent from pose to pose.
+    """
+
+    T_parent_child: FloatArray
+    cov_parent_child_in_child: FloatArray
+    unseen: FloatArray
+    weights: FloatArray
+    metres_per_pose: float
+    is_noise_dominated: bool = False
+
+    @property
+    def systematic(self) -> str:
+        """Systematic errors that the data show beyond doubt, joined by ``+``; ``none``."""
+        shown = np.abs(self.parameters) > TUNING.plain * self.parameter_sigmas
+        return "+".join(name for name, at in PARAMETERS.items() if shown[at].any()) or "none"
+
+    @property
+    def rate_bias(self) -> FloatArray:
+        """(2, 3) array: bias of the child's rates less that of the parent's, along the axes of the
+        child, and its standard deviations, rad/s.
+        """
+        return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
+
+    def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
+        """Variance (rad^2) per axis of the rotation over so many typical intervals."""
+        white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
+        variance = 2 * white + n_intervals * walk
+        for slow in self.noise.lasting:
+            if slow.part == "rotation":
+                ratio = n_intervals * self.model.interval_s / slow.tau_s
+                variance = variance - 2 * slow.sigma**2 * np.expm1(-ratio)
+        return np.asarray(variance)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """The noise in plain numbers: standard deviations per axis, systematic errors."""
+        sigmas = np.exp(0.5 * self.levels)
+        lasting = tuple(
+            CorrelatedError(
+                kind=kind,
+                part=part,
+                sigma=float(sigmas[at]),
+                tau_s=float(np.exp(self.levels[at + 1])),
+            )
+            for (kind, part), at in zip(self.model.slow, range(N_FAST, len(sigmas), 2), strict=True)
+        )
+        return Noise(
+            in_words=(),
+            rotation_white_rad=float(sigmas[ROTATION]),
+            translation_white_m=float(sigmas[TRANSLATION]),
+            rotation_drift_rad_per_pose=float(sigmas[WALK_ROTATION]),
+            translation_drift_m_per_pose=float(sigmas[WALK_TRANSLATION]),
+            lasting=lasting,
+            systematic=self.systematic,
+            misfit=self.misfit,
+        )
+
+    def describe(self, stamps_ns: IntArray) -> Noise:
+        """The noise in plain numbers and in words, with the times of jumps and outliers."""
+        said = [*self._noise_in_words(), *self._systematic_in_words(), *self.events(stamps_ns)]
+        return replace(self.noise, in_words=tuple(said))
+
+    def _noise_in_words(self) -> list[str]:
+        sigmas, lasting = np.exp(0.5 * self.levels), self.noise.lasting
+        white, drift = angle(sigmas[ROTATION]), f"{angle(sigmas[WALK_ROTATION])} from pose to pose"
+        if self.metres_per_pose:
+            white = f"{length(sigmas[TRANSLATION])} and {white}"
+            by_m, by_rad = sigmas[[WALK_TRANSLATION, WALK_ROTATION]] / self.metres_per_pose**0.5
+            drift = f"{length(by_m)} and {angle(by_rad)} after 1 m, ten times that after 100 m"
+        else:
+            lasting = tuple(slow for slow in lasting if slow.part == "rotation")
+        jitter_ms = 1e3 * float(sigmas[JITTER])
+        return [
+            f"Noise: {white} per axis of each pose (both sensors together).",
+            f"Drift: {drift}.",
+            *map(_slow_in_words, lasting),
+            *[f"stamps jitter by {jitter_ms:.2g} ms"] * (jitter_ms > TUNING.notable_jitter_ms),
+        ]
+
+    def _systematic_in_words(self) -> list[str]:
+        systematic, said = self.systematic.split("+"), []
+        if "scale" in systematic:
+            off, sigma = 100 * (self.scale - 1), 100 * self.scale_sigma
+            than = f"{'shorter' if off > 0 else 'longer'} than the parent's"
+            said.append(f"the child's lengths are {abs(off):.2f} +/- {sigma:.2g} % {than}")
+        if "bias" in systematic:
+            bias = zip("xyz", 1000 * self.parameters[BIAS], strict=True)
+            along = ", ".join(f"{axis} {value:.2g}" for axis, value in bias)
+            said.append(
+                f"the child's path is off by {along} mm per metre travelled, along its axes"
+            )
+        if "rate" in systematic:
+            rates = zip("xyz", *np.degrees(self.rate_bias), strict=True)
+            about = ", ".join(f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates)
+            said.append(f"bias of the angular rates, along the child's axes: {about} deg/s")
+        elif "time" in systematic:
+            ms, sigma = 1000 * self.time_offset_s, 1000 * self.time_offset_sigma_s
+            late = "early" if ms > 0 else "late"
+            said.append(f"the child's stamps are {abs(ms):.1f} +/- {sigma:.2g} ms {late}")
+        return said
+
+
+def _slow_in_words(slow: CorrelatedError) -> str:
+    if slow.part == "scale":
+        return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
+    if slow.part == "direction":
+        return f"the direction of travel drifts by {angle(slow.sigma)} within {slow.tau_s:.2g} s"
+    size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
+    return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
+
+
+def solve(
+    stamps_ns: IntArray,
+    Ts_pw_p: FloatArray,
+    Ts_cw_c: FloatArray,
+    systematic: Sequence[str] = SYSTEMATIC,
+    quick: bool = False,
+    is_clock_free: bool = False,
+    without: Collection[str] = (),
+    tuning: Tuning = TUNING,
+) -> AdaptiveSolution:
+    """Estimate T_parent_child, the noise of the trajectories, and their covariance.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
+        Poses of both sensors in their own worlds at these stamps.
+    systematic : sequence of str
+        Systematic errors in the model.
+    quick : bool
+        Stop at white noise, drift and outliers: neither time-correlated errors nor heavy tails.
+    is_clock_free : bool
+        The clock offset was estimated from these poses: it is not known beforehand.
+    without : collection of str
+        Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` to leave out.
+    tuning : Tuning
+
+    Returns
+    -------
+    AdaptiveSolution
+    """
+    problem = Problem(
+        streams=Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c),
+        columns=[column for name in systematic for column in PARAMETERS[name]],
+        is_clock_free=is_clock_free,
+        without=frozenset(without) | (_SLOW if quick else frozenset()),
+        tuning=tuning,
+    )
+    return _solved(problem)
+
+
+def _solved(problem: Problem) -> AdaptiveSolution:
+    first = _passed(problem, start(problem), STAGES[:_FIRST])
+    # A camera that sees a target: its errors repeat, and exceed the rotation from pose to pose.
+    if first.model.centre != "sensors" and problem.is_noisy(first):
+        kept = _strided(problem, first)
+        if len(kept) < len(problem.streams):
+            fewer = replace(problem, streams=problem.streams[kept], _last=[])
+            return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
+    fit = _passed(problem, first, STAGES[_FIRST:])
+    if not is_settled(problem, fit):
+        problem = replace(problem, without=problem.without | {"lasting"})
+        fit = _passed(problem, first, STAGES[_FIRST:])
+    return _solution(problem, fit)
+
+
+def _passed(problem: Problem, fit: Fit, stages: Sequence) -> Fit:
+    """The fit after some stages."""
+    for stage in stages:
+        if stage.__name__ not in problem.without:
+            fit = stage(problem, fit)
+    return fit
+
+
+def _strided(problem: Problem, fit: Fit) -> IntArray:
+    """Poses to keep: every so many, so that the rotation between them exceeds their noise."""
+    tuning, streams = problem.tuning, problem.streams
+    every = np.flatnonzero(~fit.outliers.spikes)
+    most = max((s for s in tuning.strides if len(every) >= s * tuning.fewest_strides), default=1)
+    noise = np.exp(0.5 * fit.levels[ROTATION])
+    rotations = streams.Ts_pw_p[every, :3, :3]
+    for stride in tuning.strides:
+        turned = np.swapaxes(rotations[:-stride], 1, 2) @ rotations[stride:]
+        if noise < tuning.noisy * median(se3.rotation_angle(turned)):
+            return every[:: min(stride, most)]
+    return every[::most]
+
+
+def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
+    """The solution of some poses, jumps and outlier poses told of all."""
+    jumps, spikes = np.zeros(len(spikes) - 1, dtype=bool), spikes.copy()
+    weights = np.ones(len(spikes))
+    jumps[kept[1:][fewer.jumps] - 1] = True
+    spikes[kept[fewer.spikes]] = True
+    weights[kept] = fewer.weights
+    return replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_noise_dominated=True)
+
+
+def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
+    """The solution one step from where the search stands."""
+    streams, posterior, columns = problem.streams, problem.posterior(fit), problem.columns
+    normal = posterior.normal
+    # Rows of an increment that tell: three where only rotations are measured, without a place.
+    places = np.concatenate([streams.Ts_pw_p[:, :3, 3], streams.Ts_cw_c[:, :3, 3]], axis=1)
+    n_rows = 6 if np.ptp(places, axis=0).any() else 3
+    n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
+    misfit = float(normal.cost) / max(n_rows * n_evidence - 6 - len(columns), 1)
+    # Steps smaller than predicted do not make what was learned over long baselines more certain.
+    covariance = max(misfit, 1.0) * normal.covariance
+    sigmas = np.zeros(N_SYSTEMATIC)
+    sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
+    unseen = np.zeros(6)
+    for (kind, _), level in zip(fit.model.slow, fit.levels[N_FAST::2], strict=True):
+        if kind == "body":
+            unseen[:3] += problem.tuning.unseen_share * np.exp(level)
+    steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
+    final = fit.moved(normal.step, columns)
+    is_there = fit.sigmas > problem.tuning.none
+    parameters, sigmas = (np.where(is_there, each, 0.0) for each in (final.parameters, sigmas))
+    return AdaptiveSolution(
+        T_parent_child=final.T,
+        cov_parent_child_in_child=covariance[:6, :6] + np.diag(unseen),
+        unseen=normal.unseen[:6],
+        model=fit.model,
+        levels=fit.levels,
+        weights=fit.weights,
+        parameters=parameters,
+        parameter_sigmas=sigmas,
+        scale=1.0 + float(parameters[SCALE]),
+        scale_sigma=float(sigmas[SCALE]),
+        time_offset_s=-float(parameters[TIME]),
+        time_offset_sigma_s=float(sigmas[TIME]),
+        jumps=fit.outliers.jumps,
+        spikes=fit.outliers.spikes,
+        misfit=misfit,
+        metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
+        part_products=posterior.part_products(),
+        objective=0.5 * (posterior.log_determinant + float(normal.cost)),
+        converged=is_settled(problem, fit),
+    )

@@ -1,0 +1,201 @@
+"""The noise of two trajectories: which errors there are, how strong, and how they enter.
+
+Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
+stamps that jitter), the motions a random walk, and time-correlated errors are first-order
+Gauss-Markov processes: translations fixed to the child's body, translations and rotations fixed to
+the parent's world, each with one variance; so are the scale and the direction of travel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.noise.increments import PATH_PARTS, Linearisation, Streams
+from hand_eye_calib.core.noise.reml import Prior
+from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
+from hand_eye_calib.core.noise.tuning import TUNING
+
+# What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
+# child's or of the parent's world, as of a camera that sees a target.
+CENTRES = ("sensors", "child", "parent")
+
+# Log levels before those of lasting errors: white translation (m^2), white rotation (rad^2), jitter
+# of stamps (s^2), walk of translation and of rotation.
+_FAST = ("translation", "rotation", "jitter", "walk_translation", "walk_rotation")
+N_FAST = len(_FAST)
+TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
+
+PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
+TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
+
+
+#: A process of time-correlated errors, by its kind and its part: of the body or the world,
+#: translation or rotation; of the path, scale or direction.
+Slow: TypeAlias = tuple[str, str]
+
+# No rotation fixed to the body: a mount that wanders. X would forget what it knows, and no
+# recording gains by it.
+LASTING: tuple[Slow, ...] = (
+    ("body", "translation"),
+    *(("world", part) for part in PARTS),
+    *(("path", part) for part in PATH_PARTS),
+)
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Which errors there are.
+
+    Attributes
+    ----------
+    slow : tuple of Slow
+    centre : {"sensors", "child", "parent"}
+    interval_s, duration_s : float
+        Typical interval and duration of the recording.
+    """
+
+    slow: tuple[Slow, ...]
+    centre: str
+    interval_s: float
+    duration_s: float
+
+    def state_space(
+        self,
+        streams: Streams,
+        linearisation: Linearisation,
+        twists: FloatArray,
+        T_parent_child: FloatArray,
+        weights: FloatArray,
+        cut: BoolArray,
+        prior: FloatArray,
+    ) -> StateSpace:
+        """The state space of a linearisation.
+
+        Parameters
+        ----------
+        streams : Streams
+        linearisation : Linearisation
+        twists : (N, 6) array
+            The child's, see :class:`~hand_eye_calib.core.noise.increments.Course`.
+        T_parent_child : (4, 4) array
+        weights : (N,) array
+        cut : (n,) bool array
+        prior : (p + 1, p + 1) array
+        """
+        to_child, intervals_s = se3.adjoint(se3.inverse(T_parent_child)), np.diff(streams.stamps_s)
+        # Rotation noise, half of it the parent's, which moves the child by the lever arm.
+        both = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
+        is_swung = self.centre != "sensors"
+        ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
+        for kind, part in self.slow:
+            if kind == "path":
+                behind.append(-linearisation.by_path[part])
+                ahead.append(np.zeros_like(behind[-1]))
+                continue
+            directions = _directions(kind, part, streams, to_child)
+            ahead.append(directions[1:])
+            behind.append(linearisation.adjoints @ directions[:-1])
+        return StateSpace(
+            intervals_s=intervals_s,
+            relative=np.clip(intervals_s / self.interval_s, *TUNING.relative),
+            columns=linearisation.columns,
+            ahead=np.concatenate(ahead, axis=2),
+            behind=np.concatenate(behind, axis=2) if self.slow else behind[0],
+            white=(TRANSLATIONS[None], self._swing(streams, to_child) if is_swung else both[None]),
+            walk=(TRANSLATIONS, both),
+            twists=twists,
+            sizes=tuple(each.shape[2] for each in ahead[1:]),
+            weights=weights,
+            cut=cut,
+            prior=prior,
+        )
+
+    def _swing(self, streams: Streams, to_child: FloatArray) -> FloatArray:
+        """Covariances (N, 6, 6) of c by rotation noise of 1 rad about the origin of a world."""
+        poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
+        swing = np.zeros((len(poses), 6, 3))
+        swing[:, :3], swing[:, 3:] = se3.skew(se3.inverse(poses)[:, :3, 3]), np.eye(3)
+        if self.centre == "parent":
+            swing = to_child @ swing
+        return swing @ np.swapaxes(swing, 1, 2)
+
+    def shares(
+        self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
+    ) -> FloatArray:
+        """Matrices (1 or N, 6, 6) from the white errors c to what of them is the parent's, in the
+        child's frame.
+
+        White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c``
+        with the white covariances S' of the parent and S of the child: with a lever arm, a
+        translation says which of the sensors rotated. Both have half of the noise, but rotation
+        noise about a world's origin is that sensor's alone.
+        """
+        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        translation, rotation = np.exp(levels[[TRANSLATION, ROTATION]])
+        half, turning = 0.5 * translation * TRANSLATIONS, 0.5 * rotation * ROTATIONS
+        of_child, of_parent = half[None], (to_child @ half @ to_child.T)[None]
+        if self.centre == "sensors":
+            of_parent, of_child = of_parent + to_child @ turning @ to_child.T, of_child + turning
+        elif self.centre == "child":
+            of_child = of_child + rotation * self._swing(streams, to_child)
+        else:
+            of_parent = of_parent + rotation * self._swing(streams, to_child)
+        return np.swapaxes(np.linalg.solve(of_parent + of_child, of_parent), 1, 2)
+
+    def prior(self, levels: FloatArray) -> Prior:
+        """What is known beforehand, for a search from these levels."""
+        total, shortest = whole(levels), np.log(self.interval_s)
+        mean, precision = levels.copy(), np.zeros(len(levels))
+        lower = np.full(len(levels), np.log(TUNING.lowest_variance))
+        upper = np.full(len(levels), TUNING.highest_level)
+        lower[:2] = np.maximum(lower[:2], total + TUNING.least_white)
+        lower[3:5] = np.maximum(lower[3:5], total + TUNING.least_walk)
+        mean[JITTER], precision[JITTER] = TUNING.jitter, TUNING.jitter_precision
+        taus = slice(N_FAST + 1, None, 2)
+        precision[taus], lower[taus] = TUNING.tau_precision, shortest
+        upper[taus] = max(np.log(TUNING.longest_share * self.duration_s), shortest)
+        # One that lasts is a bias or a mount askew, which have parameters.
+        is_direction = [part == "direction" for _, part in self.slow]
+        upper[taus] = np.where(is_direction, shortest + np.log(TUNING.first_tau), upper[taus])
+        return Prior(mean, precision, lower, upper)
+
+    def with_lasting(
+        self, processes: tuple[Slow, ...], levels: FloatArray
+    ) -> tuple[NoiseModel, FloatArray]:
+        """The model with processes that last, and log levels to start a search at."""
+        shortest = TUNING.first_tau * self.interval_s
+        longest = max(TUNING.last_tau * self.duration_s, shortest)
+        first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
+        first |= dict.fromkeys(PATH_PARTS, TUNING.first_of_path)
+        starts = [[first[part], 0.5 * np.log(shortest * longest)] for _, part in processes]
+        return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
+
+    def lasting(
+        self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
+    ) -> FloatArray:
+        """The lasting part (N, 6) of the error c that states (N, d) make, in the child's frame."""
+        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        error, start = np.zeros((len(states), 6)), WHITE
+        for kind, part in self.slow:
+            if kind != "path":
+                directions = _directions(kind, part, streams, to_child)
+                error += se3.times(directions, states[:, start : start + 3])
+            start += 1 if part == "scale" else 3
+        return error
+
+
+def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) -> FloatArray:
+    """Matrices (N, 6, 3) from a process to the error c."""
+    if kind == "body":
+        return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
+    return to_child[:, PARTS[part]] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
+
+
+def whole(levels: FloatArray) -> FloatArray:
+    """Log variances (2,) of increments of translation and rotation: white noise plus walk."""
+    return np.logaddexp(levels[[3, 4]], levels[:2] + np.log(2.0))

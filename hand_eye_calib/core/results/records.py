@@ -1,0 +1,291 @@
+"""Parts of a calibration: how the solve ended, how well each axis is known, residuals, findings,
+noise, clock, other answers.
+
+All are plain values under names, so that :mod:`hand_eye_calib.core.base.plain` reads and writes
+them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TypeAlias
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.geometry.trajectory import Columns
+
+# Motion pairs with more weight than this count as inliers.
+INLIER_WEIGHT = 0.5
+
+
+TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
+AXES = (*TRANSLATIONS, *ROTATIONS)
+
+# Axes that streams say nothing about, by what they measure together.
+OUT_OF_REACH = {"poses": (), "rotations": TRANSLATIONS, "positions": ROTATIONS}
+
+
+class SolveStatus(str, Enum):
+    """How a solve ended. Only an OK result may be used as it is.
+
+    Of an UNOBSERVABLE one the other directions may be used. NOT_CONVERGED and CONTRADICTED (a prior
+    contradicts the motion) are failures.
+
+    Examples
+    --------
+    >>> result.status is hec.SolveStatus.OK
+    True
+    """
+
+    OK = "ok"
+    UNOBSERVABLE = "unobservable"
+    NOT_CONVERGED = "not_converged"
+    CONTRADICTED = "contradicted"
+
+    @property
+    def failure(self) -> str:
+        """Why nothing of a result may be used; empty unless the solve failed."""
+        if self is SolveStatus.NOT_CONVERGED:
+            return "the solver did not converge"
+        return "a prior contradicts the motion" if self is SolveStatus.CONTRADICTED else ""
+
+
+class DofVerdict(str, Enum):
+    """How well one degree of freedom is known; PRIOR if mostly or only from a prior."""
+
+    OBSERVED = "observed"
+    WEAK = "weak"
+    UNOBSERVABLE = "unobservable"
+    PRIOR = "prior"
+
+
+@dataclass(frozen=True)
+class DofObservability:
+    """Observability of one degree of freedom of the child sensor's pose, along or about an axis of
+    the parent sensor's frame.
+
+    Attributes
+    ----------
+    name : str
+        x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
+    verdict : DofVerdict
+    sigma : float
+        One standard deviation, in m or rad; ``inf`` if unobservable. It contains the allowance for
+        constant errors in ``observability``, not in ``observability_measured``.
+    """
+
+    name: str
+    verdict: DofVerdict
+    sigma: float
+
+
+def by_hand(axis: str) -> str:
+    """What stands in files and commands for an axis that is not known; no parser takes it."""
+    return f"MEASURE_{axis.upper()}_BY_HAND"
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals(Columns):
+    """Residuals of K motion pairs at the result.
+
+    A pair of the adaptive estimator runs from one pose to the next.
+
+    Attributes
+    ----------
+    translation : (K, 3) array
+        Residuals of eq. (6) of Välimäki et al. 2023, m, in the axes of the parent sensor at the
+        start of each pair.
+    rotation : (K, 3) array
+        Rotation vectors of the residual rotations, whose angles are those of eq. (7), rad, in the
+        axes of the child sensor at the end of each pair.
+    weights : (K,) array
+        Weights of the pairs in the solution, 0 to 1.
+    start_ns, end_ns : (K,) int64 arrays
+        Stamps of both ends of each pair, parent clock.
+
+    Examples
+    --------
+    >>> residuals = result.residuals()
+    >>> residuals.translation.shape == (len(residuals), 3)
+    True
+    """
+
+    translation: FloatArray
+    rotation: FloatArray
+    weights: FloatArray
+    start_ns: IntArray
+    end_ns: IntArray
+
+    @property
+    def translation_m(self) -> FloatArray:
+        """Lengths (K,) of the translation residuals, m."""
+        return np.linalg.norm(self.translation, axis=1)
+
+    @property
+    def rotation_rad(self) -> FloatArray:
+        """Angles (K,) of the rotation residuals, rad."""
+        return np.linalg.norm(self.rotation, axis=1)
+
+    @property
+    def is_inlier(self) -> BoolArray:
+        """Whether (K,) each pair counts as an inlier."""
+        return self.weights > INLIER_WEIGHT
+
+
+class Severity(str, Enum):
+    """How much a finding matters.
+
+    With an error, a result from these streams as they are is unusable. With a warning it may be
+    used with care. A note is good to know.
+    """
+
+    NOTE = "note"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something about the streams that a person should know.
+
+    Attributes
+    ----------
+    code : str
+        Short name, stable over versions.
+    stream : str
+        "parent", "child" or "both".
+    severity : Severity
+    what : str
+        What was found, with its values.
+    advice : str
+        What to do.
+    cause : str
+        Usual cause, if ``what`` does not name it.
+    evidence : mapping of str to float
+        The numbers in ``what``, by name.
+    options : mapping
+        Options that do it, by their names in :mod:`hand_eye_calib.core.base.config`; empty if none
+        can.
+    """
+
+    code: str
+    severity: Severity
+    what: str
+    advice: str
+    stream: str = "both"
+    cause: str = ""
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    options: Mapping[str, float | str] = field(default_factory=dict)
+
+    @property
+    def makes_unusable(self) -> bool:
+        """Whether a result from these streams as they are is unusable."""
+        return self.severity is Severity.ERROR
+
+    def __str__(self) -> str:
+        cause = f" ({self.cause})" if self.cause else ""
+        return f"{self.what.rstrip('.')}{cause}; {self.advice}"
+
+
+def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The findings by severity, errors first, otherwise in their order."""
+    order = list(Severity)
+    return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrelatedError:
+    """A time-correlated error: what it is fixed to (``kind``: body or world, or path), its part of
+    the poses or the path, its standard deviation per axis (m, rad or a share) and its correlation
+    time.
+    """
+
+    kind: str
+    part: str
+    sigma: float
+    tau_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Noise of the trajectories as the adaptive estimator found it.
+
+    Standard deviations are per axis, of both sensors together: of a single pose (``white``), and
+    of the drift from pose to pose.
+    """
+
+    in_words: tuple[str, ...]
+    misfit: float | None = None
+    translation_white_m: float | None = None
+    rotation_white_rad: float | None = None
+    translation_drift_m_per_pose: float | None = None
+    rotation_drift_rad_per_pose: float | None = None
+    lasting: tuple[CorrelatedError, ...] = ()
+    systematic: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockRate:
+    """By how much the time offset changes with time, in parts per million.
+
+    Attributes
+    ----------
+    ppm, sigma_ppm : float
+        Microseconds to add to the child's stamps for each second after ``at_ns``, and one standard
+        deviation. Positive if the child's clock is slow.
+    at_ns : int
+        Stamp of the child's clock at which the time offset holds.
+    is_used : bool
+        Whether the child's stamps were freed of it: it stands out of its standard deviation.
+    """
+
+    ppm: float
+    sigma_ppm: float
+    at_ns: int
+    is_used: bool = False
+
+    @property
+    def used(self) -> float:
+        """Seconds for each second that the child's stamps were freed of."""
+        return 1e-6 * self.ppm if self.is_used else 0.0
+
+    def __str__(self) -> str:
+        return (
+            f"{abs(self.ppm):.1f} +/- {self.sigma_ppm:.2g} ppm {'slow' if self.ppm > 0 else 'fast'}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisScatter:
+    """Scatter of other answers about a result on one axis, m or rad; None where it is not known.
+
+    Attributes
+    ----------
+    sigma : float or None
+        The result's standard deviation, with the allowance; None if the axis is unobservable.
+    of_methods : float or None
+        Robust standard deviation of other methods and references about the result.
+    of_halves : float or None
+        Standard deviation that follows from the difference between both halves of the recording.
+    excess_of_methods, excess_of_halves : float or None
+        The same in joint standard deviations, which contain the allowance; those of
+        the halves also the result's own if the halves are solved with another method.
+    excess_over_own : float or None
+        Distance of other methods and references in the result's own standard deviations, over those
+        that are not much less certain.
+    is_confirmed : bool
+        False if the result determines the axis and no other method or reference does.
+    """
+
+    sigma: float | None
+    of_methods: float | None
+    of_halves: float | None
+    excess_of_methods: float | None = None
+    excess_of_halves: float | None = None
+    excess_over_own: float | None = None
+    is_confirmed: bool = True
+
+
+#: Axis (x, y, z, roll, pitch, yaw) to the scatter of other answers about a result.
+CrossCheck: TypeAlias = Mapping[str, AxisScatter]

@@ -1,0 +1,143 @@
+"""Solvers that weigh all motion pairs alike, and what every solver returns.
+
+Park and Taylor: rotation by aligning rotation vectors, then translation by linear least squares.
+
+The coarse stages of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes, *Spatiotemporal
+camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotics and Automation
+Letters 5(2), 2020, and of Z. Taylor, J. Nieto, *Motion-based calibration of multimodal sensor
+arrays*, IEEE International Conference on Robotics and Automation, 2015, with equal weights for all
+readings. Both solve the same two least-squares problems, and their published results differ by
+rounding only; they have names of their own because the comparison of Välimäki et al. (2023) lists
+both.
+
+DNL: direct non-linear optimisation (Välimäki et al. 2023, eq. 4); and Ali, of the translation
+residual alone.
+
+That is cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
+robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'
+program computes it: the rotation residual of a motion pair enters only as the norm of a unit
+quaternion, a constant (Välimäki et al. 2023, section 2). The rest is the translation of AX - XB,
+a quadratic form in the same thirteen variables as dnl's cost.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.solvers import quadratic_form
+
+# Singular values below this share of the largest are rounding: directions that the motion does not
+# reveal; they are not changed.
+RANK_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Solution of AX = XB for K motion pairs.
+
+    Attributes
+    ----------
+    T_parent_child : (4, 4) array
+        X. Directions that the motion does not excite at all keep zero translation or the rotation
+        of the start.
+    objective : float
+        The method's own cost at X.
+    converged : bool
+        Whether the iteration settled. If not, X is the best point it reached.
+    weights : (K,) array
+        Weight of each motion pair; 1 for all with methods that do not reject outliers.
+    """
+
+    T_parent_child: FloatArray
+    objective: float
+    converged: bool
+    weights: FloatArray
+
+
+def solve_park(pairs: MotionPairs) -> Solution:
+    """Solve AX = XB of K >= 1 pairs in two closed-form stages.
+
+    ``objective`` is the sum of squared translation residuals, the cost of the second stage, in m^2.
+    """
+    rotation = align_rotation_vectors(pairs)
+    # (R_A - I) t = R t_B - t_A; 0 along directions that no rotation reveals.
+    moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    target = pairs.Ts_childi_childj[:, :3, 3] @ rotation.T - pairs.Ts_parenti_parentj[:, :3, 3]
+    found = np.linalg.lstsq(moved.reshape(-1, 3), target.ravel(), rcond=RANK_TOLERANCE)
+    T_parent_child = se3.from_rotation_translation(rotation, found[0])
+    objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
+    return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
+
+
+def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
+    """Find the rotation (3, 3) from the child's rotation vectors to the parent's, in least squares.
+
+    ``R_A = R R_B R^T`` means ``log(R_A) = R log(R_B)``. The best R comes from the singular value
+    decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976), mirrored back if it is a
+    reflection. No centroid is subtracted, because the vectors have a common origin. For a rotation
+    by nearly pi, noise decides the sign of the vector.
+    """
+    rotvecs_parent = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
+    rotvecs_child = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
+    return se3.nearest_rotation(rotvecs_parent.T @ rotvecs_child)
+
+
+def solve_dnl(pairs: MotionPairs) -> Solution:
+    """Minimise ``sum |A X - X B|_F^2`` over X, of K >= 1 pairs."""
+    coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
+    Q = quadratic_form.weighted_sum(coefficients, weights)
+    T, converged = lowest(Q, pairs)
+    objective = float(quadratic_form.costs(coefficients, T).sum())
+    return Solution(T, objective, converged, weights)
+
+
+def solve_ali(pairs: MotionPairs) -> Solution:
+    """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, of K >= 1 pairs."""
+    rows = residual_rows(pairs)
+    T, converged = lowest(rows.T @ rows, pairs)
+    objective = float((pairs.residuals(T)[0] ** 2).sum())
+    return Solution(T, objective, converged, np.ones(len(pairs)))
+
+
+def residual_rows(pairs: MotionPairs) -> FloatArray:
+    """Matrix (3 K, 13) that maps ``x = (vec R, t, 1)``, vec row-major, to the residuals
+    ``R_A t + t_A - R t_B - t``.
+    """
+    rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
+    for axis in range(3):
+        rows[:, axis, 3 * axis : 3 * axis + 3] = -pairs.Ts_childi_childj[:, :3, 3]
+    rows[:, :, 9:12] = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    rows[:, :, 12] = pairs.Ts_parenti_parentj[:, :3, 3]
+    return rows.reshape(-1, quadratic_form.DIMENSION)
+
+
+def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
+    """The lowest minimum (4, 4) of a form (13, 13) of pairs, and whether the search settled."""
+    Ts, values, converged = quadratic_form.minimise(Q, start_rotations(pairs))
+    best = int(np.argmin(values))
+    return Ts[best], bool(converged[best])
+
+
+def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
+    """Costs ``|A X - X B|_F^2`` (K,), which cancel less than those of condensed forms."""
+    return quadratic_form.costs(quadratic_form.coefficients(pairs), T_parent_child)
+
+
+def start_rotations(pairs: MotionPairs) -> FloatArray:
+    """Rotations (4, 3, 3) to start from.
+
+    The first aligns the child's rotation axes with the parent's: it is close to the answer if there
+    is rotation at all. The others do so after a rotation by pi about an axis of the child, for
+    motion with hardly any rotation.
+    """
+    # As good as rotation vectors for aligning axes, and faster.
+    axes_parent = se3.vee(pairs.Ts_parenti_parentj)
+    axes_child = se3.vee(pairs.Ts_childi_childj)
+    left, _, right = np.linalg.svd(axes_parent.T @ axes_child)
+    aligned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return aligned @ [
+        np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
+    ]

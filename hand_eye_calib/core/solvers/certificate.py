@@ -1,0 +1,129 @@
+"""Proof that a minimum of a quadratic form over SE(3) is the global one.
+
+With the translation eliminated, the cost is ``x^T M x`` in ``x = (vec R, 1)``. A rotation satisfies
+20 independent quadratic equations (orthonormal rows and columns, right-handed both ways), and the
+last variable is 1; each is a symmetric matrix A_i with ``x^T A_i x = 0`` for every rotation, but
+for a constant. For any multipliers, ``Z = M + sum lambda_i A_i`` therefore has the same values on
+all rotations. Those with ``Z x = 0`` at the minimum leave 14 multipliers free. If some choice makes
+Z positive semidefinite, no rotation has a smaller cost: Lagrangian duality (Briales and
+Gonzalez-Jimenez, *Convex global 3D registration with Lagrangian duality*, CVPR 2017; Giamou et al.,
+*Certifiably globally optimal extrinsic calibration from per-sensor egomotion*, RA-L 2019).
+
+The coordinates are turned so that the minimum is the identity. All that depends on the equations
+alone is then constant, and what is left is a Newton iteration in 14 variables with matrices of 9 x
+9.
+"""
+
+from functools import cache
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.solvers import quadratic_form
+
+# The bound may exceed the minimum by this share of it, and by this share of the form's mean
+# eigenvalue, which is rounding.
+_RELATIVE, _ROUNDING = 1e-6, 1e-11
+
+_MAX_STEPS = 60
+
+# The barrier's weight, first the square of this, grows by this factor once a Newton step is short,
+# until the bound is this close to the best that any multipliers give.
+_SHARPENING, _CLOSE = 10.0, 1e-12
+
+
+def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
+    """Whether the cost at a transform is proved to be the smallest over all of SE(3).
+
+    Parameters
+    ----------
+    Q : (13, 13) array
+        The form, see `quadratic_form`.
+    T_parent_child : (4, 4) array
+        Near a local minimum.
+    """
+    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
+    # The form of S in R = rotation S, so that S is the identity at the minimum.
+    turn = np.eye(10)
+    turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))
+    M = turn.T @ quadratic_form.without_translation(Q[None])[0][0] @ turn
+    scale = max(float(np.trace(M)) / len(M), np.finfo(float).tiny)
+    tolerance = _RELATIVE * max(float(values[0]), 0.0) / scale + _ROUNDING
+    lowest = _highest_lowest_eigenvalue(M / scale, enough=-0.25 * tolerance)
+    # |x|^2 is 4 for every rotation.
+    gap = 4.0 * max(-lowest, 0.0)
+    gap += max(float(quadratic_form.decrease(Q, T_parent_child, Ts[0])), 0.0) / scale
+    return gap <= tolerance
+
+
+def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
+    """The smallest eigenvalue of Z, made as large as multipliers can, or just ``enough``.
+
+    A barrier method: minimise t with ``Z + t`` positive definite where it is not zero by
+    construction.
+    """
+    identity, beside, equations, stationary, of_free = _tables()
+    Z = M - np.tensordot(stationary @ (M @ identity), equations, 1)
+    free = beside.T @ Z @ beside
+    derivatives = np.concatenate([beside.T @ of_free @ beside, np.eye(9)[None]])
+    shift = max(-float(np.linalg.eigvalsh(free)[0]), 0.0) + 0.1
+    unknowns, weight = np.append(np.zeros(len(of_free)), shift), _SHARPENING**2
+    best = float(np.linalg.eigvalsh(Z)[0])
+    for _ in range(_MAX_STEPS):
+        if best >= enough:
+            break
+        solved = np.linalg.solve(free + np.tensordot(unknowns, derivatives, 1), derivatives)
+        step, decrement = _newton_step(solved, weight)
+        unknowns = unknowns + step
+        lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], of_free, 1))[0]
+        best = max(best, float(lowest))
+        if decrement < 0.5:
+            if len(free) / weight < _CLOSE:
+                break
+            weight *= _SHARPENING
+    return best
+
+
+def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
+    """A Newton step of ``weight t - log det`` that stays inside, and the Newton decrement, by the
+    derivatives (15, 9, 9) of the matrix, its inverse times them.
+    """
+    gradient = -np.trace(solved, axis1=1, axis2=2)
+    gradient[-1] += weight
+    hessian = np.einsum("iab,jba->ij", solved, solved)
+    hessian[np.diag_indices_from(hessian)] += 1e-14 * np.trace(hessian)
+    step = -np.linalg.solve(hessian, gradient)
+    decrement = float(np.sqrt(max(-gradient @ step, 0.0)))
+    # How far it is to the edge along the step.
+    falling = -np.linalg.eigvals(np.tensordot(step, solved, 1)).real.min()
+    inside = 0.9 / falling if falling > 0 else 1.0
+    return step * min(1.0, max(inside, 1.0 / (1.0 + decrement))), decrement
+
+
+@cache
+def _tables() -> tuple[FloatArray, ...]:
+    """(vec I, 1) (10,), and the directions (10, 9) beside it; symmetric matrices (21, 10, 10) of
+    the equations, independent of each other, the last variable's among them; the multipliers
+    (21, 10) that make ``Z x = 0`` for a given ``M x``, and the matrices (14, 10, 10) that keep it.
+    """
+    # The equations are all that hold for many rotations.
+    rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(200, 3)))
+    x = np.append(rotations.reshape(-1, 9), np.ones((200, 1)), axis=1)
+    upper = np.triu_indices(10)
+    _, singular, rows = np.linalg.svd(x[:, upper[0]] * x[:, upper[1]])
+    equations = np.zeros((21, 10, 10))
+    equations[:20, *upper] = rows[singular < 1e-9]
+    equations += np.swapaxes(equations, 1, 2)
+    equations[20, 9, 9] = 1.0
+    identity = np.append(np.eye(3).ravel(), 1.0)
+    beside = np.linalg.svd(identity[None])[2][1:].T
+    at_identity = (equations @ identity).T
+    kept = np.linalg.svd(at_identity)[2][np.linalg.matrix_rank(at_identity) :]
+    return (
+        identity,
+        beside,
+        equations,
+        np.linalg.pinv(at_identity),
+        np.tensordot(kept, equations, 1),
+    )

@@ -1,0 +1,96 @@
+"""The solvers of AX = XB by the name of their method, with the options they take."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, require_backend
+from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
+from hand_eye_calib.core.solvers import all_pairs, certificate, dnlo, quadratic_form, zhuang
+from hand_eye_calib.core.solvers.all_pairs import Solution
+
+# Of pairs, and of a threshold and the least share of inliers if they reject outliers.
+_SOLVERS: dict[str, Callable[..., Solution]] = {
+    "dnlo": dnlo.solve,
+    "dnl": all_pairs.solve_dnl,
+    "park": all_pairs.solve_park,
+    "taylor": all_pairs.solve_park,
+    "zhuang": zhuang.solve,
+    "ali": all_pairs.solve_ali,
+}
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method with its options set.
+
+    Parameters
+    ----------
+    name : str
+        Name of a method in :data:`hand_eye_calib.core.base.config.METHODS` that uses a reference.
+    threshold : float
+        c of eq. (5), in m^2. Only dnlo uses it.
+    min_inlier_fraction : float
+        d of eq. (5) over the number of pairs. Only dnlo uses it.
+    backend : str
+        "fast", or "ipopt" for dnl and dnlo.
+
+    Raises
+    ------
+    ConfigError
+        If the method is unknown or does not have the backend.
+    """
+
+    name: str
+    threshold: float = CalibratorConfig.threshold
+    min_inlier_fraction: float = CalibratorConfig.min_inlier_fraction
+    backend: str = CalibratorConfig.backend
+
+    def __post_init__(self) -> None:
+        if self.name not in _SOLVERS:
+            raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}")
+        require_backend(self.name, self.backend)
+
+    def solve(self, pairs: MotionPairs) -> Solution:
+        """Solve AX = XB.
+
+        Raises
+        ------
+        NotEnoughDataError
+            If there is no pair.
+        """
+        if len(pairs) == 0:
+            raise NotEnoughDataError(
+                "no motion pairs: there are too few common poses for the chosen reference"
+            )
+        solve = _SOLVERS[self.name]
+        if self.backend == "ipopt":
+            from hand_eye_calib.core.solvers import ipopt  # takes a second
+
+            solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
+        if METHODS[self.name].rejects_outliers:
+            return solve(pairs, self.threshold, self.min_inlier_fraction)
+        return solve(pairs)
+
+    def proved_global(self, pairs: MotionPairs, solution: Solution) -> str:
+        """Whether a solution is proved to be the global minimum over the pairs it counts: "yes",
+        "no", or "not tried" for methods that have no proof.
+        """
+        if self.name not in ("dnl", "dnlo"):
+            return "not tried"
+        Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
+        return "yes" if certificate.is_global(Q, solution.T_parent_child) else "no"
+
+    def solve_without(
+        self, pairs: MotionPairs, solution: Solution, left_out: BoolArray
+    ) -> FloatArray:
+        """Answers (B, 4, 4) near a solution for all K pairs, without those in each row of
+        ``left_out`` (B, K), for resampling.
+        """
+        if self.name == "dnlo":  # the search is quicker from a solution than from nothing
+            rejection = self.threshold, self.min_inlier_fraction
+            return dnlo.solve_without(pairs, solution, left_out, *rejection)
+        return np.stack([self.solve(pairs[~row]).T_parent_child for row in left_out])

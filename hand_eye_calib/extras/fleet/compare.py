@@ -1,0 +1,67 @@
+"""``compare RESULT...``: has the mount moved, or which recording shows that it has?"""
+
+import argparse
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.text import amount, told_apart
+from hand_eye_calib.offline.cli.options import add_json_argument, print_result, waiting_for
+
+if TYPE_CHECKING:
+    from hand_eye_calib.core.results.calibration import Calibration
+    from hand_eye_calib.core.results.context import Comparison
+
+_EPILOG = """\
+examples:
+  hand_eye_calib compare result --with robot.urdf
+  hand_eye_calib compare result --with "0.40 0 1.85 0 0 -90deg"
+  hand_eye_calib compare monday/ tuesday/ wednesday/     which one has moved?
+
+exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] RESULT ..."
+    parser.epilog = _EPILOG
+    results = "extrinsic.yaml, or the directory that holds it; without --with two or more"
+    parser.add_argument("results", metavar="RESULT", nargs="+", help=results)
+    installed = (
+        "what is installed: a URDF, an earlier extrinsic.yaml, a file of another program (as of "
+        'info --as), a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
+    )
+    parser.add_argument("--with", dest="installed", metavar="SOURCE", help=installed)
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compare; returns the exit code."""
+    from hand_eye_calib.core.assessment.comparison import compare
+    from hand_eye_calib.formats.results import load_result
+
+    results = [load_result(path) for path in arguments.results]
+    for path, result in zip(arguments.results, results, strict=True):
+        if result.status.failure:
+            raise InputError(f"{path}: {result.status.failure}; there is nothing to compare")
+    installed = None
+    if arguments.installed:
+        from hand_eye_calib.formats.installed import open_installed
+
+        frames = results[0].parent_frame, results[0].child_frame
+        with waiting_for(f"reading {arguments.installed}"):
+            installed = open_installed(arguments.installed)(*frames)
+    found = compare(results, installed, told_apart(arguments.results))
+    print_result(_lines(found, results[0]), found if arguments.json else None)
+    return {"same": 0, "moved": 4}.get(found.verdict, 3)
+
+
+def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
+    yield f"Mount of {result.child_frame} on {result.parent_frame}: {found.sentence}"
+    for each in found.differences:
+        sentence = "" if len(found.differences) == 1 else each.sentence
+        yield f"{each.second} minus {each.first}: {sentence}".rstrip(": ")
+        yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
+        for axis, row in each.axes.items():
+            sizes = [amount(axis, size) for size in (row.difference, row.sigma, row.visible)]
+            yield f"  {axis:<6}{sizes[0]:>12}{sizes[1]:>10}{sizes[2]:>12}  {row.verdict}"

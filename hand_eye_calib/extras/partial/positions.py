@@ -1,0 +1,432 @@
+"""The lever arm of a sensor that measures only positions: a GNSS antenna, the prism of a total
+station.
+
+The sensor's orientation is that of the other one, as that is known from its own odometry, in the
+world of the positions: a latent rotation of each pose that may be anything, but changes from pose
+to pose as the odometry says, up to its drift. So this is the state space of the adaptive estimator
+(:mod:`~hand_eye_calib.core.noise.state_space`) with a white rotation error without bounds; the
+rotations are updated from what the positions say of them, until they stay. The sensor's frame has
+the axes of the other one by convention: ``X = (I, l)``. The search starts where windows of the
+recording, each aligned by itself, fit best.
+
+Errors that act like a lever arm are parameters beside it, known beforehand to what sensors have: a
+scale and a direction of the odometry's path, and a time offset. What the positions answer to
+acceleration is in the covariance alone: on recorded drones even its sign depends on the frequency.
+A drone tilts to accelerate, so that positions which answer by kappa (s^2), as smoothed ones do,
+move the vertical lever arm by kappa g.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.stats import robust_weights
+from hand_eye_calib.core.base.text import angle, length
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.noise import increments, reml
+from hand_eye_calib.core.noise.estimator import ModelSolution
+from hand_eye_calib.core.noise.noise_model import (
+    N_FAST,
+    ROTATION,
+    ROTATIONS,
+    TRANSLATION,
+    TRANSLATIONS,
+    WALK_ROTATION,
+    WALK_TRANSLATION,
+    NoiseModel,
+)
+from hand_eye_calib.core.noise.normal import NormalEquations
+from hand_eye_calib.core.noise.outliers import Outliers, bridged, innovations, judged
+from hand_eye_calib.core.noise.stages import known_products, rough_levels, sample
+from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
+from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.results.records import Noise
+
+# A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
+# acceleration (s^2). It is not solved with those in the model.
+RESPONSE = increments.N_SYSTEMATIC
+_SHARED = [increments.SCALE, *increments.BIAS, increments.TIME]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeverArmSolution(ModelSolution):
+    """A lever arm and what it rests on.
+
+    Attributes
+    ----------
+    lever_arm : (3,) array
+        m, in the axes of the sensor with poses.
+    covariance : (3, 3) array
+        Under the model, misfit accounted for.
+    response : (float, float)
+        What positions less odometry are per m/s^2 of acceleration, s^2, and its sigma.
+    worse : (N,) bool array
+        Positions that are left out, for those around are far less precise than the best.
+    """
+
+    lever_arm: FloatArray
+    covariance: FloatArray
+    response: tuple[float, float]
+    worse: BoolArray
+
+    def describe(self, stamps_ns: IntArray) -> Noise:
+        """The noise in plain values and in words, as of an AdaptiveSolution."""
+        sigmas = np.exp(0.5 * self.levels)
+        white, walk = (float(sigmas[level]) for level in (TRANSLATION, WALK_TRANSLATION))
+        turned = float(sigmas[WALK_ROTATION])
+        said = [
+            f"each position is off by {length(white)} per axis, and the odometry drifts by "
+            f"{length(walk)} and {angle(turned)} from one to the next"
+        ]
+        if self.worse.any():
+            share = f"{self.worse.mean():.0%} of the positions"
+            said.append(f"{share} are far less precise, and are left out")
+        response, sigma = 1e3 * np.array(self.response)
+        if abs(response) > TUNING.plain * sigma:
+            said.append(
+                f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
+                "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
+            )
+        said += self.events(stamps_ns)
+        return Noise(
+            translation_white_m=white,
+            translation_drift_m_per_pose=walk,
+            rotation_drift_rad_per_pose=turned,
+            misfit=self.misfit,
+            in_words=tuple(said),
+        )
+
+
+def solve(
+    stamps_ns: IntArray, Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool = False
+) -> LeverArmSolution:
+    """Estimate the lever arm of a sensor that measures positions.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    Ts_pw_p : (N, 4, 4) array
+        Poses of the other sensor in its world.
+    positions : (N, 3) array
+        At the same stamps, in a world of their own.
+    with_scale : bool
+        Whether to estimate the scale between both worlds.
+    """
+    lever_arm, scale, rotations = _start(Ts_pw_p, positions, with_scale)
+    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
+    Ts = se3.from_rotation_translation(rotations, scale * positions)
+    state = _State.first(increments.Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
+    for number in range(TUNING.rounds):
+        if number in TUNING.fits:
+            state = state.fitted(("body", "world") if number == TUNING.fits[0] else ())
+        posterior = Posterior(state.space(), state.levels)
+        if number + 1 in TUNING.fits[1:]:
+            state = state.with_outliers(posterior)
+        normal = NormalEquations(_solved(posterior.products))
+        step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
+        is_small = np.abs(step[:3]) < TUNING.settled_sigmas * sigmas
+        is_settled = bool((is_small | (sigmas > TUNING.unknown_m)).all())
+        converged = number > TUNING.fits[-1] and is_settled
+        if converged:
+            break
+        state = state.moved(posterior, step)
+    return _solution(state, posterior, converged, scale)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _State:
+    """Where the search stands. The child's poses are its ``positions`` (N, 3), bridged where they
+    are left out, with the orientations known so far. ``X`` is (I, l). ``parameters`` are (9,); the
+    lever arm and those that are asked for are known to ``sigmas`` (9,) beforehand. ``boost`` (n,)
+    are factors of the walk's variance, above 1 at jumps; those around positions that are ``worse``
+    (N,) are far less precise than the best.
+    """
+
+    positions: FloatArray
+    streams: increments.Streams
+    X: FloatArray
+    sigmas: FloatArray
+    parameters: FloatArray
+    model: NoiseModel
+    levels: FloatArray
+    outliers: Outliers
+    boost: FloatArray
+    worse: BoolArray
+
+    @classmethod
+    def first(cls, streams: increments.Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
+        """Where it begins."""
+        stamps_s, n, sigmas = streams.stamps_s, len(streams) - 1, np.array(TUNING.of_positions)
+        sigmas[3] = TUNING.any_scale if with_scale else sigmas[3]
+        interval_s, duration_s = float(np.median(np.diff(stamps_s))), float(stamps_s[-1])
+        state = cls(
+            positions=streams.Ts_cw_c[:, :3, 3],
+            streams=streams,
+            X=se3.from_rotation_translation(np.eye(3), lever_arm),
+            sigmas=sigmas,
+            parameters=np.zeros(RESPONSE + 1),
+            model=NoiseModel((), "sensors", interval_s, duration_s),
+            levels=np.zeros(0),
+            outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
+            boost=np.ones(n),
+            worse=np.zeros(n + 1, dtype=bool),
+        )
+        residuals = state.linearised().columns[:, :, -1]
+        squares = (residuals[:, :3] ** 2).sum(axis=1)
+        around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
+        worse = _worse(np.concatenate(around))
+        levels = rough_levels(residuals, worse[1:] | worse[:-1])
+        levels[ROTATION], levels[WALK_ROTATION] = TUNING.any_rotation, TUNING.rotation_walk[1]
+        streams = bridged(streams, state.X, worse)
+        return replace(state, streams=streams, levels=levels, worse=worse)
+
+    @property
+    def left_out(self) -> BoolArray:
+        """(N,) which positions are no evidence."""
+        return self.outliers.spikes | self.worse
+
+    @property
+    def course(self) -> increments.Course:
+        """Of the sensor with poses, at the lever arm: free of the noise of the positions, but in
+        their world.
+        """
+        streams = self.streams
+        course = increments.course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
+        back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
+        worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
+        return replace(
+            course,
+            path=increments.summed(se3.times(worlds, np.diff(course.path, axis=0))),
+            along=increments.summed(worlds @ np.diff(course.along, axis=0)),
+        )
+
+    def linearised(self) -> increments.Linearisation:
+        """Increments between poses, with the columns of the lever arm and of the parameters."""
+        course, moving = self.course, _accelerations(self.streams, self.X)
+        found = increments.linearise(
+            self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED
+        )
+        answering = se3.times(found.adjoints, moving[:-1]) - moving[1:]
+        columns = np.insert(found.columns, -1, answering, axis=2)
+        return replace(found, columns=np.delete(columns, [3, 4, 5], axis=2))
+
+    def space(self, model: NoiseModel | None = None) -> StateSpace:
+        """State space of all poses: without a rotation to estimate, with orientations that may be
+        anything, and with a walk that is the odometry's.
+        """
+        values = np.r_[self.X[:3, 3], self.parameters[[*_SHARED, RESPONSE]]]
+        known = known_products(range(len(values)), values, self.sigmas**-2.0, len(values) + 1)
+        space = (model or self.model).state_space(
+            self.streams,
+            self.linearised(),
+            self.course.twists,
+            self.X,
+            np.where(self.left_out, 0.0, 1.0),
+            np.zeros(len(self.boost), dtype=bool),
+            known,
+        )
+        to_child = se3.adjoint(se3.inverse(self.X))
+        return replace(
+            space,
+            relative=space.relative * self.boost,
+            white=(TRANSLATIONS[None], ROTATIONS[None]),
+            walk=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
+        )
+
+    def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
+        """State space of as many poses as noise levels need."""
+        kept = sample(len(self.streams), TUNING.most_poses)
+        if kept is None:
+            return self.space(model)
+        jumps = self.outliers.across(kept).jumps
+        return replace(
+            self,
+            streams=self.streams[kept],
+            outliers=Outliers(jumps, self.outliers.spikes[kept]),
+            boost=np.where(jumps, self.boost.max(), 1.0),
+            worse=self.worse[kept],
+        ).space(model)
+
+    def fitted(self, kinds: tuple[str, ...] = ()) -> _State:
+        """With noise levels fitted, and with an error of the positions that lasts, of one of these
+        kinds, if the data ask for it.
+        """
+        fit, _ = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
+        best, loss = replace(self, levels=fit.levels), fit.loss - TUNING.least_gain
+        for kind in kinds:
+            model, levels = self.model.with_lasting(((kind, "translation"),), fit.levels)
+            rival, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
+            if rival.loss < loss:
+                best, loss = replace(self, model=model, levels=rival.levels), rival.loss
+        return best
+
+    def with_outliers(self, posterior: Posterior) -> _State:
+        """With jumps, which are large steps of the walk, positions wrong by themselves, and
+        positions left out if those around are clearly worse than the rest.
+        """
+        of_walk, of_white = innovations(posterior, self.left_out)
+        found = judged(self.outliers, of_walk, of_white, with_spikes=True)
+        boost = np.where(found.jumps, np.maximum(TUNING.jump_factor * of_walk, self.boost), 1.0)
+        states = posterior.states_after(posterior.normal.step)[:, :3]
+        Ts_cw_c = self.streams.Ts_cw_c.copy()
+        path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], states)
+        spread = posterior.factor.selected_inverse[0][:, range(3), range(3)]
+        drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
+        worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
+        Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
+        streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
+        return replace(self, outliers=found, boost=boost, streams=streams, worse=worse)
+
+    def moved(self, posterior: Posterior, step: FloatArray) -> _State:
+        """After a step, with the orientations that the positions ask for."""
+        turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
+        Ts_cw_c = self.streams.Ts_cw_c.copy()
+        Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
+        X, parameters = self.X.copy(), self.parameters.copy()
+        X[:3, 3] += step[:3]
+        parameters[_SHARED] += step[3:]
+        return replace(
+            self,
+            streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
+            X=X,
+            parameters=parameters,
+        )
+
+
+def _worse(squares: FloatArray, least: float = TUNING.lowest_variance) -> BoolArray:
+    """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
+    those around, and than the least square: the odometry's drift from one position to the next.
+    """
+    window = np.ones(min(TUNING.neighbours, len(squares)))
+    around = np.convolve(squares, window, mode="same")
+    counts = np.convolve(np.ones(len(squares)), window, mode="same")
+    usual = max(float(np.quantile(around / counts, 0.25)), least)
+    return np.asarray(around > TUNING.worse * usual * counts)
+
+
+def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
+    """What is known of log levels beforehand, for a search from these."""
+    prior = model.prior(levels)
+    prior.lower[ROTATION] = prior.upper[ROTATION] = TUNING.any_rotation
+    prior.lower[WALK_ROTATION], prior.upper[WALK_ROTATION] = TUNING.rotation_walk[::2]
+    return prior
+
+
+def _solution(
+    state: _State, posterior: Posterior, converged: bool, first_scale: float
+) -> LeverArmSolution:
+    normal = NormalEquations(_solved(posterior.products))
+    n_evidence = len(state.boost) - int(state.left_out.sum())
+    misfit = float(normal.cost) / max(3 * n_evidence - 3 - len(_SHARED), 1)
+    # With the answer to acceleration, and by what it would move the lever arm.
+    whole = posterior.normal
+    covariance, shift = max(misfit, 1.0) * whole.covariance, (whole.step[:-1] - normal.step)[:3]
+    sigmas, parameters = np.zeros(RESPONSE + 1), state.parameters.copy()
+    sigmas[[*_SHARED, RESPONSE]] = np.sqrt(np.diag(covariance)[3:])
+    parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], whole.step[-1]]
+    # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
+    lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
+    return LeverArmSolution(
+        lever_arm=state.X[:3, 3] + normal.step[:3],
+        covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
+        response=(float(-parameters[RESPONSE]), float(sigmas[RESPONSE])),
+        parameters=parameters,
+        parameter_sigmas=sigmas,
+        scale=first_scale * (1.0 + float(parameters[increments.SCALE])),
+        scale_sigma=first_scale * float(sigmas[increments.SCALE]),
+        time_offset_s=-float(parameters[increments.TIME]),
+        time_offset_sigma_s=float(sigmas[increments.TIME]),
+        model=state.model,
+        levels=state.levels,
+        worse=state.worse,
+        jumps=state.outliers.jumps,
+        spikes=state.outliers.spikes,
+        part_products=_solved(posterior.part_products()),
+        misfit=misfit,
+        objective=0.5 * (posterior.log_determinant + float(normal.cost)),
+        converged=converged,
+    )
+
+
+def _solved(products: FloatArray) -> FloatArray:
+    """The products (..., 9, 9) of what the lever arm is solved with, and of the residuals."""
+    rows = [*range(3 + len(_SHARED)), products.shape[-1] - 1]
+    return products[..., rows, :][..., rows]
+
+
+def _accelerations(streams: increments.Streams, X: FloatArray) -> FloatArray:
+    """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes, from steps on
+    either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
+    """
+    path, stamps_s = (streams.Ts_pw_p @ X)[:, :3, 3], streams.stamps_s
+    found, interval_s = np.zeros((len(path), 6)), float(np.median(np.diff(stamps_s)))
+    k = max(round(TUNING.accelerating_s / interval_s), 1)
+    if len(path) <= 4 * k:
+        return found
+    velocities = (path[k:] - path[:-k]) / (stamps_s[k:] - stamps_s[:-k])[:, None]
+    spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
+    changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
+    back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
+    is_near = spans_s < TUNING.near * 4 * k * interval_s
+    found[2 * k : -2 * k, :3] = np.where(is_near, se3.times(back, changes), 0.0)
+    return found
+
+
+def _start(
+    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool
+) -> tuple[FloatArray, float, FloatArray]:
+    """The lever arm (3,) and the scale, if it is asked for, that fit windows best, of which bad
+    ones count less; and the rotations (N, 3, 3) of the other sensor in the world of the positions,
+    window by window.
+    """
+    lever_arm, scale = np.zeros(3), 1.0
+    whole = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
+    size = min(TUNING.window, len(positions))
+    axes, path, measured = (_windows(values, size) for values in whole)
+    information = np.einsum("nkij,nkil->njl", axes, axes) + TUNING.drawn * size * np.eye(3)
+    for _ in range(TUNING.start_steps):
+        predicted = axes @ lever_arm + path
+        turns = _rotations(measured, predicted)
+        rotated = measured @ turns
+        if with_scale:
+            shares = (rotated * predicted).sum(axis=(1, 2)) / (rotated**2).sum(axis=(1, 2))
+            scale = float(np.median(shares))
+        residuals = scale * rotated - path
+        errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
+        weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
+        pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
+        before = lever_arm
+        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
+        if np.abs(lever_arm - before).max() < 1e-6:
+            break
+    of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
+    return lever_arm, scale, turns[of_pose] @ Ts_pw_p[:, :3, :3]
+
+
+def unexplained_share(
+    Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray, scale: float
+) -> float:
+    """Share of the path of positions (N, 3) that the poses (N, 4, 4) and a lever arm do not
+    explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
+    """
+    predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
+    size = max(len(positions) // TUNING.path_parts, min(TUNING.path_parts, len(positions)))
+    expected, measured = (_windows(path, size) for path in (predicted, scale * positions))
+    residuals = measured @ _rotations(measured, expected) - expected
+    left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))
+    return float(np.sqrt(np.median(left) / np.median(whole))) if np.median(whole) else 1.0
+
+
+def _windows(values: FloatArray, size: int) -> FloatArray:
+    """Values (N, ...) of windows of a size, (n, size, ...), each less its mean."""
+    whole = len(values) // size * size
+    windows = values[:whole].reshape(-1, size, *values.shape[1:])
+    return windows - windows.mean(axis=1, keepdims=True)
+
+
+def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of windows, centred."""
+    return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))

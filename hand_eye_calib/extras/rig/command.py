@@ -1,0 +1,99 @@
+"""A rig of three sensors or more: calibrated, printed and saved."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.results.document import transforms_of
+from hand_eye_calib.offline.cli.options import (
+    fail,
+    note,
+    options_from,
+    print_result,
+    refuse_stamps,
+    waiting_for,
+)
+from hand_eye_calib.offline.cli.present import (
+    allowance_lines,
+    exit_code,
+    transform_lines,
+    verdict_lines,
+    wrapped,
+)
+from hand_eye_calib.offline.cli.reading import read_files
+
+if TYPE_CHECKING:
+    from hand_eye_calib.core.base.plain import Document
+    from hand_eye_calib.extras.rig.rig import RigCalibration
+    from hand_eye_calib.formats.remote import AsGiven
+
+
+def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+    """Calibrate a rig from a trajectory file of each sensor, or from topics of bags, print it and
+    save it if ``--out`` asks for that; returns the exit code.
+
+    ``as_given`` puts the name of a remote bag back into plain values.
+    """
+    from hand_eye_calib.extras.rig import rig as of_rig
+    from hand_eye_calib.formats.results import fingerprint, save_rig
+
+    if arguments.installed or arguments.base_frame:
+        raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
+    if topics := arguments.topics:
+        from hand_eye_calib.formats.bags.reader import PoseBag
+        from hand_eye_calib.formats.bags.sources import source_of
+        from hand_eye_calib.offline.cli.bags import read_sources, refuse_recordings
+
+        names, sources = topics, [*map(source_of, topics)]
+        refuse_recordings(arguments.paths, sources)
+        with PoseBag(*arguments.paths) as bag:
+            stamps = arguments.stamps or "header"
+            readings = [(source, "auto", stamps) for source in sources]
+            trajectories, notes = read_sources(bag, readings)
+            inputs: Document = {"bag": str(bag), "topics": topics}
+            if arguments.out:
+                inputs["files"] = [fingerprint(file) for file in bag.files]
+    else:
+        refuse_stamps(arguments)
+        names = [*map(str, arguments.paths)]
+        trajectories, repairs, doubts = read_files(arguments, arguments.paths, {})
+        notes = [*repairs, *doubts]
+        inputs = {"files": names}
+    note(*notes)
+    frames = [each.sensor_frame or name for each, name in zip(trajectories, names, strict=True)]
+    if twice := [each for each in frames if frames.count(each) > 1]:
+        raise ConfigError(
+            f"two trajectories of the rig are of one sensor, {twice[0]!r}: sensors have the names "
+            "of their frames or files, which must differ"
+        )
+    sensors = dict(zip(frames, trajectories, strict=True))
+    inputs = as_given(inputs) | {"options": options_from(arguments)}
+    with waiting_for(f"solving for {len(sensors)} sensors"):
+        rig = of_rig.calibrate_rig(sensors, inputs["options"])
+    if arguments.out:
+        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
+    try:
+        print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
+    finally:  # even if the reader of what is printed has gone
+        if arguments.out:
+            from hand_eye_calib.extras.rig.page import write_rig_report
+
+            write_rig_report(arguments.out, rig, names)
+    failed = [each for each in rig.calibrations if each.status.failure]
+    for each in failed:
+        fail(f"{each.child_frame}: {each.headline}", 1)
+    return 1 if failed else max(map(exit_code, rig.calibrations))
+
+
+def as_lines(rig: "RigCalibration") -> list[str]:
+    """What a person needs to see of a rig: extrinsics, closure."""
+    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", ""]
+    for each in rig.calibrations:
+        first, *others = verdict_lines(each)
+        lines += [f"{each.child_frame} in {each.parent_frame}: {first}", *others]
+        lines += transform_lines(transforms_of(each)["T_parent_child"])
+        lines += [*allowance_lines(each), ""]
+    lines += ["Results for two sensors at a time"]
+    for one in rig.closures:
+        lines += wrapped(one.sentence, "  ", "    ")
+    return lines

@@ -1,0 +1,66 @@
+"""The report of a rig: where its sensors are, and whether results for two at a time close."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hand_eye_calib.core.engine.session_result import SessionResult
+from hand_eye_calib.core.results.document import printed_numbers, transforms_of
+from hand_eye_calib.extras.rig.rig import RigCalibration, calibrate_rig
+from hand_eye_calib.formats.results import save_rig
+from hand_eye_calib.offline.cli.reporting import write_page
+from hand_eye_calib.offline.report.figures import figure_of_views
+from hand_eye_calib.offline.report.report import TONES, page
+
+# Frame of a child sensor that names none: in a rig it has the name of its input.
+_NAMELESS = "child_sensor"
+
+
+def write_rig_report(directory: Path, rig: RigCalibration, names: Sequence[str]) -> None:
+    """Write the report of a rig, whose sensors have these files, topics or frames."""
+    write_page(directory, lambda: render_rig(rig, names))
+
+
+def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
+    """The report of a rig as HTML: where its sensors are, and whether results for two sensors at a
+    time close; ``inputs`` are where the trajectories came from.
+    """
+    return page(
+        "rig.html",
+        TONES[rig.verdict.value],
+        rig.verdict.value,
+        "",
+        rig=rig,
+        inputs=inputs,
+        poses=[
+            printed_numbers(transforms_of(each)["T_parent_child"], (), "±")
+            for each in rig.calibrations
+        ],
+        figures=[figure_of_views(rig.calibrations)],
+    )
+
+
+def write_session_rig(directory: Path, session: SessionResult) -> None:
+    """Solve for all sensors of a session together, and write the files and the page.
+
+    A time offset and a scale in numbers are the child's, which has them; the others have none.
+    """
+
+    config, (parent, child) = session.snapshot.config, session.snapshot.streams
+    of_all = ["method", "max_gap", "target.translation", "target.rotation"]
+    if isinstance(config.time_offset, str):
+        of_all.append("time_offset")
+    else:
+        child = child.shifted(config.time_offset)
+    if isinstance(config.scale, str):
+        of_all.append("scale")
+    else:
+        child = child.scaled(config.scale)
+    sensors = {session.snapshot.parent_frame: parent, session.snapshot.child_frame: child}
+    for name, other in session.others.items():
+        frame = other.child_frame
+        sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]
+    options = config.to_options()
+    rig = calibrate_rig(sensors, {name: options[name] for name in of_all})
+    inputs = {**session.inputs, "sensors": list(rig.sensors)}
+    save_rig(rig.to_dict(), rig.calibrations, directory / "rig", inputs)
+    write_rig_report(directory / "rig", rig, rig.sensors)

@@ -1,0 +1,79 @@
+"""Images of a target in a bag: the poses of the camera that took them."""
+
+from pathlib import PurePosixPath
+
+from hand_eye_calib.core.base.errors import InputError, located, printable
+from hand_eye_calib.core.base.text import frame_name
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.sensors.target_images import (
+    Camera,
+    Target,
+    TargetFinder,
+    camera_of,
+    grey_of,
+    read_camera,
+)
+from hand_eye_calib.formats.bags import messages
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.sources import Reading
+
+
+def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReading":
+    """Reading of images of a target, with the intrinsics of a file or of the camera_info beside.
+
+    Parameters
+    ----------
+    bag : PoseBag
+    stream : str
+        "parent" or "child".
+    topic : str
+    text : str
+        The target, and the file of the intrinsics after ``@`` if there is one.
+
+    Raises
+    ------
+    InputError
+        If the messages are no images, or no intrinsics are found.
+    """
+    name, _, file = text.partition("@")
+    target = Target.parse(name)
+    type_ = bag.type_of(topic)
+    if type_ not in messages.IMAGE_TYPES:
+        raise InputError(f"{topic} is of type {type_}, which has no images of a target")
+    if file:
+        return ImageReading(stream, topic, target, read_camera(file))
+    beside = (str(folder / "camera_info") for folder in PurePosixPath(topic).parents)
+    info = next((each for each in beside if each in bag.topics), "")
+    run = next(bag.runs([info]), None)
+    if run is None:
+        raise InputError(
+            f"no camera_info beside {topic} in {bag}; name a file of the intrinsics: with "
+            f"--camera, or {topic}?{name}@FILE"
+        )
+    camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
+    return ImageReading(stream, topic, target, camera)
+
+
+class ImageReading(Reading):
+    """Images of a target: the poses of the camera in the frame of the target."""
+
+    def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
+        super().__init__(stream, topic)
+        self._finder, self._frame = TargetFinder(target, camera), ""
+        self._stamps_ns, self._bag_ns = list[int](), list[int]()
+
+    def take(self, run: messages.Run) -> None:
+        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
+            with located(self.topics[0]):
+                is_seen = self._finder.look(grey_of(message))
+            if is_seen:
+                self._stamps_ns.append(messages.ns_of(message.header.stamp) or 0)
+                self._bag_ns.append(bag_ns)
+                self._frame = printable(frame_name(message.header.frame_id))
+
+    def table(self) -> messages.PoseTable:
+        found = self._finder.found()
+        self.notes.append(f"{self.topics[0]}: {found}")
+        poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
+        table = messages.PoseTable.of(self._stamps_ns, poses, "target", self._frame)
+        return self._stamped(table.recorded(self.stream, self._bag_ns))

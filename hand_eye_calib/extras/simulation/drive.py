@@ -1,0 +1,253 @@
+"""A ground vehicle with two sensors drives over hills, and the errors of odometry and SLAM in their
+trajectories (Välimäki et al. 2023, section 4.1).
+
+If the article's text and its published trajectories differ, this follows the trajectories: the
+value called sigma^2 is a standard deviation, jumps last until the end, drift affects the child
+sensor only.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory, WithArrays
+from hand_eye_calib.extras.simulation import options
+
+# Start of the published drives, heading along x; in units of the surface's arguments.
+_START = np.array([0.0, 0.5])
+
+# Time from their start to the first pose (s), and time for which their first yaw rate is held.
+_LEAD_S, _FIRST_HOLD_S = 0.1, 0.4
+
+# Largest offset of the child sensor along each axis of the parent (m), and variance of a jump per
+# axis (m^2).
+_LARGEST_OFFSET_M, _JUMP_VARIANCE = 0.5, 0.02
+
+_NO_NOISE = options.NoiseConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedDrive(WithArrays):
+    """Trajectories as both sensors report them, and the truth.
+
+    Attributes
+    ----------
+    parent, child : Trajectory
+        With noise, each sensor in its own world.
+    T_parent_child : (4, 4) array
+        The extrinsic.
+    T_pw_cw : (4, 4) array
+        Pose of the child's world in the parent's world.
+    """
+
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: FloatArray
+    T_pw_cw: FloatArray
+
+
+def simulate(
+    seed: int = 0,
+    *,
+    drive: Literal["hilly", "published"] = "hilly",
+    poses: int = 600,
+    gaussian: float = options.REALISTIC.gaussian,
+    outliers: float = options.REALISTIC.outliers,
+    drift: float = options.REALISTIC.drift,
+) -> SimulatedDrive:
+    """Simulate two sensors on one vehicle with a known extrinsic.
+
+    Parameters
+    ----------
+    seed : int
+        The same seed gives the same drive. Default: 0.
+    drive : {"hilly", "published"}
+        A robot outdoors at 1.5 m/s, sensors at 10 and 20 Hz without common stamps (default), or
+        the drive of the article: 0.5 m/s, 10 Hz, equal stamps.
+    poses : int
+        Poses of the parent sensor. Default: 600, a minute.
+    gaussian : float
+        Standard deviation of each pose's translation error per axis. Default: 0.002 m.
+    outliers : float
+        Share of the poses at which a trajectory jumps. Default: 0.005.
+    drift : float
+        Drift of the child per metre, m/m. Default: 0.002.
+
+    Returns
+    -------
+    SimulatedDrive
+        With ``parent``, ``child`` and ``T_parent_child``.
+
+    Examples
+    --------
+    >>> drive = hec.simulate(3, poses=100)
+    >>> drive.parent
+    Trajectory(100 poses over 9.900 s, sensor_frame='lidar', world_frame='lidar_odom')
+    """
+    config = options.HILLY_DRIVE if drive == "hilly" else options.PUBLISHED_DRIVE
+    config = replace(config, poses=poses, parent_frame="lidar", child_frame="camera")
+    noise = replace(options.REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift)
+    return simulate_drive(seed, config, noise)
+
+
+def simulate_drive(
+    seed: int | Sequence[int],
+    config: options.DriveConfig = options.PUBLISHED_DRIVE,
+    noise: options.NoiseConfig = _NO_NOISE,
+) -> SimulatedDrive:
+    """Simulate one drive: of one seed the same, with any noise, and with the same noise."""
+    motion_rng, extrinsic_rng, noise_rng = np.random.default_rng(seed).spawn(3)
+    n_child = max(2, round(config.poses * config.child_rate / config.parent_rate))
+    parent_times_s = np.arange(config.poses) / config.parent_rate
+    child_times_s = config.child_delay + np.arange(n_child) / config.child_rate
+    track = _ground_track(config, motion_rng, _LEAD_S + np.r_[parent_times_s, child_times_s])
+    Ts_pw_p, Ts_pw_p_at_child = np.split(_poses_on_terrain(config, *track), [config.poses])
+    rotation = se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))[:3, :3]
+    offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
+    T_parent_child = se3.from_rotation_translation(rotation, offset)
+    # Euler angles (rad) and translation (m) are differences of two uniform numbers from 0 to 1.
+    angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
+    T_pw_cw = se3.from_rotation_translation(se3.rotation_from_rpy(angles[::-1]), translation)
+    Ts_pw_p, Ts_cw_c = add_noise(
+        Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng
+    )
+    start_ns = round(config.start_time * 1e9)
+    parent, child = (
+        Trajectory(start_ns + np.round(times_s * 1e9).astype(np.int64), Ts, frame, f"{frame}_odom")
+        for times_s, Ts, frame in (
+            (parent_times_s, Ts_pw_p, config.parent_frame),
+            (child_times_s, Ts_cw_c, config.child_frame),
+        )
+    )
+    return SimulatedDrive(parent, child, T_parent_child, T_pw_cw)
+
+
+def _ground_track(
+    config: options.DriveConfig, rng: np.random.Generator, times_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time since the start;
+    each yaw rate lasts for its hold time.
+    """
+    holds = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
+    holds[0] = _FIRST_HOLD_S
+    yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds))
+    starts = np.cumsum(holds) - holds
+    headings = np.cumsum(yaw_rates * holds) - yaw_rates * holds
+    arcs = _arc(config.speed, headings, yaw_rates, holds)
+    corners = _START * config.terrain_scale + (np.cumsum(arcs, axis=0) - arcs)
+    k = np.searchsorted(starts, times_s, side="right") - 1
+    elapsed = times_s - starts[k]
+    positions = corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed)
+    return positions, headings[k] + yaw_rates[k] * elapsed
+
+
+def _arc(
+    speed: float, heading: FloatArray, yaw_rate: FloatArray, duration: FloatArray
+) -> FloatArray:
+    """Displacements (N, 2) along arcs; the chord has the mean of the headings at both ends."""
+    half_turn = 0.5 * yaw_rate * duration
+    chord = speed * duration * np.sinc(half_turn / np.pi)
+    return np.stack(
+        [chord * np.cos(heading + half_turn), chord * np.sin(heading + half_turn)], axis=-1
+    )
+
+
+def _poses_on_terrain(
+    config: options.DriveConfig, positions: FloatArray, headings: FloatArray
+) -> FloatArray:
+    """Poses (N, 4, 4) of the vehicle on the ground at positions (N, 2) with headings (N,)."""
+    x, y = positions.T
+    z, slope_x, slope_y = surface(config, x, y)
+    normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    if config.attitude == "published":
+        # From a fit to the noise-free poses (to 0.01 rad, heading exactly): yaw is the heading,
+        # pitch and roll are the arc sines of x and y of the normal, the matrix is transposed.
+        angles = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
+        rotations = np.swapaxes(se3.rotation_from_rpy(angles[:, ::-1]), -1, -2)
+    else:  # z along the normal, x in the vertical plane of the heading
+        ahead = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
+        left = np.cross(normals, ahead)
+        left /= np.linalg.norm(left, axis=-1, keepdims=True)
+        rotations = np.stack([np.cross(left, normals), left, normals], axis=-1)
+    return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
+
+
+def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
+    """Height (N,) of the ground, m, and its slopes (N,) along x and y, at places (N,), m.
+
+    Its height and scale are metres per unit of :func:`_peaks` and of its arguments; arguments
+    beyond +/- its limit are mirrored back, so that a long drive stays on the hills.
+    """
+    height, scale, limit = config.terrain_height, config.terrain_scale, config.terrain_limit
+    (u, sign_u), (v, sign_v) = _mirrored(x / scale, limit), _mirrored(y / scale, limit)
+    peaks, along_u, along_v = _peaks(u, v)
+    slope = height / scale
+    return height * peaks, slope * sign_u * along_u, slope * sign_v * along_v
+
+
+def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Height of three hills and three hollows around the origin, flat beyond about 3.5, and its
+    derivatives by x and y; arrays of one shape, no unit.
+    """
+    hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
+    middle, polynomial = 10.0 * np.exp(-(x**2) - y**2), x / 5.0 - x**3 - y**5
+    hollow = np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
+    total = (1.0 - x) ** 2 * hill - polynomial * middle - hollow
+    along_x = -2.0 * (1.0 - x) * (1.0 + x * (1.0 - x)) * hill
+    along_x += (2.0 * x * polynomial - 0.2 + 3.0 * x**2) * middle + 2.0 * (x + 1.0) * hollow
+    along_y = -2.0 * (y + 1.0) * (1.0 - x) ** 2 * hill
+    along_y += (2.0 * y * polynomial + 5.0 * y**4) * middle + 2.0 * y * hollow
+    return total, along_x, along_y
+
+
+def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
+    """Triangle wave, equal to its argument within +/- limit, and its slope."""
+    phase = np.mod(values + limit, 4.0 * limit)
+    falling = phase > 2.0 * limit
+    return np.where(falling, 3.0 * limit - phase, phase - limit), np.where(falling, -1.0, 1.0)
+
+
+def add_noise(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """The trajectories (N, 4, 4) and (M, 4, 4) of both sensors with Gaussian noise, then drift
+    (child only), then jumps. Each kind of noise draws from a stream of its own: a change of one
+    does not change the others.
+    """
+    gaussian, drift, jumps = rng.spawn(3)
+    Ts_pw_p, Ts_cw_c = (_with_gaussian(Ts, noise, gaussian) for Ts in (Ts_pw_p, Ts_cw_c))
+    # So many metres per metre of each step are added to it, along one axis of the sensor.
+    axis = drift.integers(3)
+    lengths = np.linalg.norm(np.diff(Ts_cw_c[:, :3, 3], axis=0), axis=1)
+    steps = noise.drift * lengths[:, None] * Ts_cw_c[:-1, :3, axis]
+    Ts_cw_c[1:, :3, 3] += np.cumsum(steps, axis=0)
+    return _with_jumps(Ts_pw_p, noise.outliers, jumps), _with_jumps(Ts_cw_c, noise.outliers, jumps)
+
+
+def _with_gaussian(
+    Ts_world_sensor: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
+) -> FloatArray:
+    """Poses (N, 4, 4) with an independent error each, in the frame of the sensor."""
+    shape = len(Ts_world_sensor), 3
+    angles = noise.gaussian * noise.rotation_per_metre * rng.standard_normal(shape)
+    rotations = se3.rotation_from_rpy(angles[:, ::-1])
+    translation = noise.gaussian * rng.standard_normal(shape)
+    return Ts_world_sensor @ se3.from_rotation_translation(rotations, translation)
+
+
+def _with_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
+    """Poses (N, 4, 4) whose rest is shifted along the axes of the world at ``round(share * N)`` of
+    them, drawn with replacement.
+    """
+    count = len(Ts_world_sensor)
+    indices = rng.integers(count, size=round(share * count))
+    shifts = np.zeros((count, 3))
+    np.add.at(shifts, indices, np.sqrt(_JUMP_VARIANCE) * rng.standard_normal((len(indices), 3)))
+    jumped = Ts_world_sensor.copy()
+    jumped[:, :3, 3] += np.cumsum(shifts, axis=0)
+    return jumped

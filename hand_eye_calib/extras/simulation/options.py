@@ -1,0 +1,90 @@
+"""Options of simulated drives and their noise (Välimäki et al. 2023, section 4.1)."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveConfig:
+    """Vehicle, terrain and sensors; all defaults but the attitude are those of the published
+    trajectories.
+
+    Attributes
+    ----------
+    poses : int
+        Of the parent sensor.
+    parent_rate, child_rate : float
+        Poses per second, Hz.
+    child_delay, start_time : float
+        From the first pose of the parent to the first of the child; stamp of the former, s.
+    speed, max_yaw_rate, hold_time : float
+        Horizontal, m/s; yaw rates are drawn within +/- this, rad/s, and held so long, s.
+    terrain_height, terrain_scale, terrain_limit : float
+        Of the surface, see :func:`~hand_eye_calib.extras.simulation.drive.surface`.
+    attitude : {"vehicle", "published"}
+        x ahead and z along the normal of the surface; or the orientations of the published
+        trajectories, which no vehicle has (transposed, slopes not rotated with the heading).
+    """
+
+    poses: int = 100
+    parent_rate: float = 10.0
+    child_rate: float = 10.0
+    child_delay: float = 0.0
+    start_time: float = 0.0
+    speed: float = 0.5
+    max_yaw_rate: float = 2.0
+    hold_time: float = 0.5
+    terrain_height: float = 0.1
+    terrain_scale: float = 1.0
+    terrain_limit: float = 5.0
+    attitude: str = "vehicle"
+    parent_frame: str = "parent"
+    child_frame: str = "child"
+
+
+# Drives of the article, as published.
+PUBLISHED_DRIVE = DriveConfig(attitude="published")
+
+# Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of
+# freedom, sensors at different rates without a common stamp.
+HILLY_DRIVE = DriveConfig(
+    poses=1200,
+    child_rate=20.0,
+    child_delay=0.0137,
+    start_time=1.7e9,
+    speed=1.5,
+    max_yaw_rate=1.0,
+    hold_time=1.5,
+    terrain_height=0.15,
+    terrain_scale=2.5,
+    terrain_limit=3.0,
+)
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Level of each kind of noise; the default is none.
+
+    Attributes
+    ----------
+    gaussian : float
+        Standard deviation of each pose's translation error per axis, m (published: 0 to 0.010).
+    rotation_per_metre : float
+        That of each pose's Euler angles over it, rad/m.
+    outliers : float
+        Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).
+    drift : float
+        Drift of the child sensor along one of its axes, m/m (published: 0 to 0.05).
+    """
+
+    gaussian: float = 0.0
+    rotation_per_metre: float = 2.0
+    outliers: float = 0.0
+    drift: float = 0.0
+
+
+# Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a few SLAM corrections of
+# decimetres.
+REALISTIC = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
+
+# Mixture of the article: the middle of each range.
+MIXTURE = NoiseConfig(gaussian=0.005, outliers=0.05, drift=0.025)

@@ -1,0 +1,23 @@
+"""Files and messages: bags, trajectory files, results, transforms."""
+
+from typing import Any
+
+from hand_eye_calib.core.base.registry import RESULT_METHODS
+
+
+def register() -> None:
+    """Register the methods ``save`` and ``export`` of results."""
+    RESULT_METHODS["save"] = _save
+    RESULT_METHODS["export"] = _export
+
+
+def _save(result: Any, directory: Any) -> Any:
+    from hand_eye_calib.formats.results import save_result
+
+    return save_result(result, directory)
+
+
+def _export(result: Any, format: str) -> str:
+    from hand_eye_calib.formats.exports import export_text
+
+    return export_text(result, format)

@@ -1,0 +1,103 @@
+"""YAML of unknown origin, read within limits.
+
+Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. Values are
+those of JSON: dates are read as text, other tags of YAML are refused, and so are keys that appear
+twice, aliases, and documents that are too large or too deep; all in one line.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.plain import plain
+from hand_eye_calib.core.base.text import shortened
+from hand_eye_calib.formats.files import (
+    DEEPEST_YAML,
+    LARGEST_INT,
+    LARGEST_YAML,
+    LONGEST_NAME,
+    read_text,
+)
+
+# Characters of a whole number: 64 binary digits, with signs between them.
+_LONGEST_INT = 100
+_TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
+
+# libyaml is several times as fast, and part of most builds.
+_Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
+
+
+class _Loader(_Base):
+    """YAML's safe loader for the values of JSON alone."""
+
+    # Without dates, 2024-13-45 is a text like any other.
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+        for first, resolvers in _Base.yaml_implicit_resolvers.items()
+    }
+    yaml_constructors: ClassVar = {
+        tag: construct
+        for tag, construct in _Base.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in _TAGS
+    }
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if (name := str(key.value)) in seen:
+                line = key.start_mark.line + 1
+                raise ValueError(f"the key {name[:40]!r} appears twice, line {line}")
+            seen.add(name)
+        return super().construct_mapping(node, deep)
+
+
+def _whole_number(loader: Any, node: Any) -> int:
+    """Return a whole number, of any base: ``0xff...`` of any length would be one, too."""
+    is_short = len(node.value) <= _LONGEST_INT
+    number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
+    if abs(number) >= LARGEST_INT:
+        raise ValueError(f"a whole number is too large, line {node.start_mark.line + 1}")
+    return number
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
+
+
+def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
+    """Read a YAML file; ``expected`` is what an error says that it should be. An InputError if it
+    cannot be read, is not YAML or exceeds a limit.
+    """
+    text = read_text(path, expected, LARGEST_YAML)
+    # Comments of JSON, header and tag of OpenCV.
+    text = re.sub(r"^%YAML.*|^[ \t]*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
+    try:
+        _check_events(text)
+        return yaml.load(text, Loader=_Loader)
+    # A loader raises nearly anything at values that are not what their tags say.
+    except Exception as error:
+        reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
+        raise InputError(f"{path} is not YAML that can be read: {reason}") from None
+
+
+def yaml_text(document: Any) -> str:
+    """Values of any kind as a YAML file for programs and people."""
+    return str(_dump(plain(document), default_flow_style=None, width=120, allow_unicode=True))
+
+
+def _check_events(text: str) -> None:
+    """Refuse what is too deep, and aliases, before anything is built from it."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST_YAML:
+            raise ValueError(f"it is nested more than {DEEPEST_YAML} levels deep")
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(
+                f"aliases are not read: write out the value of {str(event.anchor)[:40]!r}"
+            )

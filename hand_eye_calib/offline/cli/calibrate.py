@@ -1,0 +1,182 @@
+"""``calibrate PATH ...``: two trajectory files, a bag or the parts of one, or the journal of a
+session; several recordings; the stops of an arm; three sensors or more. ``replay`` is its other
+name, for bags and journals alone.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.registry import ROUTES, SEVERAL_RECORDINGS
+from hand_eye_calib.offline.cli import options
+from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
+
+if TYPE_CHECKING:
+    from hand_eye_calib.core.base.plain import Document
+    from hand_eye_calib.formats.remote import AsGiven
+
+EXAMPLES = """\
+examples:
+  hand_eye_calib calibrate lidar.txt camera.txt --out result
+  hand_eye_calib calibrate my_bag --list
+  hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
+  hand_eye_calib calibrate my_bag --parent-topic odom:lidar --child-topic /vio --out result
+  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
+  hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
+  hand_eye_calib calibrate monday/bag tuesday/bag wednesday/bag --out together
+  hand_eye_calib calibrate --batch 'fleet/**' --vehicle 'fleet/{vehicle}/' --out results
+  hand_eye_calib calibrate samples.yaml --out arm
+  hand_eye_calib calibrate hand.tum images/ --target charuco:5x7:0.04:0.03 --camera camera.yaml
+  hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
+  hand_eye_calib replay live/journal --out result"""
+
+# Of the table of topics.
+_ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] PATH ..."
+    parser.epilog = EXAMPLES
+    parser.set_defaults(parser=parser)
+    options.add_input_arguments(
+        parser,
+        "trajectory files of parent and child, and of more sensors; or a rosbag2 directory, .mcap, "
+        ".db3 or .bag file, or the URL of one, as s3://..., of which several are the parts of one "
+        "recording; or the journal of a node's session, or the output directory that holds it",
+    )
+    add = parser.add_argument
+    listing = "show the bag's topics with types, counts, rates and frames, and exit"
+    add("--list", action="store_true", help=listing)
+    options.add_config_arguments(parser)
+    group = parser.add_argument_group("output")
+    out = (
+        "save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
+        "static_transform.launch.py and report.html"
+    )
+    group.add_argument("--out", metavar="DIR", type=Path, help=out)
+    group.add_argument(
+        "--label",
+        metavar="NAME=VALUE",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=_label,
+        help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
+    )
+    options.add_json_argument(group, or_verbose=True)
+    for route in ROUTES.values():
+        route.add_arguments(parser)
+    _add_installed(parser)
+
+
+@options.argument_type
+def _label(text: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not (name and sign and value):
+        raise ConfigError(f"expected NAME=VALUE, such as vehicle=7; got {text!r}")
+    return name, value
+
+
+def _add_installed(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("what is installed").add_argument
+    installed = (
+        "compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
+        'program, a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
+    )
+    add("--installed", metavar="SOURCE", help=installed)
+    base_frame = (
+        "state the child's pose in this frame too, as the URDF of --installed or the bag's "
+        "/tf_static has it"
+    )
+    add("--base-frame", metavar="FRAME", help=base_frame)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate; returns the exit code."""
+    is_batch = bool(getattr(arguments, "batch", None))
+    if not (arguments.paths or is_batch):
+        print(f"{arguments.parser.format_usage()}\n{EXAMPLES}", file=sys.stderr)
+        return 2
+    if is_batch and (arguments.paths or arguments.list):
+        raise ConfigError("--batch cannot be combined with PATH or --list")
+    if any("*" in str(path) for path in arguments.paths):
+        from hand_eye_calib.formats.bags.patterns import matching
+
+        arguments.paths = [
+            type(path)(found) for path in arguments.paths for found in matching(str(path))
+        ]
+    if not any("://" in str(path) for path in arguments.paths):
+        return _run_here(arguments, lambda value: value)
+    from hand_eye_calib.formats.remote import local_copies
+
+    with local_copies(arguments.paths) as (arguments.paths, as_given):
+        return _run_here(arguments, as_given)
+
+
+def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+    """Calibrate from files here; ``as_given`` puts URLs back into texts. Returns the exit code."""
+    routes = [route for route in ROUTES.values() if route.takes(arguments)]  # or it raises
+    if arguments.list:
+        return _list_topics(arguments, as_given)
+    if routes:
+        return routes[0].run(arguments, as_given)
+    from hand_eye_calib.offline.cli import reading
+    from hand_eye_calib.offline.cli.present import deliver
+
+    paths = arguments.paths
+    are_bags = arguments.command == "replay" or reading.are_bags(paths)
+    given = options.options_from(arguments)
+    if not are_bags:
+        options.refuse_stamps(arguments)
+        recording = reading.read_pair(arguments, given)
+    else:
+        from hand_eye_calib.offline.cli import bags
+
+        try:
+            recording = bags.read_recording(paths, options.sources_from(arguments), given)
+        except bags.SeveralRecordingsError as several:
+            note(f"{several.reason}; they give one result, as recordings of one rig")
+            return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
+    calibration = recording.solved(with_fingerprints=bool(arguments.out))
+    calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
+    bag = paths[0] if are_bags else None
+    return deliver(calibration, as_given(recording.inputs), arguments, recording.snapshot, bag)
+
+
+def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+    """Print the topics of a bag, with the rate in the bag's time, the frames of the first messages,
+    and whether one can be one of the two sensors; returns the exit code.
+    """
+    from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
+    from hand_eye_calib.formats.bags.reader import PoseBag
+
+    with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
+        topics = [
+            {
+                **each._asdict(),
+                "rate_hz": (each.count - 1) / (bag.duration_s or 1.0) if each.count > 1 else None,
+                "frames": bag.edges_on(each.name),
+                "is_usable": each.type in MESSAGE_TYPES,
+            }
+            for each in bag.topics.values()
+        ]
+        document: Document = {"bag": str(bag), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
+        document |= {"duration_s": bag.duration_s, "topics": topics, "warnings": bag.warnings}
+    document = as_given(document)
+    note(*document["warnings"])
+    lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
+    lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
+    for topic in topics:
+        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
+        cells = (topic["name"], topic["type"] or "several types", topic["count"], rate)
+        usable, frames = "yes" * topic["is_usable"], " ".join(topic["frames"])
+        lines.append(_ROW.format(*cells, usable, frames).rstrip())
+    lines.append(
+        "--parent-topic and --child-topic take the topics with poses, or frames of /tf: odom:lidar"
+    )
+    print_result(lines, document if arguments.json else None)
+    return 0

@@ -1,0 +1,36 @@
+"""``info RESULT``: show a saved calibration, or print it as the file of another program."""
+
+import argparse
+
+from hand_eye_calib.core.base.config import EXPORT_FORMATS
+from hand_eye_calib.offline.cli.options import add_json_argument, print_result
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.usage = "%(prog)s [OPTION ...] RESULT"
+    parser.epilog = (
+        "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
+        "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml"
+    )
+    result = "extrinsic.yaml, or the directory that holds it"
+    parser.add_argument("result", metavar="RESULT", help=result)
+    formats = f"print it as the file of another program instead: {', '.join(EXPORT_FORMATS)}"
+    parser.add_argument(
+        "--as", dest="format", choices=EXPORT_FORMATS, metavar="FORMAT", help=formats
+    )
+    add_json_argument(parser, or_verbose=True)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print a saved calibration; returns the exit code, 0 whatever the calibration's status."""
+    from hand_eye_calib.formats.results import load_result
+    from hand_eye_calib.offline.cli.present import as_lines
+
+    calibration = load_result(arguments.result)
+    if arguments.format:
+        print(calibration.export(arguments.format), end="")
+    else:
+        document = calibration.to_dict() if arguments.json else None
+        print_result(as_lines(calibration, (), arguments.verbose), document)
+    return 0

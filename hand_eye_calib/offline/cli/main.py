@@ -1,0 +1,144 @@
+"""``hand_eye_calib COMMAND``: find the command, run it, turn errors into one line and an exit code.
+
+A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. It is imported
+when it is asked for, so that a missing optional package breaks no other command.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, installing
+from hand_eye_calib.core.base.option import did_you_mean
+from hand_eye_calib.core.base.registry import COMMANDS
+from hand_eye_calib.core.base.text import shown_value
+from hand_eye_calib.formats.files import limit_memory
+from hand_eye_calib.offline.cli.options import Exit, as_typed, fail
+
+_EPILOG = """\
+examples:
+  hand_eye_calib calibrate lidar.tum camera.tum  calibrate from two trajectory files
+  hand_eye_calib calibrate my_bag --out result   calibrate from a bag, with report.html
+  hand_eye_calib COMMAND --help                  options and examples of a command
+
+exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
+unobservable or the verdict is DO NOT USE"""
+
+# How the names of ROS 2's packages end.
+_OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; without one, print the help.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Arguments after the program's name; by default those of the process.
+
+    Returns
+    -------
+    int
+        The exit code: 0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is
+        unobservable or the verdict is DO NOT USE; 130 interrupted.
+
+    Raises
+    ------
+    SystemExit
+        From argparse: code 2 for wrong usage, 0 after ``--help``.
+    """
+    return exit_code_of(lambda: _run(sys.argv[1:] if argv is None else argv))
+
+
+def exit_code_of(run: Callable[[], int]) -> int:
+    """What ``run()`` returns; an error that a person can act on becomes one line on stderr and an
+    exit code.
+    """
+    # The matrices are small. Several threads would wait for each other, and take three times as
+    # long if other programs run.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    limit_memory()
+    try:
+        code = run()
+        sys.stdout.flush()
+        return code
+    except HandEyeCalibError as error:
+        return fail(error, Exit.USAGE if isinstance(error, ConfigError) else Exit.FAILED)
+    except ModuleNotFoundError as error:
+        name = error.name or "hand_eye_calib"
+        package = name.partition(".")[0]
+        if package == "hand_eye_calib":
+            raise
+        text = f"this needs the Python package {name!r}, which is not installed; install it"
+        if package.endswith(_OF_ROS):
+            text = (
+                f"this needs ROS 2's Python packages ({name} is missing): source the setup file of "
+                f"a ROS 2 installation, or {installing('ros')}"
+            )
+        return fail(text)
+    except BrokenPipeError:
+        # Keeps the interpreter from complaining when it flushes at exit: the reader has gone.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return Exit.BROKEN_PIPE
+    except OSError as error:
+        if error.filename is None:
+            raise
+        name = shown_value(error.filename)
+        return fail(f"cannot use {name}: {error.strerror}; choose another")
+    except KeyboardInterrupt:
+        return Exit.INTERRUPTED
+
+
+def named_command() -> int:
+    """Entry point of the executables that are called like a command, as in ``ros2 run
+    hand_eye_calib replay BAG``.
+    """
+    return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Parser whose errors are one line on stderr, with exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line on stderr and exit with code 2."""
+        text = as_typed(f"{message} (see {self.prog} --help)")
+        self.exit(Exit.USAGE, f"hand_eye_calib: error: {text}\n")
+
+
+def _run(argv: Sequence[str]) -> int:
+    command = next((word for word in argv if not word.startswith("-")), None)
+    parser = CommandParser(
+        prog="hand_eye_calib",
+        description="Extrinsic calibration of two sensors on one rigid body from their motion.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("--version", action="store_true", help="show the version and exit")
+    if command is not None and command not in COMMANDS:
+        known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
+        parser.error(f"invalid choice: {command!r}, {known}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    added = {name: commands.add_parser(name, help=COMMANDS[name].help) for name in COMMANDS}
+    for one in (parser, *added.values()):
+        one.formatter_class, one.allow_abbrev = argparse.RawDescriptionHelpFormatter, False
+    if command is not None:
+        module = COMMANDS[command].load()
+        added[command].description = COMMANDS[command].help
+        module.add_arguments(added[command])
+    arguments, rest = parser.parse_known_args(argv)
+    if rest and command != "calibrator":
+        word = next((each for each in rest if each.startswith("-")), rest[0]).partition("=")[0]
+        of = added.get(command or "", parser)
+        of.error(f"unknown {word!r}{did_you_mean(word, of._option_string_actions)}")
+    if arguments.version:
+        from hand_eye_calib.core.base.version import version_of
+
+        print(f"hand_eye_calib {version_of()}")
+    elif command is None:
+        parser.print_help()
+    else:
+        arguments.passed_on, arguments.typed = rest, list(argv)
+        return int(module.run(arguments))
+    return 0

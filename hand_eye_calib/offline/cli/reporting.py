@@ -1,0 +1,51 @@
+"""Pages: ``report.html`` of a calibration or of a session of the node."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.engine.session_result import SessionResult
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.formats.results import save_text
+from hand_eye_calib.offline.cli.options import note, waiting_for
+
+if TYPE_CHECKING:
+    from hand_eye_calib.core.engine.snapshot import Snapshot
+
+REPORT = "report.html"
+
+
+def write_report(
+    directory: Path, calibration: Calibration, snapshot: "Snapshot | None", inputs: Document
+) -> None:
+    """Write the report of a result, of the poses and options that gave it, and of where the data
+    came from in plain values.
+    """
+    from hand_eye_calib.offline.report.report import render
+
+    write_page(directory, lambda: render(calibration, snapshot, inputs))
+
+
+def write_page(directory: Path, page: Callable[[], str]) -> None:
+    """Write the page that ``page()`` renders, and print where it is."""
+    with waiting_for(f"writing {REPORT}"):
+        path = save_text(directory / REPORT, page())
+    note(f"wrote {path}")
+
+
+def write_session_report(directory: Path, session: SessionResult) -> None:
+    """Check the streams of a session, and write its result and the report again with the findings.
+
+    The session's own checks may be older than its result.
+    """
+    if not session.with_report:
+        return
+    from hand_eye_calib.core.engine.examination import check
+    from hand_eye_calib.formats.results import save_result
+
+    checked = check(session.snapshot, session.calibration)
+    calibration = replace(session.calibration, findings=checked.findings)
+    save_result(calibration, directory, session.inputs)
+    write_report(directory, calibration, session.snapshot, session.inputs)

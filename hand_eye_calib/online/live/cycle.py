@@ -1,0 +1,661 @@
+"""Solves and stream checks of the node: their schedule, their results, and the waiting callers."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.excitation import what_is_missing
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.option import Options
+from hand_eye_calib.core.base.plain import plain
+from hand_eye_calib.core.base.text import duration, listing, parse_targets
+from hand_eye_calib.core.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
+from hand_eye_calib.core.checks.findings import Finding, Severity, answered, gravest_first
+from hand_eye_calib.core.engine.attempts import with_options
+from hand_eye_calib.core.engine.calibrator import Calibrator
+from hand_eye_calib.core.engine.snapshot import Snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
+from hand_eye_calib.core.results.context import Comparison
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.online.live.goal import Goal
+from hand_eye_calib.online.live.log import GOES_ON_S, ONCE_S, NodeLog
+from hand_eye_calib.online.live.session import LiveSession
+from hand_eye_calib.online.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
+from hand_eye_calib.online.live.state import (
+    ANSWER_WITHIN_S,
+    Broadcast,
+    ChecksState,
+    ExtrinsicState,
+    InputState,
+    Level,
+    ProgressState,
+    ResultState,
+    Standing,
+    by_axis,
+)
+
+# Callback with the success of a solve and a line of text about it.
+OnSolved = Callable[[bool, str], None]
+
+# Least time between two stream checks (s). A check takes one or two seconds.
+_CHECK_PERIOD_S = 30.0
+
+# Options that change the verdict on a result, but not the result.
+_TARGETS = ("target_translation", "target_rotation", "target_axes")
+
+# Codes of findings about the received poses of one stream. After pairing, which interpolates the
+# poses, a check cannot detect these faults.
+_RAW_POSE_CODES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
+
+
+class StreamChecks:
+    """Findings of the stream checks of a session.
+
+    An error counts at once. Any other finding counts if two checks in a row report it, because
+    odometry may be wrong by some per cent over a short recording. An error of the received poses
+    lasts for the whole session, because the session keeps these poses.
+    """
+
+    def __init__(self, log: NodeLog) -> None:
+        self._log = log
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new session without findings."""
+        self._result: CheckResult | None = None
+        self._checked_at_s = 0.0
+        self._suspected: set[tuple[str, str]] = set()
+        self._faults: dict[tuple[str, str], Finding] = {}
+        self._lasting: dict[tuple[str, str], Finding] = {}
+
+    def follow(self, config: CalibratorConfig) -> None:
+        """Drop lasting findings that are no errors with the new options."""
+        open_findings = {}
+        for key, finding in self._lasting.items():
+            (graded,) = answered([finding], config)
+            if graded.makes_unusable:
+                open_findings[key] = finding
+        self._lasting = open_findings
+
+    def take(self, result: CheckResult) -> None:
+        """Store the result of a check, and log new findings and those that are gone."""
+        before = self._faults
+        self._result = result
+        self._checked_at_s = time.monotonic()
+        suspects = {
+            (finding.code, finding.stream): finding
+            for finding in result.findings
+            if finding.severity is not Severity.NOTE
+        }
+        self._faults = {
+            key: finding
+            for key, finding in suspects.items()
+            if finding.makes_unusable or key in self._suspected
+        }
+        self._suspected = set(suspects)
+        for key, finding in self._faults.items():
+            if finding.makes_unusable and finding.code in _RAW_POSE_CODES:
+                self._lasting[key] = finding
+        # Findings of this check replace lasting ones: their values are newer.
+        self._faults = {**self._lasting, **self._faults}
+        for key in self._faults.keys() - before.keys():
+            self._log.warning(_in_parameters(self._faults[key]))
+        for key in before.keys() - self._faults.keys():
+            self._log.info(f"no longer found: {before[key].what}")
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings that count against these streams, the gravest first."""
+        return tuple(self._faults.values())
+
+    def _earlier_findings(self, result: CheckResult) -> list[Finding]:
+        """Lasting findings that this check does not report."""
+        keys = {(finding.code, finding.stream) for finding in result.findings}
+        return [finding for key, finding in self._lasting.items() if key not in keys]
+
+    def faults(self) -> tuple[str, ...]:
+        """Text of the findings that count, one line each, with the parameters to set."""
+        return tuple(map(_in_parameters, self.findings))
+
+    def state(self) -> ChecksState:
+        """Return the diagnostics of the last check, with lasting findings."""
+        if self._result is None:
+            text = (
+                f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
+                f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
+            )
+            return ChecksState(level=Level.WARN, text=text)
+        findings = gravest_first([*self._result.findings, *self._earlier_findings(self._result)])
+        return ChecksState(
+            level=Level.WARN if self._faults else Level.OK,
+            text="; ".join(self.faults()) or "both streams can be of one rigid body",
+            age_s=time.monotonic() - self._checked_at_s,
+            findings=tuple(
+                f"{finding.severity.value}: {_in_parameters(finding)}" for finding in findings
+            ),
+        )
+
+
+def _in_parameters(finding: Finding) -> str:
+    """Text of a finding in one line, with the parameters to set."""
+    remedies = (f": set {name} to {value}" for name, value in finding.options.items())
+    return f"{finding}{''.join(remedies)}"
+
+
+class SolveCycle:
+    """Exchange of snapshots and answers with the solving process.
+
+    At most one job runs at a time. A result of an older session is dropped.
+
+    Parameters
+    ----------
+    session : LiveSession
+    log : NodeLog
+    wake : callable
+        Called in another thread when an answer arrives for :meth:`take_answers`.
+    complete : callable
+        Called with a usable Calibration; returns the Calibration with additions of the node.
+    publish : callable
+        Called after an answer is processed, before the callbacks of :meth:`ask`.
+    targets : (6,) sequence
+        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
+
+    Attributes
+    ----------
+    is_solving : bool
+    result : Calibration or None
+        Result of the session: the newest usable one, or, once the goal is reached, the one that the
+        goal keeps. The warnings explain why a newer result was not taken. If the motion contradicts
+        a prior, a result with the verdict DO NOT USE replaces it.
+    """
+
+    def __init__(
+        self,
+        session: LiveSession,
+        log: NodeLog,
+        wake: Callable[[], None],
+        complete: Callable[[Calibration], Calibration],
+        publish: Callable[[], None],
+        targets: Sequence[float],
+    ) -> None:
+        self.is_solving = False
+        self.checks = StreamChecks(log)
+        self.goal = Goal(targets)
+        self._session = session
+        self._log = log
+        self._complete = complete
+        self._publish = publish
+        # Earliest start of the next solve (steady time, s).
+        self._rest_until_s = 0.0
+        # Callbacks that wait for a solve, with the time of the request (steady time, s).
+        self._asked: dict[OnSolved, float] = {}
+        # Callbacks that the job under way answers.
+        self._in_flight: tuple[OnSolved, ...] = ()
+        self._process = SolvingProcess(wake)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new session without a result."""
+        self.result: Calibration | None = None
+        self._result_state: ResultState | None = None
+        # Copy of the calibrator that gave the result, and options that its checks set.
+        self._solved: tuple[Calibrator, Options] | None = None
+        self._solved_at_s = 0.0
+        # Motion of the session so far.
+        self._seen = NO_MOTION
+        # Failure of the newest solve.
+        self._failure: Failure | None = None
+        # Last failure if every solve since the result has failed, and the time of the first
+        # failure (steady time, s).
+        self._failing: Failure | None = None
+        self._failing_since_s = 0.0
+        # Sentences of the reasons that were logged as warnings, by their rules.
+        self._warned: dict[str, str] = {}
+        # Options that checks of this session set, and the warnings about them.
+        self._certain: Options = {}
+        self._option_warnings: tuple[str, ...] = ()
+        # Whether poses came in since the last check, and when the next is due (steady time, s).
+        self._is_unchecked = False
+        self._check_due_s = 0.0
+        self.checks.restart()
+        self.goal.restart()
+
+    def follow(self, config: CalibratorConfig, before: CalibratorConfig) -> None:
+        """Start over with other options than before, and check at once.
+
+        If only targets have changed, the result stays and gets a new verdict at once, because the
+        robot may stand still by now.
+        """
+        self._certain = {}
+        self._option_warnings = ()
+        self._is_unchecked = True
+        self._check_due_s = 0.0
+        self.checks.follow(config)
+        targets = {name: getattr(config, name) for name in _TARGETS}
+        result = self.published
+        given_before = before.given.difference(_TARGETS)
+        given_now = config.given.difference(_TARGETS)
+        has_other_options = replace(before, **targets) != config or given_before != given_now
+        if result is None or has_other_options:
+            self.goal.follow(config.targets)
+            return
+        targets["target_axes"] = parse_targets("target.axes", config.target_axes)
+        result = replace(result, **targets)
+        self.goal.retarget(result, config.targets)
+        self.result = result
+        self._result_state = _state_of(result)
+
+    @property
+    def published(self) -> Calibration | None:
+        """Result to publish; None without a result, or if it is refuted."""
+        return None if self.result is None or is_refuted(self.result) else self.result
+
+    @property
+    def standing(self) -> Standing:
+        """Validity of the result."""
+        if self.result is None:
+            return Standing.NONE
+        if is_refuted(self.result):
+            return Standing.REFUTED
+        return Standing.CURRENT if self._failing is None else Standing.OUTDATED
+
+    @property
+    def problem(self) -> str:
+        """Reason why the result is refuted or outdated, in one line; empty otherwise."""
+        result = self.result
+        failing = self._failing
+        if result is not None and is_refuted(result):
+            reason = result.reasons[0]
+            remedy = ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
+            return f"{reason.sentence}; {reason.what_to_do}{remedy}"
+        if result is None or failing is None:
+            return ""
+        now_s = time.monotonic()
+        failing_s = duration(now_s - self._failing_since_s)
+        age_s = duration(now_s - self._solved_at_s)
+        return (
+            f"every solve has failed for {failing_s}: {failing.what.rstrip('.')}; the result shown "
+            f"is {age_s} old, of {result.n_poses} poses"
+        )
+
+    def result_to_save(self) -> Calibration | None:
+        """Return the result, with a warning if every solve since has failed; None without one."""
+        if self.result is None or self.standing is not Standing.OUTDATED:
+            return self.result
+        return replace(self.result, warnings=(*self.result.warnings, self.problem))
+
+    def snapshot(self) -> Snapshot | None:
+        """Return the poses and options that gave the result; None without a result."""
+        if self._solved is None:
+            return None
+        calibrator, certain = self._solved
+        return with_options(calibrator.snapshot(), certain)
+
+    # ------------------------------------------------------------------ solving
+
+    def ask(self, on_solved: OnSolved) -> None:
+        """Solve as soon as possible, and call ``on_solved`` with the answer."""
+        self._asked[on_solved] = time.monotonic()
+        if not self.is_solving:
+            self._start()
+
+    def tell_who_waits(self) -> None:
+        """Answer callers that have waited too long: the solve goes on. To be called often."""
+        long_ago_s = time.monotonic() - ANSWER_WITHIN_S
+        for on_solved, since_s in list(self._asked.items()):
+            if since_s >= long_ago_s:
+                continue
+            del self._asked[on_solved]
+            text = f"still solving after {ANSWER_WITHIN_S:g} s (do others use the processor?)"
+            on_solved(False, f"{text}: the result will be in the log and on the topics")
+
+    def start_if_due(self) -> None:
+        """Start a solve or a check if there are new poses and the pause after the last is over."""
+        now_s = time.monotonic()
+        has_work = self._session.has_new_poses or self._must_check(now_s)
+        if has_work and not self.is_solving and now_s >= self._rest_until_s:
+            self._start()
+
+    def take_answers(self) -> None:
+        """Process the answers of the solving process and call the waiting callbacks."""
+        for answer in self._process.answers():
+            is_good, text = self.conclude(answer)
+            self.is_solving = False
+            self._publish()
+            for on_solved in self._in_flight:
+                if self._asked.pop(on_solved, None) is not None:
+                    on_solved(is_good, text)
+            self._in_flight = ()
+            if self._asked:
+                self._start()
+
+    def stop(self, timeout_s: float) -> None:
+        """Wait up to ``timeout_s`` for the current solve, take its result, and end the process."""
+        self._process.stop(timeout_s)
+        for answer in self._process.answers():
+            self.conclude(answer)
+
+    def _must_check(self, now_s: float) -> bool:
+        """Whether a stream check is due."""
+        return self._is_unchecked and now_s >= self._check_due_s
+
+    def _start(self) -> None:
+        """Submit a job to the solving process."""
+        now_s = time.monotonic()
+        self.is_solving = True
+        self._is_unchecked |= self._session.has_new_poses
+        self._in_flight = tuple(self._asked)
+        # A requested result needs up-to-date findings, even if no check is due.
+        if check := self._must_check(now_s) or (self._is_unchecked and bool(self._in_flight)):
+            self._is_unchecked = False
+            self._check_due_s = now_s + _CHECK_PERIOD_S
+        self._submitted = self._session.copy_to_solve()
+        self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
+
+    # ------------------------------------------------------------------ answers
+
+    def conclude(self, answer: Answer) -> tuple[bool, str]:
+        """Process an answer; return whether it is good, and a line of text about it."""
+        if answer.session != self._session.number:
+            return False, "the session was reset during the solve: its result is dropped"
+        # Pause as long as the solve took, so that half of the processor time stays free.
+        self._rest_until_s = time.monotonic() + answer.seconds
+        # Keep the largest rotation so far: the measured rotation can decrease with more poses.
+        rotation = np.maximum(self._seen.rotation, answer.seen.rotation)
+        self._seen = replace(answer.seen, rotation=rotation)
+        self._failure = answer.failure
+        self._session.calibrator.adopt(answer.time_offset)
+        if answer.options:
+            self._certain = {**self._certain, **answer.options}
+            self._option_warnings = answer.messages
+        if answer.check is not None:
+            self.checks.take(answer.check)
+        elif answer.is_checked:
+            self._check_due_s = 0.0
+        if answer.failure is not None:
+            text = self._report(answer.failure)
+            if answer.calibration is None:
+                missing = what_is_missing(self._seen) if self._seen.n_poses else ""
+                self.goal.wait(missing or answer.failure.what)
+                self._keep_result(answer.failure)
+                return False, text
+        assert answer.calibration is not None
+        warnings = tuple(dict.fromkeys((*self._option_warnings, *answer.calibration.warnings)))
+        for warning in warnings:
+            self._log.warning(warning)
+        newest = self._with_findings(replace(answer.calibration, warnings=warnings))
+        if newest.status is SolveStatus.CONTRADICTED:
+            return self._refute(newest)
+        if newest.status.failure:
+            self._failure = Failure(newest.status.failure)
+            self.goal.wait(f"No usable result: {newest.status.failure}.")
+            self._keep_result(self._failure)
+            return False, self._say(newest)
+        return self._take(self._complete(newest))
+
+    def _keep_result(self, failure: Failure) -> None:
+        """Keep the result after a failed solve, and mark it as outdated."""
+        if self._failing is None:
+            self._failing_since_s = time.monotonic()
+        self._failing = failure
+
+    def _refute(self, newest: Calibration) -> tuple[bool, str]:
+        """Replace the result by a calibration whose prior the motion contradicts.
+
+        The earlier result is neither published nor saved any more.
+        """
+        self.goal.add(newest, self._seen, self.checks.faults())
+        self._solved = self._submitted, self._certain
+        self._set_result(newest)
+        return False, self._say(newest)
+
+    def _set_result(self, result: Calibration) -> None:
+        """Store the result of the session as current."""
+        self.result = result
+        self._result_state = _state_of(result)
+        self._solved_at_s = time.monotonic()
+        self._failing = None
+
+    def _take(self, newest: Calibration) -> tuple[bool, str]:
+        """Make a usable calibration the session's result, unless the goal keeps a better one."""
+        was_done = self.goal.progress.done
+        progress = self.goal.add(newest, self._seen, self.checks.faults())
+        result = self.goal.best or newest
+        if result is newest:
+            self._solved = self._submitted, self._certain
+        else:
+            kept = f"kept is the result of {result.n_poses} poses, as the newest is worse"
+            kept = f"{kept}: {describe(newest)}"
+            self._log.info(kept, ONCE_S, key="kept")
+            result = replace(result, warnings=(*result.warnings, kept))
+            result = _with_halves_of(newest, result)
+        self._set_result(self._with_findings(result))
+        if not progress.is_faulty and progress.sentence:
+            write = self._log.warning if progress.will_not_get_there else self._log.info
+            write(progress.sentence, GOES_ON_S, key=f"now {progress.done}")
+        every_s = GOES_ON_S if progress.done == was_done else 0.0
+        is_good = result.status is SolveStatus.OK
+        return is_good, self._say(self._with_findings(result), every_s)
+
+    def _say(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
+        """Return a line about a calibration with its reasons and warnings, and log new ones.
+
+        Reasons are logged only if more motion would not help; before, the progress names what to
+        do.
+        """
+        text = describe(calibration)
+        progress = self.goal.progress
+        self._log.info(text, every_s, key="result")
+        is_final = progress.done or progress.will_not_get_there or calibration.status.failure
+        reasons = []
+        for reason in calibration.reasons:
+            reasons.append(f"{reason.sentence}; {reason.what_to_do}")
+            if is_final and not reason.is_finding:  # findings are in the log already
+                self._log.warning(f"{reason.verdict.value}: {reasons[-1]}")
+                self._warned[reason.rule] = reason.sentence
+        rules = {reason.rule for reason in calibration.reasons}
+        for rule in self._warned.keys() - rules:
+            self._log.info(f"no longer found: {self._warned.pop(rule)}")
+        return "; ".join((text, *reasons, *calibration.warnings))
+
+    def _with_findings(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with the findings of the stream checks.
+
+        A calibration from positions, rotations or rates keeps its own findings. Only findings about
+        the received poses are added.
+        """
+        findings = self.checks.findings
+        if calibration.measured != "poses":
+            own = {(finding.code, finding.stream) for finding in calibration.findings}
+            added = [
+                finding
+                for finding in findings
+                if (finding.code, finding.stream) not in own and finding.code in _RAW_POSE_CODES
+            ]
+            findings = gravest_first([*calibration.findings, *added])
+        if calibration.findings == findings:
+            return calibration
+        return replace(calibration, findings=findings)
+
+    def _report(self, failure: Failure) -> str:
+        """Log a failure and return its text."""
+        if failure.details:
+            text = f"the solve failed unexpectedly: {failure.what}"
+            self._log.error(f"{text}\n{failure.details}")
+            return f"{text}; see the log"
+        if failure.is_early:
+            self._log.info(f"cannot solve yet: {failure.what}", ONCE_S)
+        else:
+            self._log.warning(f"cannot solve: {failure.what}")
+        return failure.what
+
+    # -------------------------------------------------------------------- state
+
+    def extrinsic_state(
+        self, accepts_poses: bool, tf_static: tuple[Broadcast, str]
+    ) -> ExtrinsicState:
+        """Return the diagnostics of the result.
+
+        Parameters
+        ----------
+        accepts_poses : bool
+        tf_static : tuple of Broadcast and str
+            Whether the result is broadcast on /tf_static, and the reason.
+        """
+        seen = self._seen
+        state = self._result_state
+        level, text = self._judged(accepts_poses, tf_static)
+        contradictions = self.result.contradictions if self.result is not None else {}
+        return ExtrinsicState(
+            level=level,
+            text=text,
+            is_solving=self.is_solving,
+            n_poses=seen.n_poses,
+            path_m=seen.distance,
+            motion_s=seen.motion_s,
+            has_vehicle_axes=seen.has_vehicle_axes,
+            rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True)),
+            tf_static=tf_static[0],
+            tf_static_reason=tf_static[1],
+            standing=self.standing,
+            problem=self.problem,
+            priors=priors_of(self._session.calibrator.config),
+            contradicted=tuple(contradictions),
+            result=state and replace(state, age_s=time.monotonic() - self._solved_at_s),
+        )
+
+    def _judged(self, accepts_poses: bool, tf_static: tuple[Broadcast, str]) -> tuple[Level, str]:
+        """Return level and text of the gravest condition that applies."""
+        result = self.result
+        failure = self._failure
+        if failure is not None and failure.details:
+            return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
+        if result is not None and self.problem:
+            joint = ": " if self.standing is Standing.REFUTED else ", but "
+            return Level.WARN, f"{result.verdict.value}{joint}{self.problem}"
+        if not accepts_poses:
+            return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
+        if result is None:
+            texts = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
+            texts += [failure.what] if failure else []
+            return Level.WARN, "; ".join(texts) or "no result yet"
+        if tf_static[0] is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
+            return Level.WARN, f"publish_tf is refused: {tf_static[1]}"
+        if failure is not None:
+            return Level.WARN, failure.what
+        return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
+
+    def progress_state(
+        self, why_not_compared: str, pause: tuple[Level, str] = (Level.OK, "")
+    ) -> ProgressState:
+        """Return the diagnostics of the progress towards the targets.
+
+        The level is WARN if a person should do something else than continue the motion.
+
+        Parameters
+        ----------
+        why_not_compared : str
+            Reason why the result is not compared with the installed transform; empty if no
+            comparison was requested.
+        pause : tuple of Level and str
+            Severity and reason if no poses arrive; see :func:`pause_of`.
+        """
+        progress = self.goal.progress
+        result = self.result
+        is_well = self.standing is Standing.CURRENT and not progress.is_faulty
+        may_go_on = is_well and not progress.will_not_get_there
+        comparison = result.comparison if result is not None else None
+        if comparison is None and why_not_compared:
+            comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
+        is_paused = bool(pause[1]) and not progress.done
+        level = Level.OK if may_go_on else Level.WARN
+        text = progress.sentence
+        if not progress.is_faulty:
+            text = self.problem or (pause[1] if is_paused else text)
+        return ProgressState(
+            level=max(level, pause[0]) if is_paused else level,
+            text=text,
+            is_paused=is_paused,
+            progress=progress,
+            comparison=comparison,
+        )
+
+
+def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Level, str]:
+    """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
+    if not accepts_poses:
+        return Level.WARN, "Paused: not accepting poses; call ~/set_enabled to go on."
+    paused = {name: state for name, state in inputs.items() if state.is_paused}
+    if not paused:
+        return Level.OK, ""
+    level = max(state.level for state in paused.values())
+    longest_s = max(state.silent_s or 0.0 for state in paused.values())
+    streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
+    if len(paused) < len(inputs):
+        level = Level.WARN
+    remedy = "start its source again" if level > Level.OK else "go on driving, or save"
+    return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
+
+
+def _with_halves_of(newest: Calibration, kept: Calibration) -> Calibration:
+    """Return the kept result with the newest comparison of both halves of the recording."""
+    if newest.cross_check is None or kept.cross_check is None:
+        return kept
+    rows = {}
+    for axis, row in kept.cross_check.items():
+        newer = newest.cross_check[axis]
+        excess = newer.excess_of_halves
+        rows[axis] = replace(row, of_halves=newer.of_halves, excess_of_halves=excess)
+    return replace(kept, cross_check=rows)
+
+
+def is_refuted(result: Calibration) -> bool:
+    """Whether the solve failed, or an error in the streams makes every axis unusable."""
+    return bool(result.status.failure) or any(finding.makes_unusable for finding in result.findings)
+
+
+def priors_of(config: CalibratorConfig) -> dict[str, str]:
+    """Return the priors of the options by axis, as typed by the user."""
+    priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
+    return {axis: text for axis, text in priors.items() if text}
+
+
+def _state_of(result: Calibration) -> ResultState:
+    """Return the diagnostics of a result; its age is filled in later."""
+    pose = se3.xyz_rpy(result.T_parent_child)
+    sigmas = result.sigmas_printed
+    return ResultState(
+        parent_frame=result.parent_frame,
+        child_frame=result.child_frame,
+        verdict=result.verdict.value,
+        status=result.status.value,
+        reasons=tuple(f"{reason.sentence}: {reason.what_to_do}" for reason in result.reasons),
+        pose=by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
+        pose_sigma=by_axis(sigmas),
+        warnings=result.warnings,
+        n_poses=result.n_poses,
+        time_offset_s=result.time_offset_s,
+        scale=result.scale,
+        age_s=0.0,
+    )
+
+
+def describe(calibration: Calibration) -> str:
+    """Return a log line with verdict, pose, standard deviations and amount of data."""
+    pose = se3.xyz_rpy(calibration.T_parent_child)
+    sigmas = calibration.sigmas_printed
+    xyz = ", ".join(f"{value:.4f}" for value in pose[:3])
+    rpy = ", ".join(f"{value:.3f}" for value in np.degrees(pose[3:]))
+    mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
+    deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
+    return (
+        f"{calibration.headline.rstrip('.')}. "
+        f"{calibration.child_frame} in {calibration.parent_frame}: "
+        f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
+        f"status {calibration.status.value}; {calibration.method} {calibration.reference}"
+        f": {calibration.n_poses} poses, {calibration.n_pairs} pairs, "
+        f"{calibration.n_inliers} inliers"
+    )

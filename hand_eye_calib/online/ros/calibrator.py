@@ -1,0 +1,49 @@
+"""``calibrator``: the node."""
+
+import argparse
+import json
+import textwrap
+
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+
+_INTERFACE = """\
+examples:
+  hand_eye_calib calibrator --ros-args -r parent_odom:=/lidar/odometry -r child_odom:=/camera/odom
+  hand_eye_calib calibrator --ros-args --params-file calibrator.yaml
+
+subscribed topics (-r NAME:=TOPIC):
+  parent_odom, child_odom        poses of both sensors: Odometry, PoseStamped, TransformStamped ...
+  child2_odom, child3_odom, ...  poses of further child sensors (other_children)
+  /tf, /tf_static                with parent_tf, child_tf, base_frame, installed:=tf, publish_tf
+
+published topics:
+  ~/extrinsic                    geometry_msgs/TransformStamped: pose of the child in the parent
+  ~/extrinsic_with_covariance    geometry_msgs/PoseWithCovarianceStamped
+  ~/progress                     std_msgs/String: the whole state as JSON
+  /diagnostics                   diagnostic_msgs/DiagnosticArray
+  /tf_static                     with publish_tf, once the goal is reached
+
+services:
+  ~/solve, ~/save, ~/reset       std_srvs/Trigger
+  ~/set_enabled                  std_srvs/SetBool: stop or resume accepting poses
+
+parameters (-p NAME:=VALUE):
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments: all are the node's, and passed on to it."""
+    parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
+    epilog = _INTERFACE
+    for name, field in (CalibratorConfig.by_name() | NodeConfig.by_name()).items():
+        value = " ".join(filter(None, (json.dumps(field.default), field.metadata["unit"])))
+        doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), 6 * " ")
+        epilog += f"  {name} ({value})\n{doc}\n"
+    parser.epilog = epilog.replace("%", "%%")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the node until it is told to end; returns the exit code."""
+    from hand_eye_calib.online.ros.node import main
+
+    return main(arguments.passed_on)

@@ -1,0 +1,126 @@
+"""Entry point of the node ``calibrator``: from arguments to a spinning node, and from a signal to a
+clean end.
+
+ROS and the engine are imported late, so that Ctrl-C while they load ends the program quietly too.
+"""
+
+import gc
+import os
+import re
+import signal
+import sys
+import threading
+import time
+import traceback
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+# One wait of the executor costs as much as ten messages. Those that come faster than the first of
+# these (s) are taken without it; it has its turn after the second.
+_REST_S, _TURN_S = 0.004, 0.02
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    args : list of str, optional
+        Arguments without the program's name; the process's own by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0 stopped by a signal; 1 bad parameter, failure, or a result that could not be
+        saved (reported on stderr); 2 wrong usage.
+    """
+    # The signals do nothing but make a pipe readable: no KeyboardInterrupt in the middle of a
+    # callback, no context that rclpy shuts down while a callback still publishes, and a second
+    # Ctrl-C changes nothing.
+    readable, writable = os.pipe()
+    os.set_blocking(writable, False)
+    signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
+    for number in STOP_SIGNALS:
+        signal.signal(number, lambda *_: None)
+    code = _init(sys.argv[1:] if args is None else args) or _run_node(readable)
+    # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit
+    # code.
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    return code
+
+
+def _init(arguments: list[str]) -> int:
+    """Start rclpy; returns the exit code, 0 if it has started."""
+    import rclpy
+    from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+    from rclpy.logging import LoggingSeverity, set_logger_level
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args
+
+    def fail(text: str, code: int) -> int:
+        print(f"calibrator: {text}", file=sys.stderr)
+        return code
+
+    # rcl logs an error of its own before it raises the one that says what is wrong.
+    set_logger_level("rcl", LoggingSeverity.FATAL)
+    try:
+        if unknown := remove_ros_args(args=arguments):
+            return fail(f"unknown arguments {unknown}; ROS arguments follow --ros-args", 2)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except UnknownROSArgsError as error:
+        return fail(f"unknown ROS arguments {error}", 2)
+    except RCLError as error:
+        return fail(re.sub(r", at \S+:\d+", "", " ".join(str(error).split())), 1)
+    set_logger_level("rcl", LoggingSeverity.UNSET)
+    return 0
+
+
+def _run_node(signals: int) -> int:
+    """Run the node until ``signals`` is readable; returns the exit code."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from hand_eye_calib.core.base.errors import HandEyeCalibError
+    from hand_eye_calib.online.live.state import GRACE_S
+    from hand_eye_calib.online.ros.calibrator_node import CalibratorNode
+
+    # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
+    executor, stopping = SingleThreadedExecutor(), threading.Event()
+
+    def wait_for_signal() -> None:
+        os.read(signals, 1)
+        # As a task: executor.wake() alone does not make spin_once() return.
+        executor.create_task(stopping.set)
+
+    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+    node, code = None, 1
+    try:
+        node = CalibratorNode()
+        executor.add_node(node)
+        # A collection that looks at everything imported holds up callbacks for 30 ms, on a slow
+        # computer for 250.
+        gc.collect()
+        gc.freeze()
+        # The thread that writes the journal holds up a message no longer than this.
+        sys.setswitchinterval(_REST_S / 8)
+        while not stopping.is_set():
+            executor.spin_once()
+            until_s = time.monotonic() + _TURN_S
+            while node.take_messages() and time.monotonic() < until_s:
+                time.sleep(_REST_S)
+        code = 0
+    except HandEyeCalibError as error:
+        print(f"calibrator: {error}", file=sys.stderr)
+    except Exception:
+        traceback.print_exc()
+    executor.shutdown()
+    if node is not None:
+        try:
+            code = code if node.stop(GRACE_S) else 1
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        node.destroy_node()
+    rclpy.try_shutdown()
+    return code

@@ -1,0 +1,117 @@
+"""The node's parameters, made from the option dataclasses."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.option import OptionField, Options, check_value, did_you_mean
+
+_OF_NODE = NodeConfig.by_name()
+FIELDS = CalibratorConfig.by_name() | _OF_NODE
+
+# Declared by rclpy itself.
+_SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
+
+
+class Parameters:
+    """Declares the parameters on a node and keeps them as option objects.
+
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: so
+    rclpy shows what a file or the command line sets, unknown names included.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    on_change : callable
+        Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
+        new options by then.
+    check : callable
+        ``check(NodeConfig)`` raises ConfigError for options that cannot be put in force.
+
+    Attributes
+    ----------
+    given : dict
+        Values that somebody set, at their defaults or not.
+    calibrator : CalibratorConfig
+    node : NodeConfig
+    unknown : list of str
+        One line for every given name that does not exist, unless it is of a QoS.
+
+    Raises
+    ------
+    ConfigError
+        If a given value is of the wrong type or out of range.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        on_change: Callable[[], None],
+        check: Callable[[NodeConfig], None],
+    ) -> None:
+        found: dict[str, Any] = node.get_parameters_by_prefix("")
+        overrides = {
+            name: each.value for name, each in found.items() if name not in _SYSTEM_PARAMETERS
+        }
+        for name in overrides:  # so that they can get descriptors
+            node.undeclare_parameter(name)
+        self.unknown = [
+            f"parameter {name} does not exist and is ignored{did_you_mean(name, FIELDS)}"
+            for name in overrides
+            if name not in FIELDS and not name.startswith("qos_overrides.")
+        ]
+        if overrides.get("journal") is False:
+            overrides["journal"] = "off"  # of which YAML makes a false, without quotes
+        ours = [name for name in FIELDS if name in overrides]
+        self.given: Options = {name: check_value(FIELDS[name], overrides[name]) for name in ours}
+        self.calibrator, self.node = _configs(self.given)
+        check(self.node)
+        self._check_node, self._on_change = check, on_change
+        for name, field in FIELDS.items():
+            value = self.given.get(name, field.default)
+            node.declare_parameter(name, value, _descriptor(field), ignore_override=True)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _proposed(self, parameters: list[Parameter]) -> Options:
+        ours = {each.name: each.value for each in parameters if each.name in FIELDS}
+        return {**self.given, **{name: check_value(FIELDS[name], ours[name]) for name in ours}}
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            _, node = _configs(self._proposed(parameters))
+            self._check_node(node)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, parameters: list[Parameter]) -> None:
+        if any(parameter.name in FIELDS for parameter in parameters):
+            self.given = self._proposed(parameters)
+            self.calibrator, self.node = _configs(self.given)
+            self._on_change()
+
+
+def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
+    of_node = {name: value for name, value in values.items() if name in _OF_NODE}
+    of_calibrator = {name: value for name, value in values.items() if name not in _OF_NODE}
+    return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(of_node)
+
+
+def _descriptor(field: OptionField) -> ParameterDescriptor:
+    meta = field.metadata
+    # One that takes a word as well as a number has no single type.
+    is_dynamic = bool(meta["words"])
+    words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * is_dynamic
+    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+    values = f" Values: {', '.join(words)}." if words else ""
+    return ParameterDescriptor(
+        description=f"{meta['doc']}{unit}{values}",
+        read_only=meta["read_only"],
+        dynamic_typing=is_dynamic,
+    )

@@ -1,1 +1,0 @@
-"""Simulated drives: two sensors on one vehicle with known truth, and the noise of odometry."""
