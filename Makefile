@@ -3,7 +3,7 @@
 #   make test          the whole test suite
 #   make test-oldest   the same without slow tests, on the oldest supported versions
 #   make fuzz          5,400 files, damaged on purpose (INPUTS=500)
-#   make lint          style and types
+#   make lint          style, types and the contracts of the layers
 #   make coverage      the test suite, and the lines that no test runs
 #   make paper DATA=x  every figure and table of the paper from its published data in x, to reproduced/
 #   make coverage-study DATA=x  errors over their lower bound, and what the stated sigmas are worth
@@ -76,6 +76,7 @@ lint: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports --no-cache pyproject.toml
 
 format: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check --fix .

@@ -131,7 +131,7 @@ setup(
             "pytest>=7.4",
             "wheel",
         ],
-        "lint": ["mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],
+        "lint": ["import-linter==2.17", "mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],
     },
     entry_points={
         "console_scripts": [
