@@ -200,22 +200,10 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     """
     starts_ns, blocks = _by_second(pose_pairs, T_parent_child)
     n_blocks = len(starts_ns)
-    long_run = 1.0
-    for n_windows in _WINDOWS:
-        if n_blocks < n_windows * _LEAST_WINDOW_S:
-            continue
-        # The least of all splits, about the answers of their sides.
-        windows = blocks.merged(n_windows)
-        splits = np.arange(_LEAST_WINDOWS, n_windows - _LEAST_WINDOWS + 1)
-        sides = np.stack([windows.before(splits), windows.since(splits)], axis=1)
-        is_after = (np.arange(n_windows) >= splits[:, None]).astype(int)
-        answers = most_likely(sides, _RIDGE)[np.arange(len(splits))[:, None], is_after]
-        seen = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
-        # Per degree of freedom of scores about two answers.
-        squared = squares_about(windows.sums[seen], answers[:, seen], _RIDGE).sum(axis=1)
-        long_run = max(long_run, float(squared.min()) / max(6 * seen.sum() - 12, 1))
-    if n_blocks < min(_WINDOWS) * _LEAST_WINDOW_S:
+    counts = [count for count in _WINDOWS if n_blocks >= count * _LEAST_WINDOW_S]
+    if not counts:
         return None
+    long_run = max(1.0, *(_long_run(blocks.merged(count)) for count in counts))
     shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * _OF_SHIFT)
     ratios = log_ratio(shifts / long_run)
     n_edge = max(int(n_blocks * _LEAST_WINDOWS / max(_WINDOWS)), 1)
@@ -227,6 +215,21 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
         covariance=long_run * inverse(information(shifts[best]) + _RIDGE * _OF_SHIFT),
         log_ratio=float(ratios[best]),
     )
+
+
+def _long_run(windows: Blocks) -> float:
+    """Long-run variance of the scores of windows, in units of their information: about the answers
+    before and since a time, which is chosen so that the variance is smallest.
+    """
+    count = len(windows.sums)
+    cuts = np.arange(_LEAST_WINDOWS, count - _LEAST_WINDOWS + 1)
+    sides = np.stack([windows.before(cuts), windows.since(cuts)], axis=1)
+    is_since = (np.arange(count) >= cuts[:, None]).astype(int)
+    answers = most_likely(sides, _RIDGE)[np.arange(len(cuts))[:, None], is_since]
+    seen = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
+    squared = squares_about(windows.sums[seen], answers[:, seen], _RIDGE).sum(axis=1)
+    # Six values a window, less those of both answers.
+    return float(squared.min()) / max(6 * int(seen.sum()) - 12, 1)
 
 
 def _by_second(pose_pairs: PosePairs, T_parent_child: FloatArray) -> tuple[IntArray, Blocks]:
