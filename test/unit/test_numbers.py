@@ -42,6 +42,26 @@ def test_a_weight_is_the_slope_of_its_loss_over_the_residual(kind, loss):
     assert stats.robust_weights(kind, lengths**2) == pytest.approx(slopes / lengths, rel=1e-6)
 
 
+@pytest.mark.parametrize(("kind", "within"), [("huber", 1e-3), ("cauchy", 1e-3)])
+def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
+    random = np.random.default_rng(1)
+    rows, values = random.normal(size=(200, 3, 2)), np.array([2.0, -0.5])
+    targets = rows @ values + 1e-3 * random.normal(size=(200, 3))
+    targets[:40] += 5.0
+    plain = np.linalg.lstsq(rows.reshape(-1, 2), targets.ravel(), rcond=None)[0]
+    assert np.abs(plain - values).max() > 0.05
+    found, lengths = stats.robust_regression(kind, rows, targets, 20, median)
+    assert found == pytest.approx(values, abs=within)
+    np.testing.assert_allclose(lengths, np.linalg.norm(rows @ found - targets, axis=1))
+
+
+def test_a_robust_regression_without_evidence_for_a_value_leaves_it_zero():
+    rows = np.array([[[1.0, 0.0]], [[2.0, 0.0]]])
+    found, lengths = stats.robust_regression("cauchy", rows, np.array([[3.0], [6.0]]), 3, median)
+    assert found == pytest.approx([3.0, 0.0])
+    assert lengths == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
 def test_student_weights_of_many_degrees_of_freedom_are_those_of_normal_errors():
     squared = np.array([0.0, 6.0, 60.0])
     assert stats.student_weights(squared, 1e9) == pytest.approx(np.ones(3), rel=1e-6)

@@ -32,6 +32,11 @@ STUDENT = 4.0
 
 _MAX_STEPS = 20
 
+# Of a robust regression: singular values below this share of the largest are rounding, and so are
+# residuals below this length.
+_RANK_TOLERANCE = 1e-9
+_SMALLEST_UNIT = 1e-12
+
 
 def median(values: ArrayLike) -> float:
     """Median of finite values in any shape; NaN if there are none.
@@ -115,6 +120,41 @@ def robust_weights(kind: str, squared: FloatArray) -> FloatArray:
     [1.0, 0.5, 0.1]
     """
     return _WEIGHTS[kind](squared)
+
+
+def robust_regression(
+    kind: str,
+    rows: FloatArray,
+    targets: FloatArray,
+    rounds: int,
+    unit: Callable[[FloatArray], float],
+) -> tuple[FloatArray, FloatArray]:
+    """Values x that ``rows @ x = targets`` shows, by iteratively reweighted least squares.
+
+    Parameters
+    ----------
+    kind : str
+        Of :func:`robust_weights`.
+    rows : (K, d, p) array
+    targets : (K, d) array
+    rounds : int
+    unit : callable
+        Length of a residual at which its weight falls, from the lengths (K,) of all.
+
+    Returns
+    -------
+    values : (p,) array
+    lengths : (K,) array
+        Lengths of the residuals.
+    """
+    weights = np.ones(len(rows))
+    for _ in range(rounds):
+        roots = np.sqrt(weights)[:, None]
+        scaled = (roots[..., None] * rows).reshape(-1, rows.shape[2])
+        values = np.linalg.lstsq(scaled, (roots * targets).ravel(), rcond=_RANK_TOLERANCE)[0]
+        lengths = np.linalg.norm(rows @ values - targets, axis=1)
+        weights = robust_weights(kind, (lengths / max(unit(lengths), _SMALLEST_UNIT)) ** 2)
+    return np.asarray(values, dtype=float), lengths
 
 
 def chi_square_quantile(tail: float) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from hand_eye_calib.core.alignment.similarity import fit_similarity
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import NotEnoughDataError
-from hand_eye_calib.core.base.stats import robust_weights
+from hand_eye_calib.core.base.stats import robust_regression
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.checks.hypotheses import HOLDS, LAGS_S, MAX_PAIRS, StreamPair
 from hand_eye_calib.core.geometry import se3
@@ -164,14 +164,7 @@ def _fitted_turn(streams: StreamPair, lag_s: float) -> FloatArray:
     of_lever = -(pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3))
     rows = np.concatenate([of_turn, of_lever], axis=2)
     target = pairs.Ts_parenti_parentj[:, :3, 3]
-    weights = np.ones(len(pairs))
-    unknowns = np.zeros(12)
-    for _ in range(_ROUNDS):
-        roots = np.sqrt(weights)[:, None]
-        weighted = (roots[:, :, None] * rows).reshape(-1, 12)
-        unknowns = np.linalg.lstsq(weighted, (roots * target).ravel(), rcond=1e-9)[0]
-        residuals = np.linalg.norm(rows @ unknowns - target, axis=1)
-        weights = robust_weights("huber", (residuals / _LEAST_RESIDUAL_M) ** 2)
+    unknowns, _ = robust_regression("huber", rows, target, _ROUNDS, lambda _: _LEAST_RESIDUAL_M)
     return se3.nearest_rotation(unknowns[:9].reshape(3, 3))
 
 

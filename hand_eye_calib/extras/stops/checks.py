@@ -16,7 +16,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.stats import median, medians, robust_weights
+from hand_eye_calib.core.base.stats import median, medians, robust_regression, robust_weights
 from hand_eye_calib.core.checks.findings import CONVENTIONS, Finding, Severity, conventions, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.robot_world import Stops, closest_rotations, solve
@@ -581,15 +581,8 @@ def _spread(positions: FloatArray) -> float:
 
 def _least(rows: FloatArray, positions: FloatArray) -> tuple[float, FloatArray]:
     """Median length of ``rows @ values + positions``, and the values (k,), by robust weights."""
-    weights = np.ones(len(rows))
-    for _ in range(_ROUNDS):
-        roots = np.sqrt(weights)
-        scaled = (roots[:, None, None] * rows).reshape(-1, rows.shape[2])
-        target = -(roots[:, None] * positions).ravel()
-        values = np.linalg.lstsq(scaled, target, rcond=1e-9)[0]
-        lengths = np.linalg.norm(rows @ values + positions, axis=1)
-        weights = robust_weights("cauchy", (lengths / max(median(lengths), 1e-12)) ** 2)
-    return median(lengths), np.asarray(values, dtype=float)
+    values, lengths = robust_regression("cauchy", rows, -positions, _ROUNDS, median)
+    return median(lengths), values
 
 
 def _named(
