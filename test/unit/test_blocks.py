@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance, solve
+from hand_eye_calib.core.base.blocks import (
+    Blocks,
+    answer_evidence,
+    jackknife_covariance,
+    shift_evidence,
+    solve,
+)
 
 N_ROWS, N_BLOCKS = 37, 5
 
@@ -112,3 +118,22 @@ def test_probes_without_noise_take_the_bias_of_noisy_columns_away():
     probes = np.concatenate([true, 2.0 * true], axis=2)
     assert Blocks.of_rows(rows, 4).solve([0]) == pytest.approx(1.0, abs=0.05)
     assert Blocks.of_rows(rows, 4, probes).solve([0]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_the_evidence_of_a_shift_is_that_of_the_difference_of_both_answers(rows):
+    blocks = Blocks.of_rows(rows, N_BLOCKS)
+    shifts = blocks.shift_since(CUTS, np.zeros((4, 4)))
+    for cut, shift in zip(CUTS, shifts, strict=True):
+        parts = [np.concatenate(part) for part in (split(rows)[:cut], split(rows)[cut:])]
+        answers = [least_squares(part, [0, 1, 2, 3]) for part in parts]
+        covariance = sum(np.linalg.inv(products(part)[:4, :4]) for part in parts)
+        units = np.sqrt(np.diag(covariance))
+        expected = answer_evidence(answers[1] - answers[0], covariance)
+        scale = units[:, None] * np.append(units, 1.0)
+        np.testing.assert_allclose(scale * shift, scale * expected, rtol=1e-6, atol=1e-6)
+
+
+def test_a_shift_from_values_known_exactly_is_the_answer_since():
+    table = np.array([[4.0, 0.0, 8.0], [0.0, 0.0, 0.0]])  # 4 (x - 2) = 0, nothing about y
+    shift = shift_evidence(table, np.array([0.5, 7.0]), np.zeros((2, 2)))
+    assert shift.tolist() == [[4.0, 0.0, 6.0], [0.0, 0.0, 0.0]]

@@ -28,7 +28,13 @@ import numpy as np
 
 from hand_eye_calib.core.base import stats
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score
+from hand_eye_calib.core.base.blocks import (
+    Blocks,
+    answer_evidence,
+    information,
+    inverse,
+    score,
+)
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.normal import NormalEquations
@@ -166,8 +172,10 @@ def evidence(
         Covariance of the residuals.
     weights : (K,) array
     """
-    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(noise) * weights[:, None, None]
-    return whitened @ np.concatenate([jacobians, -residuals[..., None]], axis=2)
+    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(noise)
+    weighted = whitened * weights[:, None, None]
+    columns = np.concatenate([jacobians, -residuals[..., None]], axis=2)
+    return weighted @ columns
 
 
 def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -268,35 +276,37 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     cuts = np.arange(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
     before = NormalEquations(Blocks(products).before(cuts))
     after = NormalEquations(Blocks(products).since(cuts))
-    known = before.is_complete & after.is_complete
-    if not known.any():
+    is_complete = before.is_complete & after.is_complete
+    if not is_complete.any():
         return np.zeros((6, 6)), ()
-    joint = max(misfit, 1.0) * (before.covariance + after.covariance)[known, :6, :6]
-    steps = (after.step - before.step)[known, :6]
-    H = np.linalg.inv(joint)
-    S = se3.times(H, steps)
-    tables = np.concatenate([H, S[..., None]], axis=2)
+    joint = max(misfit, 1.0) * (before.covariance + after.covariance)[is_complete, :6, :6]
+    steps = (after.step - before.step)[is_complete, :6]
+    tables = answer_evidence(steps, joint)
     ratios = log_ratio(tables)
-    found = _probability(ratios)
-    if found < _LEAST_PROBABILITY:
+    probability = _probability(ratios)
+    if probability < _LEAST_PROBABILITY:
         return np.zeros((6, 6)), ()
     shifts = most_likely(tables, 1.0)
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
-    spread = found * squared / 4.0
-    beside = np.linalg.inv(joint + scatter_of_recordings(joint[len(joint) // 2]))
-    scores = se3.times(beside, steps)[..., None]
-    if _probability(log_ratio(np.concatenate([beside, scores], axis=2))) < 0.5:
+    spread = probability * squared / 4.0
+    of_recordings = joint + scatter_of_recordings(joint[len(joint) // 2])
+    if _probability(log_ratio(answer_evidence(steps, of_recordings))) < 0.5:
         return spread, ()
     best = int(np.argmax(ratios))
-    share, xi = int(cuts[known][best]) / len(products), shifts[best]
-    sizes = length(float(np.linalg.norm(xi[:3]))), angle(float(np.linalg.norm(xi[3:])))
-    told = (
+    share = int(cuts[is_complete][best]) / len(products)
+    return spread, (_parts_differ(share, shifts[best]),)
+
+
+def _parts_differ(share: float, xi: FloatArray) -> str:
+    """Warning about a shift xi (6,) after a share of the recording."""
+    metres = length(float(np.linalg.norm(xi[:3])))
+    turn = angle(float(np.linalg.norm(xi[3:])))
+    return (
         f"The first {share:.0%} and the last {1 - share:.0%} of the recording give different "
-        f"results ({', '.join(sizes)}). Perhaps a sensor moved, or an odometry got worse. The +/- "
+        f"results ({metres}, {turn}). Perhaps a sensor moved, or an odometry got worse. The +/- "
         "values already include half of this."
     )
-    return spread, (told,)
 
 
 def _probability(log_ratios: FloatArray) -> float:

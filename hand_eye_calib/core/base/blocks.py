@@ -38,15 +38,12 @@ class Blocks:
 
         ``probes`` (K, d, p + 1) take the place of the rows on the left: instrumental variables.
         """
-        pairs = zip(
-            np.array_split(rows if probes is None else probes, n_blocks),
-            np.array_split(rows, n_blocks),
-            strict=True,
-        )
         n_columns = rows.shape[-1]
-        tables = [
-            probe.reshape(-1, n_columns).T @ row.reshape(-1, n_columns) for probe, row in pairs
-        ]
+        on_left = np.array_split(rows if probes is None else probes, n_blocks)
+        on_right = np.array_split(rows, n_blocks)
+        tables = []
+        for left, right in zip(on_left, on_right, strict=True):
+            tables.append(left.reshape(-1, n_columns).T @ right.reshape(-1, n_columns))
         return cls(np.stack(tables))
 
     @classmethod
@@ -113,6 +110,12 @@ def inverse(matrices: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrices), dtype=float)
 
 
+def answer_evidence(answers: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Evidence ``[H S]`` (..., p, p + 1) of answers (..., p) with covariances (..., p, p)."""
+    H = inverse(covariances)
+    return np.concatenate([H, H @ answers[..., None]], axis=-1)
+
+
 def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray) -> FloatArray:
     """Evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from those that are known.
 
@@ -128,7 +131,8 @@ def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray
     H = information(tables)
     scores = score(tables)[..., None] - H @ known[..., None]
     from_known = np.concatenate([H, scores], axis=-1)
-    return inverse(np.eye(H.shape[-1]) + H @ covariance) @ from_known
+    spread = np.eye(H.shape[-1]) + H @ covariance
+    return inverse(spread) @ from_known
 
 
 def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> FloatArray:
@@ -150,9 +154,11 @@ def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> Float
     normal = tables[..., columns, :][..., columns]
     sizes = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
     units = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > _LEAST_SIZE)
-    balanced = normal * units[..., :, None] * units[..., None, :] + _DAMPING * np.eye(len(columns))
-    score = (units * tables[..., columns, target])[..., None]
-    return np.asarray(units * np.linalg.solve(balanced, score)[..., 0])
+    balanced = normal * units[..., :, None] * units[..., None, :]
+    damped = balanced + _DAMPING * np.eye(len(columns))
+    scores = units * tables[..., columns, target]
+    answers = np.linalg.solve(damped, scores[..., None])[..., 0]
+    return np.asarray(units * answers)
 
 
 def jackknife_covariance(answers: FloatArray) -> FloatArray:
