@@ -7,6 +7,9 @@
 #   make coverage      the test suite, and the lines that no test runs
 #   make paper DATA=x  every figure and table of the paper from its published data in x, to reproduced/
 #   make coverage-study DATA=x  errors over their lower bound, and what the stated sigmas are worth
+#   make gate DATA=x   did errors or stated uncertainties get worse than the stored baseline? Five
+#                      minutes; x, the published data, may be left out (GATE_ARGS=--update stores)
+#   make gate-quick    the same on fewer recordings; one minute
 #   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node; about four minutes
 #   make dist          wheel and sdist in dist/, checked (RELEASE=1: only if nothing is a placeholder)
@@ -21,6 +24,7 @@ BENCH_ARGS ?=
 PAPER_ARGS ?=
 FUZZ_ARGS ?=
 STUDY_ARGS ?=
+GATE_ARGS ?=
 DATA ?=
 DEMO_ARGS ?= --out demo_output
 RELEASE ?=
@@ -33,8 +37,8 @@ OLDEST := .venv-oldest
 PIP_FLAGS := --quiet --disable-pip-version-check
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help demo test test-oldest coverage coverage-study fuzz paper bench bench-node lint format \
-	dist docs notebook clean
+.PHONY: help demo test test-oldest coverage coverage-study fuzz gate gate-quick paper bench \
+	bench-node lint format dist docs notebook clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -44,8 +48,8 @@ demo: $(VENV)/.ready-demo
 
 # One thread per process: small matrices gain nothing from more, and results do not depend on the
 # number of cores.
-test test-oldest coverage coverage-study paper: export OMP_NUM_THREADS := 1
-test test-oldest coverage coverage-study paper: export OPENBLAS_NUM_THREADS := 1
+test test-oldest coverage coverage-study gate paper: export OMP_NUM_THREADS := 1
+test test-oldest coverage coverage-study gate paper: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-test
 	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
@@ -65,6 +69,12 @@ paper: $(VENV)/.ready-test
 coverage-study: $(VENV)/.ready-test
 	$(VENV)/bin/python -m reproduction.coverage --page docs/coverage.md \
 		$(if $(DATA),--data-folder $(DATA)) $(STUDY_ARGS)
+
+gate: $(VENV)/.ready-test
+	$(VENV)/bin/python -m reproduction.gate $(if $(DATA),--data-folder $(DATA)) $(GATE_ARGS)
+
+gate-quick: GATE_ARGS += --quick
+gate-quick: gate
 
 bench: $(VENV)/.ready-bench
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py $(BENCH_ARGS)

@@ -15,7 +15,7 @@ from hand_eye_calib.core.assessment.covariance import common_mode_floor, usual_s
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
 from reproduction.coverage.scores import answer
-from reproduction.gate import Case, real_cases
+from reproduction.gate.cases import Case, real_cases
 from reproduction.writing import markdown_table, seed_of, show, study_parser
 
 _REACH = 1.645

@@ -15,7 +15,7 @@ from source_code import ROOT
 LIMITS = {
     "hand_eye_calib": (180_000, 7.7, 720),
     "test": (145_000, 7.7, 270),
-    "reproduction": (42_000, 7.8, 150),
+    "reproduction": (42_000, 7.8, 160),
 }
 
 _NOT_CODE = {

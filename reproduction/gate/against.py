@@ -1,10 +1,7 @@
-"""``python -m reproduction.gate --data-folder DATA [--against FOLDER]``: what a change does to
-recordings that nobody has tuned on, in ten minutes.
+"""Answers of this version and of another one on the same recordings.
 
-Real recordings with a known answer, random pieces of them, and random platforms, drawn anew at
-every run: errors over those of another version of the package (a folder that holds
-``hand_eye_calib``), over the Cramer-Rao bound where there is one, NEES, and how often stated 90 %
-intervals hold the truth, with the common-mode floor and without.
+Errors over those of the other version, over the Cramer-Rao bound where there is one, NEES, and how
+often stated 90 % intervals hold the truth, with the common-mode floor and without.
 """
 
 import os
@@ -12,19 +9,16 @@ import pickle
 import subprocess
 import sys
 import tempfile
-from collections.abc import Container, Iterator
-from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
-from hand_eye_calib.core.geometry.trajectory import Trajectory
-from reproduction.coverage.mixed import MIXED, make
-from reproduction.recordings import between, real_rigs
-from reproduction.writing import markdown_table, seed_of, show, study_parser
+from reproduction.coverage.measures import MEDIAN_6
+from reproduction.gate.cases import Case
+from reproduction.writing import markdown_table
 
 # Runs with any version since 0.1: the answer, and its covariance without and with the allowance. In
 # earlier versions covariance was without it.
@@ -46,51 +40,7 @@ for streams, options in pickle.load(open(sys.argv[1], "rb")):
 pickle.dump(found, open(sys.argv[2], "wb"))
 """
 
-# Shortest and longest pieces, as shares of a recording; fewest poses of one.
-_SHARES, _FEWEST = (0.2, 0.7), 100
-_90_PERCENT, _MEDIAN_NEES = 1.645, 5.35
-
-
-class Case(NamedTuple):
-    """A recording: its truth, how well that is known (6,), and the bound (6, 6) if there is one."""
-
-    family: str
-    streams: tuple[Trajectory, Trajectory]
-    options: dict[str, Any]
-    T_parent_child: FloatArray
-    sigmas: FloatArray
-    bound: FloatArray | None = None
-
-
-def real_cases(
-    folder: Path, pieces: int, rng: np.random.Generator, asked: Container[str] = ("time_offset",)
-) -> Iterator[Case]:
-    """Recordings with a known answer, with some of their options, and random pieces of each."""
-    for rig in real_rigs(folder)[0]:
-        if rig.truth is None or rig.is_refused or rig.name == "boreas":
-            continue
-        options = {name: each for name, each in rig.options.items() if name in asked}
-        truth = rig.truth.T_parent_child, rig.truth.sigmas
-        family = rig.name.split("_")[0] if "kitti" not in rig.name else rig.name
-        for recording in rig.recordings.values():
-            streams = recording.parent, recording.child
-            yield Case(family, streams, options, *truth)
-            first = max(each.stamps_ns[0] for each in streams)
-            length = min(each.stamps_ns[-1] for each in streams) - first
-            for _ in range(pieces):
-                share = np.exp(rng.uniform(*np.log(_SHARES)))
-                start = first + int(rng.uniform(0.0, 1.0 - share) * length)
-                piece = [between(each, start, start + int(share * length)) for each in streams]
-                if min(map(len, piece)) >= _FEWEST:
-                    yield Case(family, (piece[0], piece[1]), options, *truth)
-
-
-def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
-    """Random platforms."""
-    for number, name in product(range(repeats), MIXED):
-        drive = make(name, seed, number)
-        truth = drive.T_parent_child, np.zeros(6)
-        yield Case(name, (drive.parent, drive.child), {}, *truth, drive.bound())
+_90_PERCENT = 1.645
 
 
 def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
@@ -147,20 +97,18 @@ def row(cases: list[Case], found: list[Any], others: dict[str, list[Any]]) -> di
         f"{100 * np.mean(each):.0f} %" if each else "" for each in inside
     )
     if squares:
-        cells["over bound"] = f"{np.sqrt(np.median(squares) / _MEDIAN_NEES):.2f}"
+        cells["over bound"] = f"{np.sqrt(np.median(squares) / MEDIAN_6):.2f}"
         cells["NEES"] = f"{np.median(nees):.1f}"
     return cells
 
 
-def table(cases: list[Case], package: Path, against: Path | None) -> str:
+def table(cases: list[Case], package: Path, against: Path) -> str:
     """A row for every family, and one for all."""
     found = solved(cases, package, {})
-    others = {}
-    if against is not None:
-        others = {
-            "its default": solved(cases, against, {}),
-            "its adaptive": solved(cases, against, {"method": "adaptive"}),
-        }
+    others = {
+        "its default": solved(cases, against, {}),
+        "its adaptive": solved(cases, against, {"method": "adaptive"}),
+    }
     rows = []
     families = [*dict.fromkeys(case.family for case in cases)]
     for family in (*families, "all"):
@@ -175,25 +123,3 @@ def table(cases: list[Case], package: Path, against: Path | None) -> str:
         )
     columns = [*dict.fromkeys(name for each in rows for name in each)]
     return markdown_table([{name: each.get(name, "") for name in columns} for each in rows])
-
-
-def main() -> None:
-    """Draw, solve and print."""
-    parser = study_parser("reproduction.gate", __doc__)
-    parser.add_argument("--against", type=Path, help="folder with another version of the package")
-    parser.add_argument("--pieces", type=int, default=2, help="of each real recording")
-    parser.add_argument("--repeats", type=int, default=4, help="recordings of each platform")
-    parser.add_argument("--seed", type=int, help="default: another one at every run")
-    arguments = parser.parse_args()
-    seed = seed_of(arguments.seed)
-    cases = [*simulated_cases(seed, arguments.repeats)]
-    if arguments.data_folder:
-        rng = np.random.default_rng(seed)
-        cases = [*real_cases(arguments.data_folder, arguments.pieces, rng), *cases]
-    package = Path(__file__).resolve().parents[1]
-    drawn_by = f"Seed {seed}, {len(cases)} recordings."
-    show(arguments.page, {"gate": f"{drawn_by}\n\n{table(cases, package, arguments.against)}"})
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,1 @@
+"""What a change of the package does to errors and stated uncertainties."""

@@ -1,0 +1,260 @@
+"""Scores of one version against stored ones: what counts as a regression."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import InputError
+from reproduction.coverage.measures import COVERAGE, MEDIAN_6
+from reproduction.gate.scores import Score
+from reproduction.writing import TableRow
+
+# Verdicts from the least strict to the strictest; the last: no answer.
+_VERDICTS = ("USE", "USE WITH CARE", "DO NOT USE", "")
+
+# Families with fewer recordings are shown, and judged with all others only.
+_FEWEST_RECORDINGS = 8
+
+# Added in quadrature to errors before they are compared, as a share of the family's median error:
+# an error that is zero by luck is no achievement.
+_LUCK = 0.5
+
+# Standard errors: figures of recordings drawn anew are beyond by chance once in 4,000 runs.
+_CHANCE = 3.5
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Limits of a regression.
+
+    Solves repeat to the last bits on one machine. Other versions of NumPy, SciPy or their BLAS
+    change decisions of the estimator in a few of a hundred recordings.
+    """
+
+    # Geometric mean of the errors over those of the baseline.
+    error_ratio: float
+    # How much farther than in the baseline the share of true values in measured 90 % intervals may
+    # be from 90 %, and how much the share in intervals with the allowance may fall.
+    coverage: float
+    # Factor by which the median squared error under the measured covariance may change.
+    nees: float
+    # Share of recordings whose verdict may be stricter.
+    stricter: float
+
+
+_OF_ALL = Tolerances(error_ratio=1.03, coverage=0.02, nees=1.15, stricter=0.05)
+_OF_FAMILY = Tolerances(error_ratio=1.15, coverage=0.10, nees=1.6, stricter=0.34)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Stored scores, the seed of their recordings, and the versions that they were made with."""
+
+    seed: int
+    versions: str
+    scores: dict[str, Score]
+
+    @classmethod
+    def read(cls, path: Path) -> "Baseline":
+        """Read a file that :meth:`write` wrote."""
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            scores = [_score_of(values) for values in content["scores"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path} is no baseline: {error}. Write one with --update") from error
+        by_name = {score.name: score for score in scores}
+        return cls(content["seed"], content["versions"], by_name)
+
+    def write(self, path: Path) -> None:
+        """Write a file with a line for each recording."""
+        lines = [json.dumps(_values_of(score)) for score in self.scores.values()]
+        scores = ",\n".join(lines)
+        head = f'"seed": {self.seed},\n"versions": {json.dumps(self.versions)}'
+        path.write_text(f'{{\n{head},\n"scores": [\n{scores}\n]\n}}\n', encoding="utf-8")
+
+
+def _values_of(score: Score) -> dict[str, Any]:
+    """Values that differ from those of a recording without an answer, rounded."""
+    empty = asdict(Score(family="", name="", verdict=""))
+    values = {name: value for name, value in asdict(score).items() if value != empty[name]}
+    for name in ("over_bound", "nees"):
+        if name in values:
+            values[name] = float(f"{values[name]:.4g}")
+    if score.errors:
+        values["errors"] = [float(f"{error:.4g}") for error in score.errors]
+    return values
+
+
+def _score_of(values: dict[str, Any]) -> Score:
+    errors = tuple(values.get("errors", ()))
+    return Score(**{"verdict": "", **values, "errors": errors})
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Figures of some recordings beside those of the baseline; ``failures`` are sentences."""
+
+    row: TableRow
+    failures: list[str]
+
+
+def compare(scores: Sequence[Score], baseline: Baseline) -> list[Comparison]:
+    """Compare scores family by family, then all together; the baseline has all of them."""
+    families = [*dict.fromkeys(score.family for score in scores)]
+    comparisons = []
+    for family in families:
+        members = [score for score in scores if score.family == family]
+        before = [baseline.scores[score.name] for score in members]
+        is_judged = len(members) >= _FEWEST_RECORDINGS
+        tolerances = _OF_FAMILY if is_judged else None
+        comparisons.append(_comparison(family, members, before, tolerances))
+    before = [baseline.scores[score.name] for score in scores]
+    comparisons.append(_comparison("all", scores, before, _OF_ALL))
+    return comparisons
+
+
+def _comparison(
+    family: str, now: Sequence[Score], before: Sequence[Score], tolerances: Tolerances | None
+) -> Comparison:
+    figures = _figures(now)
+    old_figures = _figures(before)
+    figures["error / baseline"] = error_ratio(now, before)
+    figures["stricter"] = float(sum(_is_stricter(*pair) for pair in zip(now, before, strict=True)))
+    row: dict[str, object] = {"family": family, "recordings": len(now)}
+    for name, value in figures.items():
+        text = _FORMATS[name].format(value)
+        if name in old_figures:
+            text += f" ({_FORMATS[name].format(old_figures[name])})"
+        row[name] = "" if np.isnan(value) else text
+    failures = [] if tolerances is None else [*_failures(figures, old_figures, tolerances, now)]
+    row["result"] = _result(failures) if tolerances else ""
+    return Comparison(row, [f"{family}: {failure}" for failure in failures])
+
+
+_FORMATS = {
+    "error / bound": "{:.2f}",
+    "90 % covers": "{:.1%}",
+    "with allowance": "{:.1%}",
+    "NEES": "{:.2f}",
+    "no answer": "{:.0f}",
+    "USE but wrong": "{:.0f}",
+    "error / baseline": "{:.3f}",
+    "stricter": "{:.0f}",
+}
+
+
+def _figures(scores: Sequence[Score]) -> dict[str, float]:
+    """Figures of one version."""
+    over_bound = [score.over_bound for score in scores if score.over_bound is not None]
+    nees = [score.nees for score in scores if score.nees is not None]
+    axes = sum(score.axes for score in scores)
+    inside = sum(score.inside for score in scores)
+    inside_allowance = sum(score.inside_allowance for score in scores)
+    return {
+        "error / bound": float(np.sqrt(np.median(over_bound) / MEDIAN_6)) if over_bound else np.nan,
+        "90 % covers": inside / axes if axes else np.nan,
+        "with allowance": inside_allowance / axes if axes else np.nan,
+        "NEES": float(np.median(nees)) if nees else np.nan,
+        "no answer": float(sum(not score.verdict for score in scores)),
+        "USE but wrong": float(sum(score.is_wrong for score in scores)),
+    }
+
+
+def error_ratio(now: Sequence[Score], before: Sequence[Score]) -> float:
+    """Geometric mean of errors over those of the same recordings in the baseline."""
+    logs: list[float] = []
+    for family in dict.fromkeys(score.family for score in before):
+        pairs = [
+            (new.errors, old.errors)
+            for new, old in zip(now, before, strict=True)
+            if old.family == family and old.errors and len(new.errors) == len(old.errors)
+        ]
+        if pairs:
+            errors = np.array(pairs)
+            luck = _LUCK * np.median(errors[:, 1], axis=0)
+            tempered = np.hypot(errors, luck)
+            logs += list(np.log(tempered[:, 0] / tempered[:, 1]).ravel())
+    return float(np.exp(np.mean(logs))) if logs else np.nan
+
+
+def _is_stricter(new: Score, old: Score) -> bool:
+    return _VERDICTS.index(new.verdict) > _VERDICTS.index(old.verdict)
+
+
+def _failures(
+    figures: dict[str, float],
+    old_figures: dict[str, float],
+    tolerances: Tolerances,
+    scores: Sequence[Score],
+) -> Iterator[str]:
+    """Sentences about figures beyond their tolerances. A figure that is NaN is never beyond."""
+    if figures["error / baseline"] > tolerances.error_ratio:
+        yield (
+            f"errors are {figures['error / baseline']:.3f} times those of the baseline; the limit "
+            f"is {tolerances.error_ratio}"
+        )
+    distance = abs(figures["90 % covers"] - COVERAGE)
+    old_distance = abs(old_figures["90 % covers"] - COVERAGE)
+    if distance > old_distance + tolerances.coverage:
+        yield (
+            f"90 % intervals cover {figures['90 % covers']:.1%}, before "
+            f"{old_figures['90 % covers']:.1%}"
+        )
+    if figures["with allowance"] < old_figures["with allowance"] - tolerances.coverage:
+        yield (
+            f"90 % intervals with the allowance cover {figures['with allowance']:.1%}, before "
+            f"{old_figures['with allowance']:.1%}"
+        )
+    if abs(np.log(figures["NEES"] / old_figures["NEES"])) > np.log(tolerances.nees):
+        yield f"the median NEES is {figures['NEES']:.2f}, before {old_figures['NEES']:.2f}"
+    for name in ("no answer", "USE but wrong"):
+        if figures[name] > old_figures[name]:
+            yield f"{name}: {figures[name]:.0f} recordings, before {old_figures[name]:.0f}"
+    if figures["stricter"] > max(1.0, tolerances.stricter * len(scores)):
+        yield f"{figures['stricter']:.0f} verdicts are stricter"
+
+
+def compare_new_draw(scores: Sequence[Score], old_scores: Sequence[Score]) -> Comparison:
+    """Compare figures of recordings drawn anew with those of others of the same families.
+
+    The seed of the baseline can be tuned on, a new one cannot. Differences count beyond
+    ``_CHANCE`` standard errors.
+    """
+    figures = _figures(scores)
+    old_figures = _figures(old_scores)
+    failures = []
+    if _excess([_log_errors(scores), _log_errors(old_scores)]) > _CHANCE:
+        failures.append("new draw: errors over their bound are larger than in the baseline")
+    shares = [_shares_outside(scores), _shares_outside(old_scores)]
+    if _excess(shares) > _CHANCE:
+        failures.append("new draw: 90 % intervals cover less than in the baseline")
+    row: dict[str, object] = {"family": "platforms drawn anew", "recordings": len(scores)}
+    for name, form in _FORMATS.items():
+        is_known = name in figures
+        text = f"{form} ({form})"
+        row[name] = text.format(figures[name], old_figures[name]) if is_known else ""
+    return Comparison(row | {"result": _result(failures)}, failures)
+
+
+def _log_errors(scores: Sequence[Score]) -> FloatArray:
+    return np.array([np.log(score.over_bound) for score in scores if score.over_bound])
+
+
+def _shares_outside(scores: Sequence[Score]) -> FloatArray:
+    return np.array([1.0 - score.inside / score.axes for score in scores if score.axes])
+
+
+def _excess(samples: Sequence[FloatArray]) -> float:
+    """Mean of the first sample less that of the second, in standard errors."""
+    new, old = samples
+    error = np.sqrt(new.var(ddof=1) / len(new) + old.var(ddof=1) / len(old))
+    return float((new.mean() - old.mean()) / error)
+
+
+def _result(failures: Sequence[str]) -> str:
+    return "worse" if failures else "ok"

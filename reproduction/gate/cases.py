@@ -1,0 +1,96 @@
+"""Recordings of the gate: simulated ones by seed, real ones with a known answer, and pieces."""
+
+from collections.abc import Container, Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from reproduction.coverage import classes, mixed
+from reproduction.recordings import Recording, between, real_rigs
+
+# Shortest and longest pieces, as shares of a recording.
+_SHARES = (0.2, 0.7)
+_FEWEST_POSES = 100
+
+
+class Case(NamedTuple):
+    """A recording: its truth, how well that is known (6,), and the bound (6, 6) if there is one."""
+
+    family: str
+    name: str
+    streams: tuple[Trajectory, Trajectory]
+    options: dict[str, Any]
+    T_parent_child: FloatArray
+    sigmas: FloatArray
+    bound: FloatArray | None = None
+    # The motion leaves an axis open: an answer on all six axes is wrong.
+    is_refused: bool = False
+
+
+def simulated_case(family: str, seed: int, number: int) -> Case:
+    """Draw a recording of a random platform, or of a class of the coverage study."""
+    if family in mixed.MIXED:
+        drive = mixed.make(family, seed, number)
+    else:
+        drive = classes.make(family, seed + number)
+    return Case(
+        family=family,
+        name=f"{family} {number}",
+        streams=(drive.parent, drive.child),
+        options={},
+        T_parent_child=drive.T_parent_child,
+        sigmas=np.zeros(6),
+        bound=drive.bound(),
+        is_refused=family in classes.REFUSED,
+    )
+
+
+def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
+    """Random platforms."""
+    for number, family in product(range(repeats), mixed.MIXED):
+        yield simulated_case(family, seed, number)
+
+
+def real_cases(
+    folder: Path,
+    pieces: int,
+    rng: np.random.Generator,
+    option_names: Container[str] = ("time_offset",),
+) -> Iterator[Case]:
+    """Recordings with a known answer, with some of their options, and random pieces of each."""
+    for rig in real_rigs(folder)[0]:
+        if rig.truth is None or rig.is_refused or rig.name == "boreas":
+            continue
+        options = {name: value for name, value in rig.options.items() if name in option_names}
+        family = rig.name if "kitti" in rig.name else rig.name.split("_")[0]
+        for name, recording in rig.recordings.items():
+            streams = recording.parent, recording.child
+            for number, part in enumerate([streams, *_pieces(recording, pieces, rng)]):
+                yield Case(
+                    family=family,
+                    name=f"{rig.name} {name} {number}",
+                    streams=part,
+                    options=options,
+                    T_parent_child=rig.truth.T_parent_child,
+                    sigmas=rig.truth.sigmas,
+                )
+
+
+def _pieces(
+    recording: Recording, count: int, rng: np.random.Generator
+) -> Iterator[tuple[Trajectory, Trajectory]]:
+    """Random pieces of a recording; those with too few poses are left out."""
+    parent, child = recording.parent, recording.child
+    first_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
+    length_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1]) - first_ns
+    for _ in range(count):
+        share = np.exp(rng.uniform(*np.log(_SHARES)))
+        start_ns = first_ns + int(rng.uniform(0.0, 1.0 - share) * length_ns)
+        end_ns = start_ns + int(share * length_ns)
+        piece = between(parent, start_ns, end_ns), between(child, start_ns, end_ns)
+        if min(map(len, piece)) >= _FEWEST_POSES:
+            yield piece
