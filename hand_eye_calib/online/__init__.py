@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from hand_eye_calib.core.base.registry import COMMANDS, Command
+from hand_eye_calib.core.base.registry import COMMANDS, RESULT_PARTS, Command
 
 
 def register() -> None:
-    """Register the commands ``calibrator`` and ``watch``."""
+    """Register the commands ``calibrator`` and ``watch``, and the goal of a session."""
+    RESULT_PARTS["goal"] = _goal
     COMMANDS["calibrator"] = Command("run the ROS 2 node", _calibrator)
     COMMANDS["watch"] = Command("show the live node on the terminal, or in a browser", _watch)
 
@@ -21,3 +22,10 @@ def _watch() -> Any:
     from hand_eye_calib.online.ros import watch
 
     return watch
+
+
+def _goal() -> Any:
+    from hand_eye_calib.core.results.parts import Part
+    from hand_eye_calib.online.live.progress import Progress, details
+
+    return Part("goal", lambda: Progress, details)

@@ -96,7 +96,7 @@ def tables(rigs: Sequence[Recorded], seed: int) -> str:
     for each in rigs:
         whole = [each.results] if len(each.results) > 3 else []
         for some in (*whole, *_subsets(each.results, 3)[:2]):
-            said = together(some).together
+            said = together(some).parts["together"]
             several += 1
             accused += said is not None and said.kind in ("one off", "moved")
             foreign = str(rng.choice([*some]))
@@ -148,7 +148,7 @@ def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
 
 
 def _left_out(results: Mapping[str, Calibration]) -> set[str]:
-    said = together(results).together
+    said = together(results).parts["together"]
     assert said is not None
     return {each.name for each in said.recordings if each.left_out}
 

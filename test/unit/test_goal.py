@@ -158,7 +158,7 @@ def test_the_newest_of_equally_good_results_is_kept():
 
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
-    hec.save(dataclasses.replace(made(), goal=progress), tmp_path)
+    hec.save(made().with_part("goal", progress), tmp_path)
     found = hec.load(tmp_path).goal
     assert found == progress
     assert found.sentence == progress.sentence

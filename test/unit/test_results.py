@@ -20,11 +20,12 @@ from hand_eye_calib.core.base.plain import json_text, plain
 from hand_eye_calib.core.checks import findings as wording
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.core.results.context import AxisProgress, Progress, RateBias
 from hand_eye_calib.core.results.records import AxisScatter, CorrelatedError, Noise
+from hand_eye_calib.extras.partial.rate_bias import RateBias
 from hand_eye_calib.formats.results import load_result, save_result
 from hand_eye_calib.formats.yaml_files import yaml_text
 from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.online.live.progress import AxisProgress, Progress
 
 FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 
@@ -66,8 +67,10 @@ def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
     written = calibration(
         findings=(wording.finding("rotation_gain", "child", axis="0, 0, 1", **gain),),
         noise=noise,
-        goal=Progress(sentence="go on", axes={"x": axis}),
-        rate_bias=RateBias(of="child", rad_per_s=(0.1, 0.2, 0.3), sigma=(0.0, 0.0, 0.0)),
+        parts={
+            "goal": Progress(sentence="go on", axes={"x": axis}),
+            "rate_bias": RateBias(of="child", rad_per_s=(0.1, 0.2, 0.3), sigma=(0.0, 0.0, 0.0)),
+        },
         contradictions={"x": 4.5},
         measured="rotations",
     )
@@ -359,3 +362,12 @@ def test_a_document_whose_covariance_is_not_the_sum_of_its_parts_is_refused():
     changed = document | {"covariance": {"matrix": (1e-4 * np.eye(6)).tolist()}}
     with pytest.raises(InputError, match="covariance is not the sum of covariance_measured"):
         Calibration.from_dict(changed)
+
+
+def test_a_result_without_a_part_has_its_attributes_empty_and_no_others():
+    result = calibration()
+    without = (result.goal, result.together, result.rate_bias, result.T_world_world)
+    assert without == (None,) * 4
+    assert (result.parent_world_frame, result.child_world_frame) == ("", "")
+    with pytest.raises(AttributeError, match="no attribute 'T_child_paren'"):
+        _ = result.T_child_paren

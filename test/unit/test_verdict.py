@@ -14,9 +14,9 @@ from source_code import ROOT
 
 from hand_eye_calib.core.results import verdict as rules
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.core.results.context import Together
 from hand_eye_calib.core.results.records import AxisScatter, Finding, Severity
 from hand_eye_calib.core.results.verdict import RULES
+from hand_eye_calib.extras.fleet.records import Together
 
 PAGE = ROOT / "docs" / "verdict.md"
 TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
@@ -65,10 +65,10 @@ CASES = {
     "error_finding": dict(findings=(FINDING,)),
     "not_converged": dict(status=SolveStatus.NOT_CONVERGED),
     "nothing_known": dict(observability_measured=observed(np.inf, np.inf)),
-    "recordings_differ": dict(together=several("differ")),
+    "recordings_differ": dict(parts={"together": several("differ")}),
     "unobservable": dict(observability_measured=observed(z=np.inf)),
     "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
-    "recordings": dict(together=several("one off")),
+    "recordings": dict(parts={"together": several("one off")}),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
     "unconfirmed": dict(

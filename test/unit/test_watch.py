@@ -18,7 +18,8 @@ from rich.console import Console
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.plain import from_plain, plain
 from hand_eye_calib.core.results import context
-from hand_eye_calib.core.results.context import AxisProgress, Comparison, Difference, Progress
+from hand_eye_calib.core.results.context import Comparison, Difference
+from hand_eye_calib.online.live.progress import AxisProgress, Progress
 from hand_eye_calib.online.live.state import (
     Broadcast,
     ChecksState,

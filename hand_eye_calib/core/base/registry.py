@@ -71,6 +71,33 @@ class Route(NamedTuple):
     run: Callable[[Any, Callable[[Any], Any]], int]
 
 
+class ExtraRule(NamedTuple):
+    """A rule of the verdict that an extra adds, see ``core/results/verdict.py``.
+
+    Attributes
+    ----------
+    after : str
+        Name of the rule that it follows.
+    forbids : bool
+        Whether its reasons lead to DO NOT USE, rather than to USE WITH CARE.
+    when : str
+        The condition in words.
+    find : callable
+        Yield sentence, what to do, axes and options of each reason of a result.
+    """
+
+    after: str
+    forbids: bool
+    when: str
+    find: Callable[[Any], Any]
+
+
+#: Rules of the verdict that extras add, by their names.
+EXTRA_RULES: Registry[ExtraRule] = Registry("rule")
+
+#: Parts of results that layers above the core add: functions that return a ``Part``.
+RESULT_PARTS: Registry[Callable[[], Any]] = Registry("part of a result")
+
 #: Modules of the public names of the extras.
 PUBLIC_NAMES: Registry[str] = Registry("public name")
 

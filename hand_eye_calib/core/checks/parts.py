@@ -172,10 +172,11 @@ def _check_moving(
 
 def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
     """Remove the estimated gyroscope bias from pose pairs."""
-    if not calibration.rate_bias:
+    rate_bias = calibration.parts.get("rate_bias")
+    if not rate_bias:
         return pairs
-    bias = np.array(calibration.rate_bias.rad_per_s)
-    if calibration.rate_bias.of == "parent":
+    bias = np.array(rate_bias.rad_per_s)
+    if rate_bias.of == "parent":
         return replace(pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias))
     return replace(pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias))
 

@@ -15,6 +15,7 @@ from hand_eye_calib.core.base.text import AXIS_UNITS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.core.results import document
+from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import AXES, DofObservability, DofVerdict, SolveStatus
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 
@@ -89,7 +90,7 @@ class Calibration(Judged):
         """The result with the roles of both sensors exchanged: the pose of the parent sensor in the
         child sensor's frame. What was compared with it is left out.
         """
-        T, Z, of_Z = self.T_parent_child, self.T_world_world, self.cov_world_world
+        T = self.T_parent_child
         covariance = inverse_covariance(T, self.covariance_measured)
         sigmas = sigmas_in_parent(self.T_child_parent[:3, :3], covariance)
         if self.unobservable():
@@ -103,16 +104,13 @@ class Calibration(Judged):
             self,
             T_parent_child=self.T_child_parent,
             T_method=None if self.T_method is None else se3.inverse(self.T_method),
-            T_world_world=None if Z is None else se3.inverse(Z),
-            cov_world_world=None if Z is None or of_Z is None else inverse_covariance(Z, of_Z),
             T_base_parent=None,
             covariance_measured=covariance,
             covariance_allowance=inverse_covariance(T, self.covariance_allowance),
             observability_measured=observability,
             parent_frame=self.child_frame,
             child_frame=self.parent_frame,
-            parent_world_frame=self.child_world_frame,
-            child_world_frame=self.parent_world_frame,
+            parts={name: part(name).invert(value) for name, value in self.parts.items()},
             time_offset_s=0.0 - self.time_offset_s,
             scale=1.0 / self.scale,
             scale_sigma=self.scale_sigma / self.scale**2,

@@ -17,6 +17,7 @@ from hand_eye_calib.core.base.text import amount, fixed, given_or_estimated, lis
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.core.geometry.trajectory import check_poses
+from hand_eye_calib.core.results.parts import ExtraTransform, all_parts, part
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS, CrossCheck, by_hand
 from hand_eye_calib.core.results.result import Result
 from hand_eye_calib.core.results.verdict import Judged, Verdict
@@ -28,9 +29,9 @@ _VERSION = 2
 _READABLE = (1, 2)
 
 # Fields that a document has under other names, as matrices; and those that files do not have.
-_TRANSFORMS = ("T_parent_child", "T_method", "T_world_world", "T_base_parent")
-_COVARIANCES = ("covariance_measured", "covariance_allowance", "cov_world_world")
-_NOT_IN_FILES = ("motion_residuals", "recording")
+_TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
+_COVARIANCES = ("covariance_measured", "covariance_allowance")
+_NOT_IN_FILES = ("motion_residuals", "recording", "parts")
 
 # The fields of a covariance in version 2 and what they were called in version 1.
 _OLD_COVARIANCES = {"covariance_measured": "covariance", "covariance_allowance": "floor"}
@@ -84,13 +85,12 @@ def document_of(result: Judged) -> Document:
     if result.T_method is not None:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
         document["T_method"] = {"of": of, "matrix": result.T_method}
-    if result.cov_world_world is not None:
-        of, world = "error xi in T_world_world @ exp(xi)", result.child_world_frame
-        document["cov_world_world"] = _matrix_of(of, world, result.cov_world_world)
     left_out = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
     for name in (each.name for each in fields(result)):
         if name not in left_out.union(document):
             document[name] = getattr(result, name)
+    for added in all_parts():
+        document |= added.write(result.parts.get(added.name))
     return plain(document)
 
 
@@ -101,9 +101,9 @@ def _covariances_of(result: Result) -> Document:
     measured = f"{of}: the part that the recording shows"
     allowance = f"{of}: the allowance for constant errors, which no recording shows"
     return {
-        "covariance": _matrix_of(of, child, result.covariance) | {"order": order},
-        "covariance_measured": _matrix_of(measured, child, result.covariance_measured),
-        "covariance_allowance": _matrix_of(allowance, child, result.covariance_allowance),
+        "covariance": matrix_of(of, child, result.covariance) | {"order": order},
+        "covariance_measured": matrix_of(measured, child, result.covariance_measured),
+        "covariance_allowance": matrix_of(allowance, child, result.covariance_allowance),
     }
 
 
@@ -131,17 +131,19 @@ def transforms_of(result: Result) -> dict[str, Notation]:
     ]
     if result.T_base_child is not None:
         rows.append(("T_base_child", result.T_base_child, child, result.base_frame, own, None))
-    if result.T_world_world is not None and result.cov_world_world is not None:
-        worlds = result.child_world_frame, result.parent_world_frame
-        of_worlds = result.cov_world_world, np.zeros((6, 6))
-        rows.append(("T_world_world", result.T_world_world, *worlds, of_worlds, None))
+    extra = extra_transforms(result)
+    for name, added in extra.items():
+        added_covariances = added.covariance, np.zeros((6, 6))
+        rows.append(
+            (name, added.T_target_source, added.source, added.target, added_covariances, None)
+        )
     found = {}
     for name, T, source, target, covariances, sigmas_m in rows:
         measured, allowance = covariances
         sigmas = sigmas_rpy(T, measured)
         along, allowance_m = (sigmas_in_parent(T[:3, :3], each)[:3] for each in covariances)
         if sigmas_m is None:
-            is_unsure = bool(hidden) or name == "T_world_world"
+            is_unsure = bool(hidden) or name in extra
             sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
         is_turn_known = not {*ROTATIONS} & hidden
         # Near gimbal lock roll and yaw have no standard deviation and are known.
@@ -160,7 +162,15 @@ def transforms_of(result: Result) -> dict[str, Notation]:
     return found
 
 
-def _matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
+def extra_transforms(result: Result) -> dict[str, ExtraTransform]:
+    """Transforms of the parts of a result by their names."""
+    found: dict[str, ExtraTransform] = {}
+    for name, value in result.parts.items():
+        found |= part(name).transforms(value)
+    return found
+
+
+def matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
     """A covariance of a document, and what it is of."""
     return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
 
@@ -333,8 +343,8 @@ def _measured_parts(data: Mapping[str, Any]) -> Document:
         document |= {name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data}
         document["observability_measured"] = data["observability"]
         return document
-    whole = _covariance_of(data["covariance"])
-    parts = [_covariance_of(data[name]) for name in _OLD_COVARIANCES]
+    whole = covariance_of(data["covariance"])
+    parts = [covariance_of(data[name]) for name in _OLD_COVARIANCES]
     if not np.allclose(whole, parts[0] + parts[1], rtol=1e-6, atol=1e-300):
         raise ValueError("covariance is not the sum of covariance_measured and its allowance")
     document["observability_measured"] = [
@@ -347,17 +357,19 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     """Build a result from a document of the right format. Raises KeyError, TypeError or ValueError
     if a value is missing or was changed.
     """
-    from hand_eye_calib.core.results.context import Comparison, Progress, RateBias, Together
+    from hand_eye_calib.core.results.context import Comparison
 
-    readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), _transform_of)
-    readers |= dict.fromkeys(_COVARIANCES, _covariance_of)
+    readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), transform_of)
+    readers |= dict.fromkeys(_COVARIANCES, covariance_of)
     arrays = {name: read(data[name]) for name, read in readers.items() if name in data}
     if "T_base_child" in arrays:
         T_child_parent = se3.inverse(arrays["T_parent_child"])
         arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
     known = {name: each for name, each in data.items() if name not in _NOT_IN_FILES}
-    types = {each.__name__: each for each in (Comparison, Progress, RateBias, Together)}
-    result: _OfResult = from_plain(of, known | arrays, **types)
+    found = {added.name: added.read(data) for added in all_parts()}
+    parts = {name: value for name, value in found.items() if value is not None}
+    result: _OfResult = from_plain(of, known | arrays, Comparison=Comparison)
+    result = replace(result, parts=parts)
     if data["version"] == 1 and result.cross_check:
         result = replace(result, cross_check=_with_allowance(result))
     if tuple(dof.name for dof in result.observability) != AXES:
@@ -389,14 +401,14 @@ def _with_allowance(result: Result) -> CrossCheck:
     return rows
 
 
-def _transform_of(data: Mapping[str, Any]) -> FloatArray:
+def transform_of(data: Mapping[str, Any]) -> FloatArray:
     """Transform (4, 4) of a document."""
     matrix = _matrix(data, 4)
     check_poses(matrix[None])
     return matrix
 
 
-def _covariance_of(data: Mapping[str, Any]) -> FloatArray:
+def covariance_of(data: Mapping[str, Any]) -> FloatArray:
     """Covariance (6, 6) of a document; infinite for what is unknown."""
     matrix = _matrix(data, 6)
     known = np.isfinite(matrix)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -13,17 +13,16 @@ from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.core.results import records
+from hand_eye_calib.core.results.parts import all_parts
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from hand_eye_calib.core.results.context import Comparison, Progress, RateBias, Together
+    from hand_eye_calib.core.results.context import Comparison
 
 _FRAMES = (
     "parent_frame",
     "child_frame",
-    "parent_world_frame",
-    "child_world_frame",
     "base_frame",
 )
 
@@ -57,11 +56,6 @@ class Result:
         By how much the offset changes with time, if it was estimated.
     scale, scale_sigma : float
         Factor applied to the child's translations, in the same way.
-    rate_bias : RateBias or None
-        None if neither stream is one of rates.
-    T_world_world, cov_world_world : (4, 4), (6, 6) arrays or None
-        Of poses that are stops: pose of the child's world in the parent's (Z of A X = Z B), and
-        its covariance in the child's world.
 
     Uncertainty
 
@@ -110,8 +104,6 @@ class Result:
     Context
 
     parent_frame, child_frame : str
-    parent_world_frame, child_world_frame : str
-        Of poses that are stops.
     base_frame : str
         Frame of the robot in which the child's pose is stated as well; empty for none.
     T_base_parent : (4, 4) array or None
@@ -122,10 +114,9 @@ class Result:
         Axis to a target of its own, m or rad.
     comparison : Comparison or None
         With what is installed.
-    goal : Progress or None
-        How far the session was from its goal when the result was saved.
-    together : Together or None
-        The recordings, if the result is of several.
+    parts : mapping
+        What layers above the core add, by name: ``goal``, ``together``, ``rate_bias``, ``worlds``.
+        A result has their values as attributes, too (:mod:`hand_eye_calib.core.results.parts`).
     """
 
     T_parent_child: FloatArray
@@ -143,9 +134,6 @@ class Result:
     clock_rate: records.ClockRate | None = None
     scale: float = 1.0
     scale_sigma: float = 0.0
-    rate_bias: "RateBias | None" = None
-    T_world_world: FloatArray | None = None
-    cov_world_world: FloatArray | None = None
 
     covariance_measured: FloatArray
     covariance_allowance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
@@ -168,22 +156,33 @@ class Result:
 
     parent_frame: str = "parent"
     child_frame: str = "child"
-    parent_world_frame: str = ""
-    child_world_frame: str = ""
     base_frame: str = ""
     T_base_parent: FloatArray | None = None
     target_translation: float = CalibratorConfig.target_translation
     target_rotation: float = CalibratorConfig.target_rotation
     target_axes: Mapping[str, float] = field(default_factory=dict)
     comparison: "Comparison | None" = None
-    goal: "Progress | None" = None
-    together: "Together | None" = None
+    parts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in _FRAMES:  # tf2 refuses the leading slash of ROS 1
             frame = getattr(self, name)
             if isinstance(frame, str):  # a file that was changed may have anything
                 object.__setattr__(self, name, frame_name(frame))
+
+    if not TYPE_CHECKING:  # a misspelt attribute stays an error of types
+
+        def __getattr__(self, name: str) -> Any:
+            """Return an attribute of a part."""
+            for part in () if name.startswith("_") else all_parts():
+                if name in part.without:
+                    value = self.parts.get(part.name)
+                    return part.without[name] if value is None else part.attribute(value, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def with_part(self, name: str, value: object) -> Self:
+        """Return the result with a part that a layer above the core adds."""
+        return replace(self, parts={**self.parts, name: value})
 
     @property
     def rotation(self) -> "Rotation":

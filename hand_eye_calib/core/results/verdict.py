@@ -12,6 +12,7 @@ from functools import cached_property, partial
 from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.core.base.config import METHODS
+from hand_eye_calib.core.base.registry import EXTRA_RULES
 from hand_eye_calib.core.base.text import amount, amount_beside, axes_in_words, listing
 from hand_eye_calib.core.results.records import (
     ROTATIONS,
@@ -366,21 +367,6 @@ def _floor(result: Result) -> Iterator[_Found]:
         yield text, _OF_FLOOR, names, {}
 
 
-_OF_RECORDINGS = {
-    "differ": "record once more: then the one that is off shows",
-    "moved": "calibrate from the recordings since then alone",
-    "one off": "find out what was different in that recording; it is left out",
-    "scatter": "look for what changes from recording to recording; the standard deviations contain "
-    "the scatter",
-}
-
-
-def _recordings(kinds: Sequence[str], result: Result) -> Iterator[_Found]:
-    """Several recordings that belong together in one of these ways."""
-    if result.together and result.together.kind in kinds:
-        yield result.together.sentence, _OF_RECORDINGS[result.together.kind], (), {}
-
-
 # What the checks of streams that are no poses cannot see, and what to do.
 _UNSEEN = {
     "positions": (
@@ -434,7 +420,7 @@ _APART = (
     f"{CONTRADICTED_SHARE:g} of the target"
 )
 
-RULES = (
+_OWN_RULES = (
     Rule(
         "prior",
         _NEVER,
@@ -451,25 +437,12 @@ RULES = (
     # Behind the faults of the streams, which are often its cause.
     Rule("not_converged", _NEVER, "the solver did not converge", _not_converged),
     Rule("nothing_known", _NEVER, "all six axes are unobservable; of stops, any", _nothing_known),
-    Rule(
-        "recordings_differ",
-        _NEVER,
-        "of several recordings two differ and there is no third, all differ, or the mount has "
-        "moved between them",
-        partial(_recordings, ("differ", "moved")),
-    ),
     Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
     Rule(
         "warning_finding",
         _CARE,
         "a stream check gave a warning",
         partial(_findings_of, Severity.WARNING),
-    ),
-    Rule(
-        "recordings",
-        _CARE,
-        "of several recordings one is off and left out, or all scatter more than usual",
-        partial(_recordings, ("one off", "scatter")),
     ),
     Rule(
         "halves",
@@ -516,3 +489,18 @@ RULES = (
         _part_of_poses,
     ),
 )
+
+
+def _with_extra_rules() -> tuple[Rule, ...]:
+    """Return the rules with those of the extras at their places."""
+    rules = [*_OWN_RULES]
+    for name, extra in EXTRA_RULES.items():
+        names = [rule.name for rule in rules]
+        verdict = _NEVER if extra.forbids else _CARE
+        place = names.index(extra.after) + 1
+        rules.insert(place, Rule(name, verdict, extra.when, extra.find))
+    return tuple(rules)
+
+
+#: Rules of the verdict, the gravest first.
+RULES = _with_extra_rules()

@@ -5,10 +5,13 @@ from typing import Any
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import (
     COMMANDS,
+    EXTRA_RULES,
     PUBLIC_NAMES,
+    RESULT_PARTS,
     ROUTES,
     SEVERAL_RECORDINGS,
     Command,
+    ExtraRule,
     Route,
 )
 
@@ -19,6 +22,20 @@ def register() -> None:
     PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.extras.fleet.together"
     COMMANDS["compare"] = Command(
         "compare results with what is installed, or with each other", _compare
+    )
+    RESULT_PARTS["together"] = _together
+    EXTRA_RULES["recordings_differ"] = ExtraRule(
+        "nothing_known",
+        True,
+        "of several recordings two differ and there is no third, all differ, or the mount has "
+        "moved between them",
+        _recordings_differ,
+    )
+    EXTRA_RULES["recordings"] = ExtraRule(
+        "warning_finding",
+        False,
+        "of several recordings one is off and left out, or all scatter more than usual",
+        _recordings,
     )
     ROUTES["batch"] = Route(_add_arguments, _is_batch, _run_batch)
     SEVERAL_RECORDINGS["one rig"] = _run_together
@@ -65,3 +82,22 @@ def _run_together(arguments: Any, groups: Any) -> int:
     from hand_eye_calib.extras.fleet.batch import run_together
 
     return run_together(arguments, groups)
+
+
+def _together() -> Any:
+    from hand_eye_calib.core.results.parts import Part
+    from hand_eye_calib.extras.fleet.records import Together, details
+
+    return Part("together", lambda: Together, details)
+
+
+def _recordings_differ(result: Any) -> Any:
+    from hand_eye_calib.extras.fleet.records import find_kinds
+
+    return find_kinds(("differ", "moved"), result)
+
+
+def _recordings(result: Any) -> Any:
+    from hand_eye_calib.extras.fleet.records import find_kinds
+
+    return find_kinds(("one off", "scatter"), result)

@@ -209,6 +209,7 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
     if counts:
         print(listing([f"{count} {verdict}" for verdict, count in counts.items()]))
     for name, each in vehicles.items():
-        sentence = each.together.sentence if each.together else ""
+        together = each.parts.get("together")
+        sentence = together.sentence if together else ""
         told = each.headline if sentence in each.headline else f"{each.headline}. {sentence}"
         print("\n".join(wrapped(f"{name}: {told}", "", "  ")))

@@ -70,7 +70,8 @@ def _trend(result: Calibration, number: int) -> Drawn:
     """The figure of a vehicle's recordings about their common extrinsic, axis by axis, over time;
     ``number`` is that of the vehicle on the page.
     """
-    recordings = result.together.recordings if result.together else ()
+    together = result.parts.get("together")
+    recordings = together.recordings if together else ()
     at = date2num(np.array([each.stamp_ns for each in recordings], dtype="datetime64[ns]"))
     apart = np.array([bool(each.left_out) for each in recordings])
     figure = Figure(figsize=(LOOK.width, 3.9), layout="constrained")

@@ -21,8 +21,8 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.geometry.trajectory import TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration, Verdict, data_frame
-from hand_eye_calib.core.results.context import Recorded, Together
 from hand_eye_calib.core.results.records import AXES, DofVerdict, SolveStatus
+from hand_eye_calib.extras.fleet.records import Recorded, Together
 from hand_eye_calib.offline.calibrate import calibrate
 
 if TYPE_CHECKING:
@@ -240,7 +240,7 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
         time_offset_s=offset_s,
         scale=scale,
         findings=tuple({each.code: each for one in used for each in one.findings}.values()),
-        together=record,
+        parts={"together": record},
         **{name: sum(getattr(one, name) for one in used) for name in _COUNTS},
         **{name: getattr(newest, name) for name in _OF_NEWEST},
     )

@@ -27,9 +27,9 @@ from hand_eye_calib.core.noise import increments
 from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
-from hand_eye_calib.core.results.context import RateBias
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.extras.partial import positions as of_positions
+from hand_eye_calib.extras.partial.rate_bias import RateBias
 
 # Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
 # at most, of two 0.5 and more.
@@ -242,7 +242,8 @@ def estimate_rotation(
     solved = replace(solved, floor=floor)
     checked = estimation.cross_checked(solved, config, rotations) if cross_check else None
     rate_bias = _rate_bias(solution, config) if has_rates else None
-    return replace(checked or solved.calibration(), rate_bias=rate_bias, findings=findings)
+    result = replace(checked or solved.calibration(), findings=findings)
+    return result.with_part("rate_bias", rate_bias) if rate_bias else result
 
 
 def _rotation(

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.registry import PUBLIC_NAMES, ROUTES, Route
+from hand_eye_calib.core.base.registry import PUBLIC_NAMES, RESULT_PARTS, ROUTES, Route
 
 # Files of an arm's samples.
 _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
@@ -12,6 +12,7 @@ _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 def register() -> None:
     """Register stops for ``calibrate``."""
+    RESULT_PARTS["worlds"] = _worlds
     PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.extras.stops.samples"
@@ -51,3 +52,9 @@ def _calibrate(arguments: Any, _: Any) -> int:
 
     refuse_stamps(arguments)
     return deliver(*stops.solved(arguments), arguments)
+
+
+def _worlds() -> Any:
+    from hand_eye_calib.extras.stops.worlds import WorldsPart
+
+    return WorldsPart()

@@ -29,6 +29,7 @@ from hand_eye_calib.extras.stops.checks import (
     turns_about_two_axes,
 )
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld, Stops, solve
+from hand_eye_calib.extras.stops.worlds import Worlds
 
 # Options that mean something for stops; those of groups by the beginnings of their names.
 _OBEYED = {
@@ -522,10 +523,7 @@ def _assessed(solved: _Solved, frames: list[str]) -> Calibration:
         scale_sigma=solved.scale_sigma,
         parent_frame=config.parent_frame or parent,
         child_frame=config.child_frame or child,
-        T_world_world=Z,
-        cov_world_world=of_Z,
-        parent_world_frame=parent_world,
-        child_world_frame=child_world,
+        parts={"worlds": Worlds(Z, of_Z, parent_world, child_world)},
     )
 
 

@@ -14,12 +14,14 @@ from hand_eye_calib.core.base.text import frame_name, listing
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.core.results.document import (
     allowance_in_words,
+    extra_transforms,
     parts_of_sigmas,
     printed_numbers,
     summary,
     transforms_of,
     usable_numbers,
 )
+from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.cli.options import (
@@ -121,14 +123,16 @@ def as_lines(
     """
     parent, child = calibration.parent_frame, calibration.child_frame
     transforms, lines = transforms_of(calibration), [*verdict_lines(calibration)]
-    for source, target, name in (
+    shown = [
         (child, parent, "T_parent_child"),
         (parent, child, "T_child_parent"),
-        (calibration.child_world_frame, calibration.parent_world_frame, "T_world_world"),
         (child, calibration.base_frame, "T_base_child"),
-    ):
+    ]
+    extra = extra_transforms(calibration)
+    shown += [(added.source, added.target, name) for name, added in extra.items()]
+    for source, target, name in shown:
         if name in transforms:
-            reach = () if name == "T_world_world" else calibration.out_of_reach
+            reach = () if name in extra else calibration.out_of_reach
             lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
             lines += transform_lines(transforms[name], reach, with_details)
             if name == "T_parent_child":
@@ -139,12 +143,8 @@ def as_lines(
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = []
-    if joint := calibration.together:
-        details += [joint.sentence] * (joint.sentence not in calibration.headline)
-        told = {one.name: f"left out, {one.left_out}" for one in joint.recordings if one.left_out}
-        details += [f"{one.name}: {told.get(one.name, one.headline)}" for one in joint.recordings]
-    if calibration.goal:
-        details.append(f"the session: {calibration.goal.sentence}")
+    for name, value in calibration.parts.items():
+        details += part(name).details(value, calibration.headline)
     if found := calibration.comparison:
         details.append(f"compared with what is installed ({found.installed}): {found.sentence}")
     if with_details:

@@ -15,9 +15,9 @@ from hand_eye_calib.core.assessment.excitation import Excitation, helpful_motion
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.text import axes_in_words, duration
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.core.results.context import AxisProgress, Progress
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
+from hand_eye_calib.online.live.progress import AxisProgress, Progress
 
 # Share of its target that the standard deviation of an axis must reach, allowance included.
 _SHARE = 0.7

@@ -5,7 +5,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 from hand_eye_calib.core.base.config import NodeConfig
 from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, NotEnoughDataError
@@ -54,7 +53,7 @@ class Saver:
         # A check may have been certain of other options.
         inputs = self._session.calibrator.inputs(self._session.topics)
         inputs |= {"options": snapshot.config.to_options()}
-        result = replace(result, goal=self._cycle.goal.progress)
+        result = result.with_part("goal", self._cycle.goal.progress)
         path = output_path(directory)
         if self._earlier_kept_in != directory:
             keep_earlier_results(path)

@@ -11,8 +11,9 @@ from enum import Enum, IntEnum
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.plain import plain
-from hand_eye_calib.core.results.context import Comparison, Progress
+from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.online.live.progress import Progress
 
 # The node says how it is so often (s). A disk, a solve under way and who listens may each hold up
 # its end for so long (s).

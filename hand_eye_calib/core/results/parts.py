@@ -1,0 +1,97 @@
+"""Parts of a result that layers above the core add."""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.plain import Document, from_plain
+from hand_eye_calib.core.base.registry import RESULT_PARTS
+
+
+class ExtraTransform(NamedTuple):
+    """A transform of a part: maps coordinates of ``source`` into ``target``; ``covariance`` (6, 6)
+    is that of its error in the source's frame.
+    """
+
+    T_target_source: FloatArray
+    source: str
+    target: str
+    covariance: FloatArray
+
+
+class Part:
+    """A part that is one record, under one name in results and documents.
+
+    Parameters
+    ----------
+    name : str
+    load : callable
+        Return the type of the record.
+    details : callable, optional
+        Return lines about the record of a result, whose headline is the second argument.
+
+    Attributes
+    ----------
+    without : mapping of str to object
+        Attributes of a result with the part, and their values in a result without it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        load: Callable[[], type],
+        details: Callable[[Any, str], list[str]] | None = None,
+    ) -> None:
+        self.name = name
+        self.load = load
+        self.without: Mapping[str, Any] = {name: None}
+        self._details = details
+
+    def attribute(self, value: Any, name: str) -> Any:
+        """Return an attribute of a result that has the part."""
+        return value
+
+    def write(self, value: Any) -> Document:
+        """Return the fields of a document for the part, which may be None."""
+        return {self.name: value}
+
+    def read(self, document: Mapping[str, Any]) -> Any:
+        """Return the part of a document; None if it has none.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If a value is missing or was changed.
+        """
+        value = document.get(self.name)
+        if value is None:
+            return None
+        try:
+            return from_plain(self.load(), value)
+        except TypeError as error:
+            raise TypeError(f"{self.name}: {error}") from None
+
+    def invert(self, value: Any) -> Any:
+        """Return the part of the result with both sensors exchanged."""
+        return value
+
+    def transforms(self, value: Any) -> dict[str, ExtraTransform]:
+        """Return the transforms of the part by their names."""
+        return {}
+
+    def details(self, value: Any, headline: str) -> list[str]:
+        """Return lines for a person about the part of a result with this headline."""
+        return self._details(value, headline) if self._details else []
+
+
+@cache
+def part(name: str) -> Part:
+    """Return a part by its name."""
+    found: Part = RESULT_PARTS[name]()
+    return found
+
+
+def all_parts() -> Iterator[Part]:
+    """Yield all parts that layers have registered."""
+    yield from map(part, RESULT_PARTS)

@@ -1,0 +1,108 @@
+"""Pose of the child's world in the parent's world, as a part of results of stops."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.plain import Document, from_plain
+from hand_eye_calib.core.base.text import frame_name
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import inverse_covariance
+from hand_eye_calib.core.results.document import covariance_of, matrix_of, transform_of
+from hand_eye_calib.core.results.parts import ExtraTransform, Part
+
+
+@dataclass(frozen=True, eq=False)
+class Worlds:
+    """Z of A X = Z B.
+
+    Attributes
+    ----------
+    T_world_world : (4, 4) array or None
+        Pose of the child's world in the parent's.
+    cov_world_world : (6, 6) array or None
+        Its covariance in the child's world.
+    parent_world_frame, child_world_frame : str
+    """
+
+    T_world_world: FloatArray | None
+    cov_world_world: FloatArray | None
+    parent_world_frame: str = ""
+    child_world_frame: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("parent_world_frame", "child_world_frame"):
+            object.__setattr__(self, name, frame_name(getattr(self, name)))
+
+
+class WorldsPart(Part):
+    """The part ``worlds``: four attributes of a result, and as many fields of a document."""
+
+    def __init__(self) -> None:
+        super().__init__("worlds", lambda: Worlds)
+        self.without = {
+            "T_world_world": None,
+            "cov_world_world": None,
+            "parent_world_frame": "",
+            "child_world_frame": "",
+        }
+
+    def attribute(self, value: Worlds, name: str) -> Any:
+        """Return an attribute of a result that has the part."""
+        return getattr(value, name)
+
+    def write(self, value: Worlds | None) -> Document:
+        """Return the fields of a document; the transform is among the transforms."""
+        if value is None:
+            return {"parent_world_frame": "", "child_world_frame": ""}
+        document: Document = {
+            "parent_world_frame": value.parent_world_frame,
+            "child_world_frame": value.child_world_frame,
+        }
+        if value.cov_world_world is not None:
+            error = "error xi in T_world_world @ exp(xi)"
+            document["cov_world_world"] = matrix_of(
+                error, value.child_world_frame, value.cov_world_world
+            )
+        return document
+
+    def read(self, document: Mapping[str, Any]) -> Worlds | None:
+        """Return the part of a document; None if it has none."""
+        frames = [
+            from_plain(str, document.get(f"{stream}_world_frame", ""))
+            for stream in ("parent", "child")
+        ]
+        T = document.get("T_world_world")
+        covariance = document.get("cov_world_world")
+        if T is None and covariance is None and not any(frames):
+            return None
+        return Worlds(
+            None if T is None else transform_of(T),
+            None if covariance is None else covariance_of(covariance),
+            *frames,
+        )
+
+    def invert(self, value: Worlds) -> Worlds:
+        """Return the part of the result with both sensors exchanged."""
+        inverse = replace(
+            value,
+            parent_world_frame=value.child_world_frame,
+            child_world_frame=value.parent_world_frame,
+        )
+        T = value.T_world_world
+        if T is None:
+            return inverse
+        covariance = value.cov_world_world
+        if covariance is not None:
+            covariance = inverse_covariance(T, covariance)
+        return replace(inverse, T_world_world=se3.inverse(T), cov_world_world=covariance)
+
+    def transforms(self, value: Worlds) -> dict[str, ExtraTransform]:
+        """Return the transform between the worlds, if it is known with its covariance."""
+        T = value.T_world_world
+        covariance = value.cov_world_world
+        if T is None or covariance is None:
+            return {}
+        frames = value.child_world_frame, value.parent_world_frame
+        return {"T_world_world": ExtraTransform(T, *frames, covariance)}
