@@ -86,6 +86,8 @@ setup(
         name: ["py.typed", "*.pyi", "sample/*"],
         f"{name}.offline.report": ["templates/*.html", "templates/*.css"],
         f"{name}.formats": ["templates/*", "*.yaml"],
+        f"{name}.extras.fleet": ["*.html"],
+        f"{name}.extras.rig": ["*.html"],
         f"{name}.online.watch": ["page/*"],
     },
     data_files=[

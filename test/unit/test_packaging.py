@@ -202,7 +202,7 @@ def test_pip_install_gives_the_commands(source, tmp_path):
     where = run([sys.executable, "-c", WHERE], env=environment, cwd=tmp_path)
     assert Path(where.stdout.strip()).is_relative_to(site)
     templates = "offline/report/templates/report.html", "formats/templates/extrinsic.urdf.xacro.in"
-    for kept in (*templates, "formats/layouts.yaml", "sample/lidar.tum"):
+    for kept in (*templates, "extras/rig/rig.html", "formats/layouts.yaml", "sample/lidar.tum"):
         assert (site / PACKAGE / kept).is_file()
     for command, said in (
         ([target / "bin" / "replay", "--help"], "usage: hand_eye_calib replay"),

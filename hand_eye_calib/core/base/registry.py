@@ -126,6 +126,9 @@ SESSION_PAGES: Registry[Callable[..., None]] = Registry("page of a session")
 #: bag, the stream, the topic and what the source names behind it.
 BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
 
+#: Modules that find targets in images of a folder: functions that return one.
+TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a target")
+
 #: Readers of trajectory files of other programs. Called with the path, the bytes, and the options;
 #: return None for a file of another format.
 FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")

@@ -4,6 +4,7 @@ with time, and a row for each recording with a link to its report.
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def render_batch(
     counts = Counter(cell[2] for cell in cells)
     ordered = sorted(vehicles.items(), key=lambda one: _GRAVITY.index(TONES[one[1].verdict.value]))
     return page(
-        "batch.html",
+        Path(__file__).with_name("batch.html"),
         TONES.get(cells[0][2], "bad"),
         counted(len(rows), "recording"),
         listing([f"{count:,} {verdict}" for verdict, count in counts.most_common()]),

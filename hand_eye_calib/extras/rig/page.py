@@ -25,7 +25,7 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
     time close; ``inputs`` are where the trajectories came from.
     """
     return page(
-        "rig.html",
+        Path(__file__).with_name("rig.html"),
         TONES[rig.verdict.value],
         rig.verdict.value,
         "",

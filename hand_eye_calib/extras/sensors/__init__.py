@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.core.base.registry import BAG_READINGS, FILE_READERS
+from hand_eye_calib.core.base.registry import BAG_READINGS, FILE_READERS, TARGET_IMAGES
 
 
 def register() -> None:
     """Register the readers of messages and files."""
     BAG_READINGS["sensor_msgs/msg/PointCloud2"] = _scans
     BAG_READINGS["images of a target"] = _images
+    TARGET_IMAGES["folder"] = _target_images
     FILE_READERS["other programs"] = _other_programs
 
 
@@ -29,3 +30,9 @@ def _other_programs(path: str | Path, data: bytes, options: Any) -> Any:
     from hand_eye_calib.extras.sensors.foreign import table_of_program
 
     return table_of_program(path, data, options)
+
+
+def _target_images() -> Any:
+    from hand_eye_calib.extras.sensors import target_images
+
+    return target_images

@@ -11,9 +11,9 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.registry import TARGET_IMAGES
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.extras.sensors import target_images
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.offline.cli.options import (
@@ -42,6 +42,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     parent_path, child_path = map(Path, arguments.paths)
     images: list[Path] = []
     if arguments.target:
+        target_images = TARGET_IMAGES["folder"]()
         if not child_path.is_dir():
             raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
         images = target_images.images_in(child_path)

@@ -131,6 +131,8 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
     given = options.options_from(arguments)
     if not are_bags:
+        if len(paths) != len(options.STREAMS):
+            raise ConfigError(f"expected the trajectory files of two sensors; got {len(paths)}")
         options.refuse_stamps(arguments)
         recording = reading.read_pair(arguments, given)
     else:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,9 +53,9 @@ _NAMELESS = ("parent_sensor", "child_sensor")
 # Figures for whoever uses the result; the others are evidence for whoever doubts it.
 _SHOWN_FIRST = ("views", "trajectories")
 
-# Compiled once each.
+_FOLDER = Path(__file__).parent / "templates"
 _TEMPLATES = jinja2.Environment(
-    loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+    loader=jinja2.FileSystemLoader(_FOLDER),
     autoescape=True,
     undefined=jinja2.StrictUndefined,
     trim_blocks=True,
@@ -67,12 +67,18 @@ _TEMPLATES.globals |= dict(amount=text.amount, change=text.change, counted=text.
 _TEMPLATES.globals["axis_names"] = _AXIS_NAMES
 
 
-def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> str:
+@cache
+def _template(path: Path) -> jinja2.Template:
+    """Compile a template once; what it extends or imports is among the templates here."""
+    return _TEMPLATES.from_string(path.read_text(encoding="utf-8"))
+
+
+def page(template: Path, tone: str, verdict: str, said: str, **values: Any) -> str:
     """A page from its template: every page begins with a verdict, in words and by a tone.
 
     Parameters
     ----------
-    template : str
+    template : Path
     tone : {"good", "warn", "bad"}
     verdict, said : str
         In a word and in a sentence.
@@ -80,7 +86,7 @@ def page(template: str, tone: str, verdict: str, said: str, **values: Any) -> st
         What else the template shows.
     """
     values |= {"tone": tone, "mark": MARKS[tone], "marks": MARKS, "verdict": verdict}
-    return _TEMPLATES.get_template(template).render(**values, said=text.capital(said))
+    return _template(template).render(**values, said=text.capital(said))
 
 
 def render(
@@ -104,7 +110,7 @@ def render(
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
     return page(
-        "report.html",
+        _FOLDER / "report.html",
         TONES[calibration.verdict.value],
         verdict,
         said,
