@@ -70,12 +70,18 @@ def expected(tmp_path_factory):
     return hec.load(out).to_dict()
 
 
+def copy_of_the_package(folder):
+    """The folder of a copy."""
+    copy = folder / PACKAGE
+    shutil.copytree(SOURCE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    return copy
+
+
 def run_without(extra, folder, needing):
     """What a copy of the package without an extra prints: the result of the sample recording, and
     lines of a command that needs the extra.
     """
-    copy = folder / PACKAGE
-    shutil.copytree(SOURCE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    copy = copy_of_the_package(folder)
     shutil.rmtree(copy / "extras" / extra)
     table = copy / "extras" / "__init__.py"
     lines = table.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -109,3 +115,42 @@ def test_everything_else_works_without(tmp_path, extra, expected):
 def test_every_folder_is_in_the_table():
     folders = sorted(path.parent.name for path in (SOURCE / "extras").glob("*/__init__.py"))
     assert folders == sorted(EXTRAS)
+
+
+TOY = '''
+"""A command that prints how often it was named."""
+
+import sys
+
+from hand_eye_calib.core.base.registry import COMMANDS, Command
+
+
+def register():
+    COMMANDS["toy"] = Command("count words", lambda: sys.modules[__name__])
+
+
+def add_arguments(parser):
+    parser.add_argument("words", nargs="*")
+
+
+def run(arguments):
+    print(len(arguments.words))
+    return 0
+'''
+
+
+def test_a_new_extra_is_a_folder_and_a_line(tmp_path):
+    copy = copy_of_the_package(tmp_path)
+    (copy / "extras" / "toy").mkdir()
+    (copy / "extras" / "toy" / "__init__.py").write_text(TOY)
+    table = copy / "extras" / "__init__.py"
+    text = table.read_text(encoding="utf-8")
+    table.write_text(text.replace("EXTRAS = (\n", 'EXTRAS = (\n    "toy",\n'), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", PACKAGE, "toy", "one", "two"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout, done.stderr) == ("2\n", "")
