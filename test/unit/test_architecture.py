@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import re
 from graphlib import CycleError, TopologicalSorter
 
 import pytest
@@ -74,6 +75,31 @@ def test_a_breach_is_caught(tmp_path, file, line, message):
     assert breaches(tmp_path) == []
     breach.write_text(line + "\n")
     assert breaches(tmp_path) == [f"{file}: {message}"]
+
+
+ORDER = ("core", "formats", "online", "offline", "extras")
+# Layers that a layer knows.
+BELOW = {layer: {"core", "formats", layer} for layer in ORDER} | {"extras": {*ORDER}}
+BELOW["core"] = {"core"}
+
+
+def modules_in_texts(path):
+    """Modules of the package that texts of a file name, docstrings left out."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in alone:
+            yield from re.findall(rf"{PACKAGE}\.({'|'.join(ORDER)})\b", node.value)
+
+
+def test_no_text_names_a_module_of_a_layer_above():
+    found = {
+        (path.relative_to(SOURCE).parts[0], layer)
+        for path in SOURCE.glob("*/**/*.py")
+        for layer in modules_in_texts(path)
+    }
+    assert ("online", "online") in found  # code of the solving process
+    assert [(own, layer) for own, layer in sorted(found) if layer not in BELOW[own]] == []
 
 
 def file_imports(package_root):
