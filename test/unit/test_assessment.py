@@ -11,6 +11,7 @@ import real_data
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment import covariance as uncertainty
 from hand_eye_calib.core.assessment.reference_selection import select_reference
+from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import prior_as_typed
@@ -18,7 +19,7 @@ from hand_eye_calib.core.engine import estimation
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import absolute_errors
 from hand_eye_calib.core.noise import estimator
-from hand_eye_calib.core.noise.normal import answers_without
+from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.core.solvers.registry import Method
@@ -77,7 +78,8 @@ def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_
         stamps_ns = np.arange(len(parent)) * 100_000_000
         solution = estimator.solve(stamps_ns, parent, child, systematic=())
         model = solution.cov_parent_child_in_child / solution.misfit
-        deviations = answers_without(solution.part_products, 10)[:, :6]
+        blocks = Blocks(solution.part_products).merged(10)
+        deviations = NormalEquations(blocks.without()).step[:, :6]
         deviations -= deviations.mean(axis=0)
         resampled = 0.9 * deviations.T @ deviations
         ratios.append(np.trace(np.linalg.solve(model, resampled)) / 6)
