@@ -3,21 +3,17 @@ does, halved and doubled, on random platforms that are drawn anew, by poses and 
 and on short real recordings. ``constants.csv`` is of seed 45343421.
 """
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.extras.partial import positions
 from reproduction.ablation import Case, outcome, real_cases, simulated_cases
 from reproduction.writing import seed_of, study_parser, write_csv
-
-# Of the constants above zero, those that are logarithms of variances.
-_LOGARITHMS = ("highest_level", "any_rotation")
 
 # One recording of each family, none longer than this.
 _FAMILIES, _MOST_POSES = ("kitti", "zxl19"), 1450
@@ -33,34 +29,30 @@ def chosen(folder: Path | None, seed: int) -> list[Case]:
     return [*first.values()]
 
 
-@contextlib.contextmanager
-def changed(name: str, factor: float) -> Iterator[None]:
-    """A constant times a factor, wherever it is read."""
-    before = getattr(TUNING, name)
-    is_log = np.min(before) < 0 or name in _LOGARITHMS
+def changed(name: str, factor: float) -> Tuning:
+    """Multiply a constant by a factor; logarithms of variances are shifted instead."""
+    value = getattr(TUNING, name)
+    is_log = bool(np.min(value) < 0)
 
-    def one(value: float) -> float:
-        if isinstance(value, int):
-            return max(round(factor * value), min(value, 1))
-        return float(value + np.log(factor)) if is_log else factor * value
+    def multiplied(number: float) -> float:
+        if isinstance(number, int):
+            return max(round(factor * number), min(number, 1))
+        return float(number + np.log(factor)) if is_log else factor * number
 
-    is_tuple = isinstance(before, tuple)
-    object.__setattr__(TUNING, name, tuple(map(one, before)) if is_tuple else one(before))
-    try:
-        yield
-    finally:
-        object.__setattr__(TUNING, name, before)
+    new_value = tuple(map(multiplied, value)) if isinstance(value, tuple) else multiplied(value)
+    return dataclasses.replace(TUNING, **{name: new_value})
 
 
-def measured(cases: Sequence[Case]) -> FloatArray:
+def measured(cases: Sequence[Case], tuning: Tuning = TUNING) -> FloatArray:
     """Errors of translation and rotation, and squared errors over their variances (N, 3)."""
     rows = []
     for case in cases:
-        found = outcome(case, {})
+        found = outcome(case, {"tuning": tuning})
         rows.append([np.nan] * 3 if found is None else [*found.errors, np.mean(found.in_sigmas**2)])
         if not case.sigmas.any():
             poses = case.poses
-            lever = positions.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c[:, :3, 3])
+            measured_m = poses.Ts_cw_c[:, :3, 3]
+            lever = positions.solve(poses.stamps_ns, poses.Ts_pw_p, measured_m, tuning=tuning)
             off = lever.lever_arm - case.T_parent_child[:3, 3]
             square = float(off @ np.linalg.solve(lever.covariance, off)) / 3.0
             rows.append([float(np.linalg.norm(off)), np.nan, square])
@@ -78,8 +70,7 @@ def main() -> None:
         row: dict[str, object] = {"constant": field.name, "value": getattr(TUNING, field.name)}
         largest = 0.0
         for title, factor in (("halved", 0.5), ("doubled", 2.0)):
-            with changed(field.name, factor):
-                logs = np.log(measured(cases) / whole)
+            logs = np.log(measured(cases, changed(field.name, factor)) / whole)
             row[f"{title}: error"] = f"{np.exp(np.nanmean(logs[:, :2])):.3f}"
             row[f"{title}: NEES"] = f"{np.exp(np.nanmean(logs[:, 2])):.3f}"
             largest = max(largest, float(np.nanmax(np.abs(np.expm1(logs)))))

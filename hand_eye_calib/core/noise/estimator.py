@@ -33,16 +33,23 @@ from hand_eye_calib.core.noise.noise_model import (
     N_FAST,
     ROTATION,
     TRANSLATION,
+    VARIANCES,
     WALK_ROTATION,
     WALK_TRANSLATION,
     NoiseModel,
 )
-from hand_eye_calib.core.noise.stages import STAGES, Fit, Problem, is_settled, start
+from hand_eye_calib.core.noise.stages import STAGES, Fit, Problem, Workspace, is_settled, start
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import CorrelatedError, Noise
 
 # Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
 _SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
+
+# Standard deviations beyond which a systematic error is reported.
+PLAIN_SIGMAS = 3.0
+
+# Smallest jitter of stamps (ms) that is reported.
+_NOTABLE_JITTER_MS = 0.1
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
@@ -135,7 +142,7 @@ class AdaptiveSolution(ModelSolution):
     @property
     def systematic(self) -> str:
         """Systematic errors that the data show beyond doubt, joined by ``+``; ``none``."""
-        shown = np.abs(self.parameters) > TUNING.plain * self.parameter_sigmas
+        shown = np.abs(self.parameters) > PLAIN_SIGMAS * self.parameter_sigmas
         return "+".join(name for name, at in PARAMETERS.items() if shown[at].any()) or "none"
 
     @property
@@ -198,7 +205,7 @@ class AdaptiveSolution(ModelSolution):
             f"Noise: {white} per axis of each pose (both sensors together).",
             f"Drift: {drift}.",
             *map(_slow_in_words, lasting),
-            *[f"stamps jitter by {jitter_ms:.2g} ms"] * (jitter_ms > TUNING.notable_jitter_ms),
+            *[f"stamps jitter by {jitter_ms:.2g} ms"] * (jitter_ms > _NOTABLE_JITTER_MS),
         ]
 
     def _systematic_in_words(self) -> list[str]:
@@ -275,25 +282,26 @@ def solve(
 
 
 def _solved(problem: Problem) -> AdaptiveSolution:
-    first = _passed(problem, start(problem), STAGES[:_FIRST])
-    # A camera that sees a target: its errors repeat, and exceed the rotation from pose to pose.
+    workspace = Workspace(problem)
+    first = _passed(workspace, start(problem), STAGES[:_FIRST])
+    # A camera that observes a target: its errors repeat, and exceed the rotation between poses.
     if first.model.centre != "sensors" and problem.is_noisy(first):
         kept = _strided(problem, first)
         if len(kept) < len(problem.streams):
-            fewer = replace(problem, streams=problem.streams[kept], _last=[])
+            fewer = replace(problem, streams=problem.streams[kept])
             return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
-    fit = _passed(problem, first, STAGES[_FIRST:])
-    if not is_settled(problem, fit):
-        problem = replace(problem, without=problem.without | {"lasting"})
-        fit = _passed(problem, first, STAGES[_FIRST:])
-    return _solution(problem, fit)
+    fit = _passed(workspace, first, STAGES[_FIRST:])
+    if not is_settled(workspace, fit):
+        workspace = Workspace(replace(problem, without=problem.without | {"lasting"}))
+        fit = _passed(workspace, first, STAGES[_FIRST:])
+    return _solution(workspace, fit)
 
 
-def _passed(problem: Problem, fit: Fit, stages: Sequence) -> Fit:
-    """The fit after some stages."""
+def _passed(workspace: Workspace, fit: Fit, stages: Sequence) -> Fit:
+    """Return the fit after some stages."""
     for stage in stages:
-        if stage.__name__ not in problem.without:
-            fit = stage(problem, fit)
+        if stage.__name__ not in workspace.problem.without:
+            fit = stage(workspace, fit)
     return fit
 
 
@@ -321,9 +329,12 @@ def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) ->
     return replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_noise_dominated=True)
 
 
-def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
-    """The solution one step from where the search stands."""
-    streams, posterior, columns = problem.streams, problem.posterior(fit), problem.columns
+def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
+    """Return the solution one step from where the search ended."""
+    problem = workspace.problem
+    streams = problem.streams
+    columns = problem.columns
+    posterior = workspace.posterior(fit)
     normal = posterior.normal
     # Rows of an increment that tell: three where only rotations are measured, without a place.
     places = np.concatenate([streams.Ts_pw_p[:, :3, 3], streams.Ts_cw_c[:, :3, 3]], axis=1)
@@ -335,7 +346,7 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
     unseen = np.zeros(6)
-    for (kind, _), level in zip(fit.model.slow, fit.levels[N_FAST::2], strict=True):
+    for (kind, _), level in zip(fit.model.slow, fit.levels[VARIANCES], strict=True):
         if kind == "body":
             unseen[:3] += problem.tuning.unseen_share * np.exp(level)
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
@@ -361,5 +372,5 @@ def _solution(problem: Problem, fit: Fit) -> AdaptiveSolution:
         metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
         part_products=posterior.part_products(),
         objective=0.5 * (posterior.log_determinant + float(normal.cost)),
-        converged=is_settled(problem, fit),
+        converged=is_settled(workspace, fit),
     )

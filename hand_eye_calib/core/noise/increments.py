@@ -30,7 +30,6 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns
-from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import motions
 
 # Systematic errors and their parameters: by how much the child's lengths are short, bias per metre
@@ -38,6 +37,8 @@ from hand_eye_calib.core.pairing.motion_pairs import motions
 # the child's rates minus that of the parent's, along the axes of the child (rad/s).
 PARAMETERS = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
 (SCALE,), BIAS, (TIME,), RATE = PARAMETERS.values()
+# Least variance (m^2) of steps against their neighbours: rounding.
+_LEAST_VARIANCE = 1e-18
 N_SYSTEMATIC = sum(map(len, PARAMETERS.values()))
 SYSTEMATIC = ("scale", "bias", "time")
 # What of a step may err anew: its length, and its direction.
@@ -104,7 +105,7 @@ class Course(Columns):
     along: FloatArray
 
 
-def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.inf) -> Course:
+def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf) -> Course:
     """Course of both sensors; the child's steps are the mean of what both streams say, the metres
     that a bias of them grows with those that the parent travels: they have no bias.
 
@@ -112,16 +113,16 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     ----------
     streams : Streams
     T_parent_child : (4, 4) array
-    noise_m : float
-        Standard deviation per axis of the noise of a step. The smaller it is beside what steps
-        differ from their neighbours by, the more they are believed themselves.
+    noise_m2 : float
+        Variance per axis up to which differences between a step and its neighbours count as
+        noise. The smaller it is beside them, the less the steps are smoothed.
     """
     of_parent, of_child = streams.motions_p[:, :3, 3], streams.motions_c[:, :3, 3]
     rotation, lever_arm = T_parent_child[:3, :3], T_parent_child[:3, 3]
     chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
     by_parent = (chords + of_parent) @ rotation
     step, true_step = (
-        _cleaned(each, np.diff(streams.stamps_s), noise_m)
+        _cleaned(each, np.diff(streams.stamps_s), noise_m2)
         for each in (0.5 * (of_child + by_parent), by_parent)
     )
     metres_c = np.linalg.norm(true_step, axis=1)
@@ -133,15 +134,15 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m: float = np.
     )
 
 
-def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m: float) -> FloatArray:
+def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
     """Steps (n, 3) with the mean velocity of those two before and two after, as far as what they
     differ by may be noise.
     """
     rates = steps / intervals_s[:, None]
     around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
     smooth = 0.5 * (around[:-4] + around[4:]) * intervals_s[:, None]
-    variance = max(median((steps - smooth) ** 2), TUNING.least_variance)
-    believed = max(1.0 - TUNING.caution * noise_m**2 / variance, 0.0)
+    variance = max(median((steps - smooth) ** 2), _LEAST_VARIANCE)
+    believed = max(1.0 - noise_m2 / variance, 0.0)
     return smooth + believed * (steps - smooth)
 
 

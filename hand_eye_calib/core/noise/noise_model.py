@@ -18,7 +18,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.increments import PATH_PARTS, Linearisation, Streams
 from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
-from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.noise.tuning import Tuning
 
 # What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
 # child's or of the parent's world, as of a camera that sees a target.
@@ -29,10 +29,24 @@ CENTRES = ("sensors", "child", "parent")
 _FAST = ("translation", "rotation", "jitter", "walk_translation", "walk_rotation")
 N_FAST = len(_FAST)
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
+# Levels of white noise and of the walk, translation and rotation each.
+WHITES = slice(TRANSLATION, ROTATION + 1)
+WALKS = slice(WALK_TRANSLATION, WALK_ROTATION + 1)
+# Levels of lasting errors: of each process its variance, then its time constant (s).
+VARIANCES = slice(N_FAST, None, 2)
+TIME_CONSTANTS = slice(N_FAST + 1, None, 2)
 
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
 TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
+# Variances (m^2, rad^2, s^2) and log variances are within these bounds.
+LOWEST_VARIANCE = 1e-14
+_HIGHEST_LEVEL = 14.0
+
+# Least log shares of white noise and of the walk in the whole: the precisions of both are added in
+# one matrix.
+_LEAST_WHITE = -14.0
+_LEAST_WALK = -12.0
 
 #: A process of time-correlated errors, by its kind and its part: of the body or the world,
 #: translation or rotation; of the path, scale or direction.
@@ -57,12 +71,15 @@ class NoiseModel:
     centre : {"sensors", "child", "parent"}
     interval_s, duration_s : float
         Typical interval and duration of the recording.
+    tuning : Tuning
+        Numbers of the prior and of the levels that a search starts at.
     """
 
     slow: tuple[Slow, ...]
     centre: str
     interval_s: float
     duration_s: float
+    tuning: Tuning
 
     def state_space(
         self,
@@ -102,7 +119,7 @@ class NoiseModel:
             behind.append(linearisation.adjoints @ directions[:-1])
         return StateSpace(
             intervals_s=intervals_s,
-            relative=np.clip(intervals_s / self.interval_s, *TUNING.relative),
+            relative=np.clip(intervals_s / self.interval_s, *self.tuning.relative),
             columns=linearisation.columns,
             ahead=np.concatenate(ahead, axis=2),
             behind=np.concatenate(behind, axis=2) if self.slow else behind[0],
@@ -149,29 +166,35 @@ class NoiseModel:
 
     def prior(self, levels: FloatArray) -> Prior:
         """What is known beforehand, for a search from these levels."""
-        total, shortest = whole(levels), np.log(self.interval_s)
-        mean, precision = levels.copy(), np.zeros(len(levels))
-        lower = np.full(len(levels), np.log(TUNING.lowest_variance))
-        upper = np.full(len(levels), TUNING.highest_level)
-        lower[:2] = np.maximum(lower[:2], total + TUNING.least_white)
-        lower[3:5] = np.maximum(lower[3:5], total + TUNING.least_walk)
-        mean[JITTER], precision[JITTER] = TUNING.jitter, TUNING.jitter_precision
-        taus = slice(N_FAST + 1, None, 2)
-        precision[taus], lower[taus] = TUNING.tau_precision, shortest
-        upper[taus] = max(np.log(TUNING.longest_share * self.duration_s), shortest)
+        tuning = self.tuning
+        total = whole(levels)
+        shortest = np.log(self.interval_s)
+        mean = levels.copy()
+        precision = np.zeros(len(levels))
+        lower = np.full(len(levels), np.log(LOWEST_VARIANCE))
+        upper = np.full(len(levels), _HIGHEST_LEVEL)
+        lower[WHITES] = np.maximum(lower[WHITES], total + _LEAST_WHITE)
+        lower[WALKS] = np.maximum(lower[WALKS], total + _LEAST_WALK)
+        mean[JITTER] = tuning.jitter
+        precision[JITTER] = tuning.jitter_precision
+        precision[TIME_CONSTANTS] = tuning.tau_precision
+        lower[TIME_CONSTANTS] = shortest
+        upper[TIME_CONSTANTS] = max(np.log(tuning.longest_share * self.duration_s), shortest)
         # One that lasts is a bias or a mount askew, which have parameters.
         is_direction = [part == "direction" for _, part in self.slow]
-        upper[taus] = np.where(is_direction, shortest + np.log(TUNING.first_tau), upper[taus])
+        longest_of_direction = shortest + np.log(tuning.first_tau)
+        upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, upper[TIME_CONSTANTS])
         return Prior(mean, precision, lower, upper)
 
     def with_lasting(
         self, processes: tuple[Slow, ...], levels: FloatArray
     ) -> tuple[NoiseModel, FloatArray]:
         """The model with processes that last, and log levels to start a search at."""
-        shortest = TUNING.first_tau * self.interval_s
-        longest = max(TUNING.last_tau * self.duration_s, shortest)
-        first = dict(zip(PARTS, whole(levels) + np.log(TUNING.audible), strict=True))
-        first |= dict.fromkeys(PATH_PARTS, TUNING.first_of_path)
+        tuning = self.tuning
+        shortest = tuning.first_tau * self.interval_s
+        longest = max(tuning.last_tau * self.duration_s, shortest)
+        first = dict(zip(PARTS, whole(levels) + np.log(tuning.audible), strict=True))
+        first |= dict.fromkeys(PATH_PARTS, tuning.first_of_path)
         starts = [[first[part], 0.5 * np.log(shortest * longest)] for _, part in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
@@ -198,4 +221,4 @@ def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) ->
 
 def whole(levels: FloatArray) -> FloatArray:
     """Log variances (2,) of increments of translation and rotation: white noise plus walk."""
-    return np.logaddexp(levels[[3, 4]], levels[:2] + np.log(2.0))
+    return np.logaddexp(levels[WALKS], levels[WHITES] + np.log(2.0))

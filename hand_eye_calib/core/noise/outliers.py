@@ -26,7 +26,15 @@ from hand_eye_calib.core.noise.increments import N_SYSTEMATIC, Course, Streams, 
 from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.reml import walk_covariance
 from hand_eye_calib.core.noise.state_space import WHITE, Posterior, combined
-from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.noise.tuning import Tuning
+
+# Smallest jump (m, rad): rounding.
+_LEAST_JUMP = 1e-6
+
+# Covariances of differences are raised by this share and this variance (m^2, rad^2): rounding must
+# not make them indefinite.
+_RAISED_COVARIANCE = 1e-9
+_LEAST_VARIANCE = 1e-18
 
 
 @dataclass(frozen=True)
@@ -44,12 +52,12 @@ class Outliers:
     jumps: BoolArray
     spikes: BoolArray
 
-    def across(self, kept: np.ndarray) -> Outliers:
+    def across(self, kept: np.ndarray, longest_gap: int) -> Outliers:
         """For some poses, in order: a jump between two of them counts for their increment, and so
         does a gap of more poses than the longest.
         """
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
-        return Outliers(jumps | (np.diff(kept) > TUNING.longest_gap), self.spikes[kept])
+        return Outliers(jumps | (np.diff(kept) > longest_gap), self.spikes[kept])
 
     def differs_by(self, other: Outliers) -> float:
         """Share of the evidence that counts in one but not in the other."""
@@ -58,7 +66,11 @@ class Outliers:
 
 
 def first_outliers(
-    streams: Streams, course: Course, T_parent_child: FloatArray, residuals: FloatArray
+    streams: Streams,
+    course: Course,
+    T_parent_child: FloatArray,
+    residuals: FloatArray,
+    tuning: Tuning,
 ) -> Outliers:
     """What stands out of residuals (n, 6) without knowing their noise.
 
@@ -68,10 +80,10 @@ def first_outliers(
     """
     sizes = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
     usual = np.array([median(each) for each in sizes.T])
-    limits = np.maximum(TUNING.first_jump_sigmas * usual / MEDIAN_LENGTH, TUNING.least_jump)
+    limits = np.maximum(tuning.first_jump_sigmas * usual / MEDIAN_LENGTH, _LEAST_JUMP)
     jumps = (sizes > limits).any(axis=1)
     spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
-    if np.mean(spikes) > TUNING.most_spikes:
+    if np.mean(spikes) > tuning.most_spikes:
         return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
     jumps = jumps & ~(spikes[1:] | spikes[:-1])
     if spikes.any():
@@ -112,22 +124,27 @@ def _chi_squares(
     """
     spread = prior - posterior
     spread[left_out] = prior[left_out] + posterior[left_out]
-    spread += TUNING.raised_covariance * prior + TUNING.least_variance * np.eye(6)
+    spread += _RAISED_COVARIANCE * prior + _LEAST_VARIANCE * np.eye(6)
     return np.asarray((values * np.linalg.solve(spread, values[:, :, None])[:, :, 0]).sum(axis=1))
 
 
 def judged(
-    outliers: Outliers, of_walk: FloatArray, of_white: FloatArray, with_spikes: bool
+    outliers: Outliers,
+    of_walk: FloatArray,
+    of_white: FloatArray,
+    tuning: Tuning,
+    with_spikes: bool = True,
 ) -> Outliers:
     """Outliers by the chi-squares of increments (n,) and poses (N,): the largest of its
     neighbourhood is one, and what a walk makes probable is no jump.
     """
-    alarming = chi_square_quantile(TUNING.false_alarms / len(of_white))
+    alarming = chi_square_quantile(tuning.false_alarms / len(of_white))
     # A step of the walk is a jump from the level of false alarms on if the others are normal, in
     # units of what they usually are.
     others = of_walk[~outliers.jumps]
-    ordinary, factor = others[others < alarming], TUNING.decisive
-    if len(ordinary) and np.mean(ordinary**2) <= TUNING.walk_kurtosis * np.mean(ordinary) ** 2:
+    ordinary = others[others < alarming]
+    factor = tuning.decisive
+    if len(ordinary) and np.mean(ordinary**2) <= tuning.walk_kurtosis * np.mean(ordinary) ** 2:
         factor = float(max(median(ordinary) / CHI2[0.5][6], 1.0))
     decisive = of_walk > factor * alarming
     beside = np.maximum(of_white[1:], of_white[:-1])
@@ -160,7 +177,7 @@ def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> 
     return Streams(streams.stamps_s, streams.Ts_pw_p, Ts_cw_c)
 
 
-def tail_weights(posterior: Posterior) -> FloatArray:
+def tail_weights(posterior: Posterior, tuning: Tuning) -> FloatArray:
     """Weights (N,) of white errors with Student's t distribution, whose level may change over time:
     ``u = (nu + 6) / (nu m + E w' S^-1 w)``.
 
@@ -176,7 +193,7 @@ def tail_weights(posterior: Posterior) -> FloatArray:
     hidden = 6.0 * (1.0 - kept) / np.where(free, 1.0, weights)
     expected = np.where(free, 0.0, squares + hidden)
     levels, of_all = [np.ones(len(expected))], np.array([~free, expected])
-    for width in TUNING.widths:  # so many neighbours on either side
+    for width in tuning.widths:  # so many neighbours on either side
         sums = np.cumsum(np.pad(of_all, ((0, 0), (width + 1, width))), axis=1)
         n_around, around = sums[:, 2 * width + 1 :] - sums[:, : len(free)] - of_all
         levels.append((STUDENT + around) / (STUDENT + 6.0 * n_around))
@@ -185,5 +202,5 @@ def tail_weights(posterior: Posterior) -> FloatArray:
         for m in levels
     ]
     best = int(np.argmin(losses))
-    level = levels[best if losses[best] < losses[0] - TUNING.least_gain_of_widths else 0]
+    level = levels[best if losses[best] < losses[0] - tuning.least_gain_of_widths else 0]
     return robust_weights("student", expected / level) / level

@@ -58,37 +58,38 @@ def loss_difference(
         If the noise model cannot be fitted to a reading.
     """
     stride = -(-len(stamps_ns) // MOST_POSES)
-    problems = []
+    workspaces = []
     for Ts_pw_p, Ts_cw_c in (first, second):
         stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
         streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)[::stride]
         columns = [column for name in SYSTEMATIC for column in PARAMETERS[name]]
-        problems.append(stages.Problem(streams, columns))
+        workspaces.append(stages.Workspace(stages.Problem(streams, columns)))
     starts = []
-    for problem in problems:
-        noise = stages.noise(problem, stages.start(problem))
-        starts.append(stages.outliers(problem, noise))
+    for workspace in workspaces:
+        noise = stages.noise(workspace, stages.start(workspace.problem))
+        starts.append(stages.outliers(workspace, noise))
     common = Outliers(
         starts[0].outliers.jumps | starts[1].outliers.jumps,
         starts[0].outliers.spikes | starts[1].outliers.spikes,
     )
     losses = []
-    for problem, start in zip(problems, starts, strict=True):
-        losses.append(_least_loss(problem, start, common))
+    for workspace, start in zip(workspaces, starts, strict=True):
+        losses.append(_least_loss(workspace, start, common))
     return losses[1] - losses[0]
 
 
-def _least_loss(problem: stages.Problem, start: stages.Fit, outliers: Outliers) -> float:
+def _least_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
     The fit has the given outliers and no robust weights.
     """
-    n_poses = len(problem.streams)
+    streams = workspace.problem.streams
+    n_poses = len(streams)
     fits = []
     for centre in CENTRES:
         plain = replace(
             start,
-            poses=bridged(problem.streams, start.T, outliers.spikes),
+            poses=bridged(streams, start.T, outliers.spikes),
             error=np.zeros((n_poses, 6)),
             model=replace(start.model, slow=(), centre=centre),
             outliers=outliers,
@@ -96,15 +97,15 @@ def _least_loss(problem: stages.Problem, start: stages.Fit, outliers: Outliers) 
             has_heavy_tails=False,
         )
         with suppress(np.linalg.LinAlgError):
-            fits.append(stages.noise(problem, plain))
+            fits.append(stages.noise(workspace, plain))
     if not fits:
         raise np.linalg.LinAlgError("no noise model fits these poses")
-    best = min(fits, key=lambda fit: _loss(problem, fit))
-    best = stages.lasting(problem, best)
-    return min(_loss(problem, best), _loss(problem, stages.polish(problem, best)))
+    best = min(fits, key=lambda fit: _loss(workspace, fit))
+    best = stages.lasting(workspace, best)
+    return min(_loss(workspace, best), _loss(workspace, stages.polish(workspace, best)))
 
 
-def _loss(problem: stages.Problem, fit: stages.Fit) -> float:
+def _loss(workspace: stages.Workspace, fit: stages.Fit) -> float:
     """Return the restricted negative log likelihood, with the normalisation of the prior."""
-    prior_sigmas = fit.sigmas[problem.columns]
-    return problem.posterior(fit).loss + float(np.log(prior_sigmas).sum())
+    prior_sigmas = fit.sigmas[workspace.problem.columns]
+    return workspace.posterior(fit).loss + float(np.log(prior_sigmas).sum())

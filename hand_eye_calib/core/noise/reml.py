@@ -15,7 +15,11 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.noise.normal import multiplied, transposed
 from hand_eye_calib.core.noise.state_space import WHITE, Markov, Posterior, StateSpace
-from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.noise.tuning import Tuning
+
+# Steps of levels shorter than this end a search; so does this number of steps.
+_SHORTEST_STEP = 1e-3
+_MAX_STEPS = 20
 
 
 class Prior(NamedTuple):
@@ -39,17 +43,20 @@ def fit(
     space: StateSpace,
     start: FloatArray,
     prior: Prior,
-    settled: float = TUNING.settled_loss,
+    tuning: Tuning,
+    settled: float | None = None,
     smaller: Callable[[FloatArray, FloatArray], Rest] | None = None,
 ) -> tuple[Posterior, FloatArray]:
     """The posterior at the levels of the least loss near a start, by Newton steps within a radius;
     and the average information (m, m). Steps end if one promises to lower the loss by less than
-    ``settled``. What ``smaller`` leaves out on the way stays out.
+    ``settled``, by default the tuning's. What ``smaller`` leaves out on the way stays out.
     """
+    settled = tuning.settled_loss if settled is None else settled
     levels = np.clip(start, prior.lower, prior.upper)
-    posterior, radius = Posterior(space, levels), TUNING.first_radius
+    posterior = Posterior(space, levels)
+    radius = tuning.first_radius
     loss = posterior.loss + prior.loss(levels)
-    for _ in range(TUNING.max_steps):
+    for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
         if smaller and (rest := smaller(levels, information)):
             space, levels, prior = rest
@@ -57,13 +64,13 @@ def fit(
             loss = posterior.loss + prior.loss(levels)
             gradient, information = derivatives(posterior)
         gradient = gradient + prior.precision * (levels - prior.mean)
-        curvature = information + np.diag(prior.precision + TUNING.least_curvature)
+        curvature = information + np.diag(prior.precision + tuning.least_curvature)
         gain = 0.0
-        while radius > TUNING.settled_level:
+        while radius > _SHORTEST_STEP:
             step, is_newton = _step(levels, gradient, curvature, prior, radius)
             promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
             is_small = is_newton and promised < settled
-            if is_small or np.abs(step).max() < TUNING.settled_level:
+            if is_small or np.abs(step).max() < _SHORTEST_STEP:
                 break
             try:
                 rival = Posterior(space, levels + step)
@@ -72,13 +79,13 @@ def fit(
                 gain = 0.0
             if gain > 0.0:
                 break
-            radius, gain = TUNING.shrink * float(np.abs(step).max()), 0.0
+            radius, gain = tuning.shrink * float(np.abs(step).max()), 0.0
         if gain == 0.0:
             break
         levels, posterior, loss = rival.levels, rival, loss - gain
-        if gain > TUNING.good * promised:
-            radius = min(2.0 * radius, TUNING.largest_radius)
-        elif gain < TUNING.poor * promised:
+        if gain > tuning.good * promised:
+            radius = min(2.0 * radius, tuning.largest_radius)
+        elif gain < tuning.poor * promised:
             radius = 0.5 * float(np.abs(step).max())
         if gain < 0.5 * settled:
             break

@@ -1,9 +1,10 @@
-"""What is to be solved, where a search stands, and the stages of the search, in order.
+"""Stages of the adaptive search, in order.
 
-Each stage takes a :class:`Problem` and a :class:`Fit`, and returns another fit; neither ever
-changes. ``start`` makes the first one. Noise levels come before outliers, which need them; errors
-that last are looked for once outliers are out; systematic errors are chosen under the noise found
-so far.
+A :class:`Problem` holds the data and never changes. A :class:`Fit` is a state of the search: X, the
+noise model, outliers and systematic errors; it never changes either. A :class:`Workspace` keeps the
+factorisation for the last fit. :func:`start` makes the first fit; each stage takes a workspace and
+a fit, and returns another fit. Noise levels come before outliers, which need them; time-correlated
+errors are searched for without outliers; systematic errors are chosen under the noise model.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,11 +33,15 @@ from hand_eye_calib.core.noise.increments import (
 from hand_eye_calib.core.noise.noise_model import (
     CENTRES,
     LASTING,
+    LOWEST_VARIANCE,
     N_FAST,
     ROTATION,
     TRANSLATION,
+    VARIANCES,
     WALK_ROTATION,
     WALK_TRANSLATION,
+    WALKS,
+    WHITES,
     NoiseModel,
     whole,
 )
@@ -53,10 +59,16 @@ from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.registry import Method
 
+# No lever arm is that long (m).
+_LONGEST_STEP_M = 1000.0
+
+# Steps of X below this (m, rad) are rounding.
+_SETTLED_STEP = 1e-9
+
 
 @dataclass(frozen=True)
 class Problem:
-    """Poses of two sensors, and what is asked of them.
+    """Data of a search: poses of two sensors, and which parameters to estimate.
 
     Attributes
     ----------
@@ -75,8 +87,6 @@ class Problem:
     is_clock_free: bool = False
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
-    # The fit whose posterior of all poses was asked for last, and that posterior. It is large.
-    _last: list[tuple[Fit, Posterior]] = field(default_factory=list)
 
     def known(self, fit: Fit) -> FloatArray:
         """Products (p + 1, p + 1) that what is known of the parameters beforehand adds."""
@@ -92,7 +102,7 @@ class Problem:
         if kept is not None:
             poses, course = poses[kept], course[kept]
             error, weights = error[kept], weights[kept]
-            outliers = outliers.across(kept)
+            outliers = outliers.across(kept, self.tuning.longest_gap)
         known = error if error.any() else None
         return (model or fit.model).state_space(
             poses,
@@ -104,17 +114,39 @@ class Problem:
             self.known(fit),
         )
 
-    def posterior(self, fit: Fit) -> Posterior:
-        """The posterior of all poses; that of the last fit is kept."""
-        if not self._last or self._last[0][0] is not fit:
-            self._last.clear()
-            self._last.append((fit, Posterior(self.space(fit), fit.levels)))
-        return self._last[0][1]
+    def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
+        """Course of the given poses, steps smoothed as far as noise of these levels asks for."""
+        noise_m = float(np.exp(0.5 * whole(levels)[0]))
+        return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
 
     def is_noisy(self, fit: Fit) -> bool:
         """Whether the rotation between poses is not large beside its noise."""
         turns = se3.rotation_angle(self.streams.motions_p[:, :3, :3])
         return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy * median(turns))
+
+
+class Workspace:
+    """What is computed for a problem and kept: the factorisation for the last fit.
+
+    Attributes
+    ----------
+    problem : Problem
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        # One alone: a posterior of all poses is large.
+        self._fit: Fit | None = None
+        self._posterior: Posterior | None = None
+
+    def posterior(self, fit: Fit) -> Posterior:
+        """Return the posterior of all poses; solve only if the fit is not the last one."""
+        if self._posterior is None or self._fit is not fit:
+            # Release the memory of the last one first.
+            self._posterior = None
+            self._posterior = Posterior(self.problem.space(fit), fit.levels)
+            self._fit = fit
+        return self._posterior
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +190,7 @@ class Fit:
         """After a step of xi and of these parameters; X as it is if noise alone makes a step so
         long, along a direction that the motion hardly shows.
         """
-        is_long = np.linalg.norm(step[:3]) >= TUNING.longest_step_m
+        is_long = np.linalg.norm(step[:3]) >= _LONGEST_STEP_M
         parameters = self.parameters.copy()
         parameters[columns] += step[6:]
         T = self.T if is_long else self.T @ se3.exp(step[:6])
@@ -201,13 +233,14 @@ def known_products(
     return known
 
 
-def sample(n_poses: int, most: int) -> IntArray | None:
+def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
     """Poses to fit noise levels with: evenly spread bursts, ever farther apart within each; None
     for all of them.
     """
+    most = tuning.most_poses
     if n_poses <= most:
         return None
-    burst = np.array(TUNING.burst)
+    burst = np.array(tuning.burst)
     offsets = burst[2 * len(burst) * n_poses // most > burst]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(burst)).astype(int)
     return np.unique(starts[:, None] + offsets)
@@ -220,8 +253,9 @@ def start(problem: Problem) -> Fit:
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
     residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ()).columns[:, :, -1]
-    outliers = first_outliers(streams, course, T, residuals)
-    interval_s, duration_s = median(np.diff(streams.stamps_s)), float(np.ptp(streams.stamps_s))
+    outliers = first_outliers(streams, course, T, residuals, tuning)
+    interval_s = median(np.diff(streams.stamps_s))
+    duration_s = float(np.ptp(streams.stamps_s))
     centre = _centre(streams, T, residuals, tuning.decisive_centre)
     beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
@@ -229,8 +263,8 @@ def start(problem: Problem) -> Fit:
         error=np.zeros((len(streams), 6)),
         course=course,
         T=T,
-        model=NoiseModel((), centre, interval_s, duration_s),
-        levels=rough_levels(residuals, beside),
+        model=NoiseModel((), centre, interval_s, duration_s, tuning),
+        levels=rough_levels(residuals, beside, tuning),
         outliers=outliers,
         weights=np.ones(len(streams)),
         sigmas=np.array(tuning.first_sizes),
@@ -249,7 +283,7 @@ def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: fl
     return best if sizes[best] < decisive * sizes["sensors"] else "sensors"
 
 
-def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> FloatArray:
+def rough_levels(residuals: FloatArray, left_out: np.ndarray, tuning: Tuning) -> FloatArray:
     """Log levels (5,) to start at, from scatter and correlation.
 
     Differences of white noise have variance 2 s^2 and a covariance of -s^2 with their neighbours;
@@ -257,175 +291,222 @@ def rough_levels(residuals: FloatArray, left_out: np.ndarray) -> FloatArray:
     """
     kept = ~left_out
     together = kept[1:] & kept[:-1]
-    levels, least = np.full(N_FAST, TUNING.jitter), TUNING.lowest_variance
+    levels = np.full(N_FAST, tuning.jitter)
+    least = LOWEST_VARIANCE
     at = (TRANSLATION, WALK_TRANSLATION), (ROTATION, WALK_ROTATION)
     for (of_white, of_walk), of_part in zip(at, np.split(residuals, 2, axis=1), strict=True):
         total = np.mean(of_part[kept] ** 2) if kept.any() else least
         total = max(float(total), 100 * least)
         products = of_part[1:][together] * of_part[:-1][together]
         neighbours = np.mean(products) if together.any() else -total / 2
-        white = float(np.clip(-neighbours, *np.multiply(TUNING.first_white, total)))
+        white = float(np.clip(-neighbours, *np.multiply(tuning.first_white, total)))
         levels[of_white] = np.log(white)
-        levels[of_walk] = np.log(max(total - 2 * white, TUNING.first_walk * total))
+        levels[of_walk] = np.log(max(total - 2 * white, tuning.first_walk * total))
     return levels
 
 
-def noise(problem: Problem, fit: Fit) -> Fit:
-    """Noise levels of white noise and walk, and one step of X."""
-    kept = sample(len(problem.streams), problem.tuning.most_poses)
-    found, _ = reml.fit(problem.space(fit, kept), fit.levels, fit.model.prior(fit.levels))
-    of_xi = [*range(6), -1]
-    moved = fit.moved(NormalEquations(found.products[np.ix_(of_xi, of_xi)]).step, [])
-    noise_m = float(np.exp(0.5 * whole(found.levels)[0]))
-    course = course_of(problem.streams, moved.T, noise_m)
-    return replace(moved, levels=found.levels, course=course)
+def noise(workspace: Workspace, fit: Fit) -> Fit:
+    """Fit the levels of white noise and walk, then take one step of X."""
+    problem = workspace.problem
+    kept = sample(len(problem.streams), problem.tuning)
+    space = problem.space(fit, kept)
+    prior = fit.model.prior(fit.levels)
+    fitted, _ = reml.fit(space, fit.levels, prior, problem.tuning)
+    xi_and_residual = [*range(6), -1]
+    products_of_xi = fitted.products[np.ix_(xi_and_residual, xi_and_residual)]
+    moved = fit.moved(NormalEquations(products_of_xi).step, [])
+    course = problem.course(moved.T, fitted.levels)
+    return replace(moved, levels=fitted.levels, course=course)
 
 
-def outliers(problem: Problem, fit: Fit) -> Fit:
-    """Jumps and outlier poses, and the noise without them."""
+def outliers(workspace: Workspace, fit: Fit) -> Fit:
+    """Detect jumps and outlier poses, and fit the noise without them."""
+    problem = workspace.problem
     tuning = problem.tuning
-    found = _outliers_found(problem, fit, tuning.outlier_rounds)
-    if found.outliers.differs_by(fit.outliers) > tuning.negligible:
-        found = _outliers_found(problem, noise(problem, found), 1)
-    if np.mean(found.outliers.spikes) > tuning.most_spikes:
+    searched = _with_outliers(workspace, fit, tuning.outlier_rounds)
+    if searched.outliers.differs_by(fit.outliers) > tuning.negligible:
+        searched = _with_outliers(workspace, noise(workspace, searched), 1)
+    if np.mean(searched.outliers.spikes) > tuning.most_spikes:
         # Whole stretches are noisy, no single pose is wrong: all get less weight, none is left out.
-        none = Outliers(found.outliers.jumps, np.zeros_like(found.outliers.spikes))
-        found = replace(found, outliers=none, poses=problem.streams, has_heavy_tails=True)
-    return found
+        no_spikes = np.zeros_like(searched.outliers.spikes)
+        searched = replace(
+            searched,
+            outliers=Outliers(searched.outliers.jumps, no_spikes),
+            poses=problem.streams,
+            has_heavy_tails=True,
+        )
+    return searched
 
 
-def _outliers_found(problem: Problem, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
-    """Jumps and outlier poses in turn, until few change; jumps alone where tails have weights."""
+def _with_outliers(workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
+    """Detect jumps and outlier poses alternately until few change.
+
+    Without spikes, detect only jumps: heavy tails have weights instead.
+    """
+    problem = workspace.problem
+    tuning = problem.tuning
     for _ in range(rounds):
         if problem.is_noisy(fit):
-            posterior = problem.posterior(fit)
+            posterior = workspace.posterior(fit)
             fit = fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
-        of_walk, of_white = innovations(problem.posterior(fit), fit.outliers.spikes)
-        found = judged(fit.outliers, of_walk, of_white, with_spikes)
-        if change := found.differs_by(fit.outliers):
-            poses = bridged(problem.streams, fit.T, found.spikes)
-            fit = replace(fit, outliers=found, poses=poses, error=np.zeros_like(fit.error))
-        if change <= TUNING.negligible:
+        of_walk, of_white = innovations(workspace.posterior(fit), fit.outliers.spikes)
+        detected = judged(fit.outliers, of_walk, of_white, tuning, with_spikes)
+        change = detected.differs_by(fit.outliers)
+        if change:
+            poses = bridged(problem.streams, fit.T, detected.spikes)
+            fit = replace(fit, outliers=detected, poses=poses, error=np.zeros_like(fit.error))
+        if change <= tuning.negligible:
             break
     if with_spikes:
         normal = of_white[~fit.outliers.spikes]
-        is_heavy = np.mean(normal**2) > TUNING.heavy_kurtosis * np.mean(normal) ** 2
+        is_heavy = np.mean(normal**2) > tuning.heavy_kurtosis * np.mean(normal) ** 2
         fit = replace(fit, has_heavy_tails=bool(is_heavy))
     return fit
 
 
-def tails(problem: Problem, fit: Fit) -> Fit:
-    """Weights of white errors whose level varies, if their tails are heavy."""
+def tails(workspace: Workspace, fit: Fit) -> Fit:
+    """Weight white errors with heavy tails, whose level may vary."""
+    tuning = workspace.problem.tuning
     if not fit.has_heavy_tails:
         return fit
     for _ in range(2):
-        posterior = problem.posterior(fit)
-        for _ in range(problem.tuning.tail_rounds - 1):
-            weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior))
+        posterior = workspace.posterior(fit)
+        for _ in range(tuning.tail_rounds - 1):
+            weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior, tuning))
             posterior = Posterior(replace(posterior.space, weights=weights), posterior.levels)
-        fit = noise(problem, replace(fit, weights=tail_weights(posterior)))
-    return _outliers_found(problem, fit, 2, with_spikes=False)
+        fit = noise(workspace, replace(fit, weights=tail_weights(posterior, tuning)))
+    return _with_outliers(workspace, fit, 2, with_spikes=False)
 
 
-def lasting(problem: Problem, fit: Fit) -> Fit:
-    """Time-correlated errors, if the data ask for them."""
+def lasting(workspace: Workspace, fit: Fit) -> Fit:
+    """Add time-correlated errors to the model if the data ask for them."""
+    problem = workspace.problem
     tuning = problem.tuning
-    kept = sample(len(problem.streams), tuning.most_poses)
-    # No white noise and no walk is so small that the search cannot hear it.
-    levels, total = fit.levels.copy(), whole(fit.levels)
-    levels[:2] = np.maximum(levels[:2], total + np.log(tuning.audible))
-    levels[3:5] = np.maximum(levels[3:5], total + np.log(tuning.audible_walk))
+    kept = sample(len(problem.streams), tuning)
+    # Neither white noise nor walk is too small to matter during the search.
+    total = whole(fit.levels)
+    levels = fit.levels.copy()
+    levels[WHITES] = np.maximum(levels[WHITES], total + np.log(tuning.audible))
+    levels[WALKS] = np.maximum(levels[WALKS], total + np.log(tuning.audible_walk))
     model, levels = fit.model.with_lasting(LASTING, levels)
-    # Biases are free here: those that are there would be taken for drift and never be found.
+    # Biases are free here: a bias would be taken for drift and never be found.
     free = replace(fit, sigmas=np.array(tuning.sizes))
-    prior, faint = model.prior(levels), levels - tuning.faded
+    prior = model.prior(levels)
+    faint_levels = levels - tuning.faded
 
-    def smaller(levels: FloatArray, information: FloatArray) -> reml.Rest:
-        """Without the processes that make no difference, of those below the faint levels."""
-        nonlocal model, prior, faint
-        matters = np.diag(information)[N_FAST::2] > tuning.least_information
-        matters |= (levels >= faint)[N_FAST::2]
+    def without_faint(levels: FloatArray, information: FloatArray) -> reml.Rest:
+        """Drop processes below their faint level that make no difference."""
+        nonlocal model, prior, faint_levels
+        matters = np.diag(information)[VARIANCES] > tuning.least_information
+        matters |= (levels >= faint_levels)[VARIANCES]
         if matters.all():
             return None
-        left = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
+        is_kept = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
         model = replace(model, slow=tuple(compress(model.slow, matters)))
-        faint, prior = faint[left], reml.Prior(*np.array(prior)[:, left])
-        return problem.space(free, kept, model), levels[left], prior
+        faint_levels = faint_levels[is_kept]
+        prior = reml.Prior(*np.array(prior)[:, is_kept])
+        return problem.space(free, kept, model), levels[is_kept], prior
 
-    settled = TUNING.settled_loss * len(levels)
+    settled_loss = tuning.settled_loss * len(levels)
     space = problem.space(free, kept, model)
-    found, information = reml.fit(space, levels, prior, settled, smaller)
+    fitted, information = reml.fit(space, levels, prior, tuning, settled_loss, without_faint)
     before = Posterior(problem.space(free, kept), fit.levels)
-    if before.loss - found.loss < tuning.least_gain:
+    if before.loss - fitted.loss < tuning.least_gain:
         return fit
-    faint = np.full(len(found.levels), np.inf)
-    rest = smaller(found.levels, information)
-    return replace(fit, model=model, levels=rest[1] if rest else found.levels)
+    faint_levels = np.full(len(fitted.levels), np.inf)
+    rest = without_faint(fitted.levels, information)
+    return replace(fit, model=model, levels=rest[1] if rest else fitted.levels)
 
 
-def systematic(problem: Problem, fit: Fit) -> Fit:
-    """The likeliest systematic errors; and a step of X and of these, at poses freed of errors.
+class _Hypothesis(NamedTuple):
+    """Systematic errors that may be there: the loss with them, and the step that they make."""
 
-    The child's path has a scale, or a bias along one of its axes, or neither.
+    loss: float
+    fit: Fit
+    normal: NormalEquations
+
+
+def systematic(workspace: Workspace, fit: Fit) -> Fit:
+    """Choose the likeliest systematic errors, then take a step of X and of these.
+
+    The child's path has a scale, or a bias along one of its axes, or neither. The step is taken at
+    poses freed of their errors.
     """
-    posterior, tuning, columns = problem.posterior(fit), problem.tuning, problem.columns
-    without, log_odds = posterior.products - problem.known(fit), np.log(tuning.odds)
-    times = [[], [TIME]] if TIME in columns else [[]]
-    # A time offset that is not known beforehand is there.
-    times = times[-1:] if problem.is_clock_free else times
+    problem = workspace.problem
+    tuning = problem.tuning
+    columns = problem.columns
+    posterior = workspace.posterior(fit)
+    products = posterior.products - problem.known(fit)
+    log_odds = np.log(tuning.odds)
+    choices_of_time = [[], [TIME]] if TIME in columns else [[]]
+    if problem.is_clock_free:
+        # A time offset that is not known beforehand is there.
+        choices_of_time = choices_of_time[-1:]
     # The levels may be those of other systematic errors: they are known as by so much evidence.
-    rows = 6.0 * len(problem.streams)
+    n_rows = 6.0 * len(problem.streams)
 
-    def likeliest(of_path: list[int]) -> tuple[float, Fit, NormalEquations]:
-        """The loss with these errors of the path, with a time offset or without."""
-        found = []
-        for there in (of_path + time for time in times):
-            is_there = [k in there or k in RATE for k in range(N_SYSTEMATIC)]
-            rival = replace(fit, sigmas=np.where(is_there, tuning.sizes, tuning.none))
-            normal = NormalEquations(without + problem.known(rival))
-            loss = 2.0 * rows * np.log1p(float(normal.cost) / rows)
+    def likeliest(path_columns: list[int]) -> _Hypothesis:
+        """Return the likelier hypothesis: these errors of the path with or without an offset."""
+        hypotheses = []
+        for time_columns in choices_of_time:
+            present = path_columns + time_columns
+            is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
+            rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.none))
+            normal = NormalEquations(products + problem.known(rival))
+            loss = 2.0 * n_rows * np.log1p(float(normal.cost) / n_rows)
             loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
-            found.append((loss - 2.0 * log_odds * len(there), rival, normal))
-        return min(found, key=lambda each: each[0])
+            loss -= 2.0 * log_odds * len(present)
+            hypotheses.append(_Hypothesis(loss, rival, normal))
+        return min(hypotheses, key=lambda hypothesis: hypothesis.loss)
 
-    best = plain = likeliest([])
-    known, most = np.linalg.pinv(plain[2].covariance[:6, :6], hermitian=True), 0.0
-    for column in (column for column in columns if column < TIME):
+    plain = likeliest([])
+    plain_information = np.linalg.pinv(plain.normal.covariance[:6, :6], hermitian=True)
+    best = plain
+    largest_gain = 0.0
+    for column in columns:
+        if column >= TIME:
+            continue
         rival = likeliest([column])
-        gain = (plain[0] - rival[0]) * (1.0 if column == SCALE else tuning.like_scale)
-        growth = np.linalg.eigvals(known @ rival[2].covariance[:6, :6]).real.max()
-        if growth < tuning.most_growth**2 and gain > most:
-            best, most = rival, gain
-    _, chosen, normal = best
-    moved = chosen.moved(normal.step, columns)
-    noise_m = float(np.exp(0.5 * whole(fit.levels)[0]))
-    moved = replace(moved, course=course_of(problem.streams, moved.T, noise_m))
-    return moved.freed(problem.streams, posterior.states_after(normal.step))
+        gain = plain.loss - rival.loss
+        if column != SCALE:
+            gain *= tuning.like_scale
+        ratios = plain_information @ rival.normal.covariance[:6, :6]
+        growth = np.linalg.eigvals(ratios).real.max()
+        if growth < tuning.most_growth**2 and gain > largest_gain:
+            best = rival
+            largest_gain = gain
+    step = best.normal.step
+    moved = best.fit.moved(step, columns)
+    moved = replace(moved, course=problem.course(moved.T, fit.levels))
+    return moved.freed(problem.streams, posterior.states_after(step))
 
 
-def polish(problem: Problem, fit: Fit) -> Fit:
-    """X followed to the end, derivatives taken from poses freed of their errors."""
+def polish(workspace: Workspace, fit: Fit) -> Fit:
+    """Follow X to the end, with derivatives at poses freed of their errors."""
+    problem = workspace.problem
     for _ in range(problem.tuning.max_rounds - 1):
-        posterior = problem.posterior(fit)
-        if is_settled(problem, fit):
+        posterior = workspace.posterior(fit)
+        if is_settled(workspace, fit):
             break
         if fit.has_heavy_tails and "tails" not in problem.without:
-            fit = replace(fit, weights=tail_weights(posterior))
+            fit = replace(fit, weights=tail_weights(posterior, problem.tuning))
         step = posterior.normal.step
         moved = fit.moved(step, problem.columns)
         fit = moved.freed(problem.streams, posterior.states_after(step))
     return fit
 
 
-def is_settled(problem: Problem, fit: Fit) -> bool:
-    """Whether the next step is small beside its sigmas, but for translations that the motion does
-    not reveal.
+def is_settled(workspace: Workspace, fit: Fit) -> bool:
+    """Return whether the next step is small beside its standard deviations.
+
+    Translations that the motion does not show need not settle.
     """
-    tuning, normal = problem.tuning, problem.posterior(fit).normal
+    tuning = workspace.problem.tuning
+    normal = workspace.posterior(fit).normal
     variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
     steps = np.r_[axes.T @ normal.step[:3], normal.step[3:]]
     sigmas = np.sqrt(np.maximum(np.r_[variances, np.diag(normal.covariance)[3:]], 0.0))
-    limits = np.maximum(tuning.settled_sigmas * sigmas, tuning.settled_step)
+    limits = np.maximum(tuning.settled_sigmas * sigmas, _SETTLED_STEP)
     limits[:3][sigmas[:3] > tuning.unknown_m] = np.inf
     return bool((np.abs(steps) < limits).all())
 

@@ -30,10 +30,18 @@ from hand_eye_calib.core.noise.normal import (
     multiplied,
     transposed,
 )
-from hand_eye_calib.core.noise.tuning import TUNING
 
 # States of a pose's white error.
 WHITE = 6
+
+# Diagonals of precisions are raised by this share, so that rounding cannot make them indefinite.
+_RAISED = 1e-13
+
+# Precision (1/m^2, 1/rad^2) of poses that may be anywhere.
+_FREE = 1.0
+
+# Parts of a recording for the jackknife.
+_N_PARTS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +205,7 @@ class Posterior:
         self.white, of_white = space.white_precision(levels)
         weights = space.weights[:, None, None]
         self._of_poses = weights * self.white
-        self._of_poses[~(space.weights > 0.0)] = TUNING.free * np.eye(WHITE)
+        self._of_poses[~(space.weights > 0.0)] = _FREE * np.eye(WHITE)
         self.walk_covariance = combined(levels[n_white:], space.walk)
         self.walk = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
@@ -208,10 +216,10 @@ class Posterior:
             self.markov.append(Markov(*of_group, space.intervals_s))
             start, at = start + size, at + 2
         diagonal, below = self._blocks(0, n_poses - 1)
-        np.einsum("nii->ni", diagonal)[:] *= 1.0 + TUNING.raised
+        np.einsum("nii->ni", diagonal)[:] *= 1.0 + _RAISED
         self.factor = Factor(diagonal, below)
         white = WHITE * np.log(np.where(given, space.weights, 1.0)) - of_white
-        prior = float(white[given].sum()) + WHITE * np.log(TUNING.free) * int((~given).sum())
+        prior = float(white[given].sum()) + WHITE * np.log(_FREE) * int((~given).sum())
         for process, size in zip(self.markov, space.sizes, strict=True):
             of_one = n_poses * np.log(process.variance) + np.log(process.rest).sum()
             prior -= size * of_one
@@ -289,7 +297,7 @@ class Posterior:
         """
         n, _, n_columns = self.space.columns.shape
         size = self.space.behind.shape[2]
-        ends = np.linspace(0, n, min(TUNING.n_parts, n) + 1).astype(int).tolist()
+        ends = np.linspace(0, n, min(_N_PARTS, n) + 1).astype(int).tolist()
         known = np.zeros((size + n_columns, size + n_columns))
         totals = [np.zeros((n_columns, n_columns))]
         for start, end in pairwise(ends):

@@ -18,6 +18,7 @@ move the vertical lever arm by kappa g.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,8 +28,9 @@ from hand_eye_calib.core.base.stats import robust_weights
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import increments, reml
-from hand_eye_calib.core.noise.estimator import ModelSolution
+from hand_eye_calib.core.noise.estimator import PLAIN_SIGMAS, ModelSolution
 from hand_eye_calib.core.noise.noise_model import (
+    LOWEST_VARIANCE,
     N_FAST,
     ROTATION,
     ROTATIONS,
@@ -42,12 +44,25 @@ from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.noise.outliers import Outliers, bridged, innovations, judged
 from hand_eye_calib.core.noise.stages import known_products, rough_levels, sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
-from hand_eye_calib.core.noise.tuning import TUNING
+from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
 
 # A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
 # acceleration (s^2). It is not solved with those in the model.
 RESPONSE = increments.N_SYSTEMATIC
+
+# Log variance (rad^2) of orientations that may be anything.
+_ANY_ROTATION = math.log(100.0)
+
+# Most steps of the start, which ends if the lever arm moves by less (m). Where the motion does not
+# show the lever arm, it is drawn to zero by this share of the information of an axis.
+_START_STEPS = 50
+_START_SETTLED_M = 1e-6
+_DRAWN = 1e-6
+
+# Parts of a recording whose paths are compared by themselves.
+_PATH_PARTS = 10
+
 _SHARED = [increments.SCALE, *increments.BIAS, increments.TIME]
 
 
@@ -85,7 +100,7 @@ class LeverArmSolution(ModelSolution):
             share = f"{self.worse.mean():.0%} of the positions"
             said.append(f"{share} are far less precise, and are left out")
         response, sigma = 1e3 * np.array(self.response)
-        if abs(response) > TUNING.plain * sigma:
+        if abs(response) > PLAIN_SIGMAS * sigma:
             said.append(
                 f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
                 "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
@@ -101,7 +116,11 @@ class LeverArmSolution(ModelSolution):
 
 
 def solve(
-    stamps_ns: IntArray, Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool = False
+    stamps_ns: IntArray,
+    Ts_pw_p: FloatArray,
+    positions: FloatArray,
+    with_scale: bool = False,
+    tuning: Tuning = TUNING,
 ) -> LeverArmSolution:
     """Estimate the lever arm of a sensor that measures positions.
 
@@ -114,22 +133,24 @@ def solve(
         At the same stamps, in a world of their own.
     with_scale : bool
         Whether to estimate the scale between both worlds.
+    tuning : Tuning
     """
-    lever_arm, scale, rotations = _start(Ts_pw_p, positions, with_scale)
+    lever_arm, scale, rotations = _start(Ts_pw_p, positions, with_scale, tuning.window)
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     Ts = se3.from_rotation_translation(rotations, scale * positions)
-    state = _State.first(increments.Streams(stamps_s, Ts_pw_p, Ts), lever_arm, with_scale)
-    for number in range(TUNING.rounds):
-        if number in TUNING.fits:
-            state = state.fitted(("body", "world") if number == TUNING.fits[0] else ())
+    streams = increments.Streams(stamps_s, Ts_pw_p, Ts)
+    state = _State.first(streams, lever_arm, with_scale, tuning)
+    for number in range(tuning.rounds):
+        if number in tuning.fits:
+            state = state.fitted(("body", "world") if number == tuning.fits[0] else ())
         posterior = Posterior(state.space(), state.levels)
-        if number + 1 in TUNING.fits[1:]:
+        if number + 1 in tuning.fits[1:]:
             state = state.with_outliers(posterior)
         normal = NormalEquations(_solved(posterior.products))
         step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
-        is_small = np.abs(step[:3]) < TUNING.settled_sigmas * sigmas
-        is_settled = bool((is_small | (sigmas > TUNING.unknown_m)).all())
-        converged = number > TUNING.fits[-1] and is_settled
+        is_small = np.abs(step[:3]) < tuning.settled_sigmas * sigmas
+        is_settled = bool((is_small | (sigmas > tuning.unknown_m)).all())
+        converged = number > tuning.fits[-1] and is_settled
         if converged:
             break
         state = state.moved(posterior, step)
@@ -155,31 +176,44 @@ class _State:
     outliers: Outliers
     boost: FloatArray
     worse: BoolArray
+    tuning: Tuning
 
     @classmethod
-    def first(cls, streams: increments.Streams, lever_arm: FloatArray, with_scale: bool) -> _State:
+    def first(
+        cls,
+        streams: increments.Streams,
+        lever_arm: FloatArray,
+        with_scale: bool,
+        tuning: Tuning,
+    ) -> _State:
         """Where it begins."""
-        stamps_s, n, sigmas = streams.stamps_s, len(streams) - 1, np.array(TUNING.of_positions)
-        sigmas[3] = TUNING.any_scale if with_scale else sigmas[3]
-        interval_s, duration_s = float(np.median(np.diff(stamps_s))), float(stamps_s[-1])
+        stamps_s = streams.stamps_s
+        n = len(streams) - 1
+        sigmas = np.array(tuning.of_positions)
+        if with_scale:
+            sigmas[3] = tuning.any_scale
+        interval_s = float(np.median(np.diff(stamps_s)))
+        duration_s = float(stamps_s[-1])
         state = cls(
             positions=streams.Ts_cw_c[:, :3, 3],
             streams=streams,
             X=se3.from_rotation_translation(np.eye(3), lever_arm),
             sigmas=sigmas,
             parameters=np.zeros(RESPONSE + 1),
-            model=NoiseModel((), "sensors", interval_s, duration_s),
+            model=NoiseModel((), "sensors", interval_s, duration_s, tuning),
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
             boost=np.ones(n),
             worse=np.zeros(n + 1, dtype=bool),
+            tuning=tuning,
         )
         residuals = state.linearised().columns[:, :, -1]
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
-        worse = _worse(np.concatenate(around))
-        levels = rough_levels(residuals, worse[1:] | worse[:-1])
-        levels[ROTATION], levels[WALK_ROTATION] = TUNING.any_rotation, TUNING.rotation_walk[1]
+        worse = _worse(np.concatenate(around), tuning, LOWEST_VARIANCE)
+        levels = rough_levels(residuals, worse[1:] | worse[:-1], tuning)
+        levels[ROTATION] = _ANY_ROTATION
+        levels[WALK_ROTATION] = tuning.rotation_walk[1]
         streams = bridged(streams, state.X, worse)
         return replace(state, streams=streams, levels=levels, worse=worse)
 
@@ -205,7 +239,8 @@ class _State:
 
     def linearised(self) -> increments.Linearisation:
         """Increments between poses, with the columns of the lever arm and of the parameters."""
-        course, moving = self.course, _accelerations(self.streams, self.X)
+        course = self.course
+        moving = _accelerations(self.streams, self.X, self.tuning)
         found = increments.linearise(
             self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED
         )
@@ -238,10 +273,10 @@ class _State:
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of as many poses as noise levels need."""
-        kept = sample(len(self.streams), TUNING.most_poses)
+        kept = sample(len(self.streams), self.tuning)
         if kept is None:
             return self.space(model)
-        jumps = self.outliers.across(kept).jumps
+        jumps = self.outliers.across(kept, self.tuning.longest_gap).jumps
         return replace(
             self,
             streams=self.streams[kept],
@@ -254,13 +289,18 @@ class _State:
         """With noise levels fitted, and with an error of the positions that lasts, of one of these
         kinds, if the data ask for it.
         """
-        fit, _ = reml.fit(self.sampled_space(), self.levels, _prior(self.model, self.levels))
-        best, loss = replace(self, levels=fit.levels), fit.loss - TUNING.least_gain
+        tuning = self.tuning
+        prior = _prior(self.model, self.levels)
+        fit, _ = reml.fit(self.sampled_space(), self.levels, prior, tuning)
+        best = replace(self, levels=fit.levels)
+        loss = fit.loss - tuning.least_gain
         for kind in kinds:
             model, levels = self.model.with_lasting(((kind, "translation"),), fit.levels)
-            rival, _ = reml.fit(self.sampled_space(model), levels, _prior(model, levels))
+            prior = _prior(model, levels)
+            rival, _ = reml.fit(self.sampled_space(model), levels, prior, tuning)
             if rival.loss < loss:
-                best, loss = replace(self, model=model, levels=rival.levels), rival.loss
+                best = replace(self, model=model, levels=rival.levels)
+                loss = rival.loss
         return best
 
     def with_outliers(self, posterior: Posterior) -> _State:
@@ -268,14 +308,15 @@ class _State:
         positions left out if those around are clearly worse than the rest.
         """
         of_walk, of_white = innovations(posterior, self.left_out)
-        found = judged(self.outliers, of_walk, of_white, with_spikes=True)
-        boost = np.where(found.jumps, np.maximum(TUNING.jump_factor * of_walk, self.boost), 1.0)
+        tuning = self.tuning
+        found = judged(self.outliers, of_walk, of_white, tuning)
+        boost = np.where(found.jumps, np.maximum(tuning.jump_factor * of_walk, self.boost), 1.0)
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], states)
         spread = posterior.factor.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
-        worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), drift)
+        worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), tuning, drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
         streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
         return replace(self, outliers=found, boost=boost, streams=streams, worse=worse)
@@ -296,22 +337,24 @@ class _State:
         )
 
 
-def _worse(squares: FloatArray, least: float = TUNING.lowest_variance) -> BoolArray:
+def _worse(squares: FloatArray, tuning: Tuning, least: float) -> BoolArray:
     """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
     those around, and than the least square: the odometry's drift from one position to the next.
     """
-    window = np.ones(min(TUNING.neighbours, len(squares)))
+    window = np.ones(min(tuning.neighbours, len(squares)))
     around = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
     usual = max(float(np.quantile(around / counts, 0.25)), least)
-    return np.asarray(around > TUNING.worse * usual * counts)
+    return np.asarray(around > tuning.worse * usual * counts)
 
 
 def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
     """What is known of log levels beforehand, for a search from these."""
     prior = model.prior(levels)
-    prior.lower[ROTATION] = prior.upper[ROTATION] = TUNING.any_rotation
-    prior.lower[WALK_ROTATION], prior.upper[WALK_ROTATION] = TUNING.rotation_walk[::2]
+    prior.lower[ROTATION] = prior.upper[ROTATION] = _ANY_ROTATION
+    lowest, _, highest = model.tuning.rotation_walk
+    prior.lower[WALK_ROTATION] = lowest
+    prior.upper[WALK_ROTATION] = highest
     return prior
 
 
@@ -357,26 +400,26 @@ def _solved(products: FloatArray) -> FloatArray:
     return products[..., rows, :][..., rows]
 
 
-def _accelerations(streams: increments.Streams, X: FloatArray) -> FloatArray:
+def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -> FloatArray:
     """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes, from steps on
     either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
     """
     path, stamps_s = (streams.Ts_pw_p @ X)[:, :3, 3], streams.stamps_s
     found, interval_s = np.zeros((len(path), 6)), float(np.median(np.diff(stamps_s)))
-    k = max(round(TUNING.accelerating_s / interval_s), 1)
+    k = max(round(tuning.accelerating_s / interval_s), 1)
     if len(path) <= 4 * k:
         return found
     velocities = (path[k:] - path[:-k]) / (stamps_s[k:] - stamps_s[:-k])[:, None]
     spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
     changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
     back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
-    is_near = spans_s < TUNING.near * 4 * k * interval_s
+    is_near = spans_s < tuning.near * 4 * k * interval_s
     found[2 * k : -2 * k, :3] = np.where(is_near, se3.times(back, changes), 0.0)
     return found
 
 
 def _start(
-    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool
+    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool, window: int
 ) -> tuple[FloatArray, float, FloatArray]:
     """The lever arm (3,) and the scale, if it is asked for, that fit windows best, of which bad
     ones count less; and the rotations (N, 3, 3) of the other sensor in the world of the positions,
@@ -384,10 +427,10 @@ def _start(
     """
     lever_arm, scale = np.zeros(3), 1.0
     whole = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
-    size = min(TUNING.window, len(positions))
+    size = min(window, len(positions))
     axes, path, measured = (_windows(values, size) for values in whole)
-    information = np.einsum("nkij,nkil->njl", axes, axes) + TUNING.drawn * size * np.eye(3)
-    for _ in range(TUNING.start_steps):
+    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
+    for _ in range(_START_STEPS):
         predicted = axes @ lever_arm + path
         turns = _rotations(measured, predicted)
         rotated = measured @ turns
@@ -400,7 +443,7 @@ def _start(
         pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
         before = lever_arm
         lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
-        if np.abs(lever_arm - before).max() < 1e-6:
+        if np.abs(lever_arm - before).max() < _START_SETTLED_M:
             break
     of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
     return lever_arm, scale, turns[of_pose] @ Ts_pw_p[:, :3, :3]
@@ -413,7 +456,7 @@ def unexplained_share(
     explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
     """
     predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
-    size = max(len(positions) // TUNING.path_parts, min(TUNING.path_parts, len(positions)))
+    size = max(len(positions) // _PATH_PARTS, min(_PATH_PARTS, len(positions)))
     expected, measured = (_windows(path, size) for path in (predicted, scale * positions))
     residuals = measured @ _rotations(measured, expected) - expected
     left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))

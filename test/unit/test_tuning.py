@@ -1,0 +1,240 @@
+"""Every number of Tuning is obeyed: to change it changes a solution."""
+
+import ast
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from motions import child_of, disturbed, planar_poses, walked, wandering_poses
+from source_code import ROOT
+
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.noise import estimator
+from hand_eye_calib.core.noise.tuning import TUNING, Tuning
+from hand_eye_calib.extras.partial import positions
+
+N_POSES = 360
+
+
+def stamps(n_poses):
+    random = np.random.default_rng(1)
+    gaps_s = np.full(n_poses, 0.1)
+    gaps_s[n_poses // 2] = 30.0
+    return np.cumsum(gaps_s * 1e9).astype(np.int64) + random.integers(0, 2_000_000, n_poses)
+
+
+def lasting_errors(seed, n_poses, sigma, tau_poses):
+    """Gauss-Markov errors (N, 6)."""
+    random = np.random.default_rng(seed)
+    phi = np.exp(-1.0 / tau_poses)
+    errors = sigma * random.normal(size=(n_poses, 6))
+    for k in range(1, n_poses):
+        errors[k] = phi * errors[k - 1] + np.sqrt(1.0 - phi**2) * errors[k]
+    return errors
+
+
+def drive():
+    """Time-correlated errors, heavy tails, outlier poses and a jump, a scale and a late child."""
+    random = np.random.default_rng(3)
+    parent = wandering_poses(N_POSES, 3)
+    child = child_of(parent) @ se3.exp(lasting_errors(4, N_POSES, 0.01, 15))
+    child[:, :3, 3] /= 1.02
+    child[200:, :3, 3] += [0.3, -0.2, 0.1]
+    for pose in (40, 41, 90, 301):
+        child[pose] = child[pose] @ se3.exp(random.normal(0.0, 0.2, 6))
+    tails = np.sqrt(3.0 / random.chisquare(3, (N_POSES, 1)))
+    child = child @ se3.exp(tails * random.normal(0.0, 0.002, (N_POSES, 6)))
+    return disturbed(parent, 6, 1e-3, 1e-3), child
+
+
+def bursts():
+    """White noise that is ten times as large for a while."""
+    random = np.random.default_rng(5)
+    parent = wandering_poses(N_POSES, 5)
+    sigmas = np.where(np.arange(N_POSES) % 60 < 20, 0.01, 0.001)[:, None]
+    child = child_of(parent) @ se3.exp(sigmas * random.normal(size=(N_POSES, 6)))
+    return disturbed(parent, 7, 1e-3, 1e-3), child
+
+
+def target():
+    """A camera that observes a target: rotation noise exceeds the rotation from pose to pose."""
+    parent = wandering_poses(N_POSES, 7, step_m=0.02, step_rad=0.01)
+    T_cw_pw = se3.exp(np.array([1.0, -1.0, 0.5, 0.5, 0.2, -2.0]))
+    child = child_of(parent, T_cw_pw=T_cw_pw)
+    child = se3.inverse(disturbed(se3.inverse(child), 8, 0.002, 0.01))
+    return parent, child
+
+
+def sideways():
+    """A child that slips sideways on flat ground."""
+    parent = planar_poses(N_POSES)
+    child = child_of(parent)
+    steps = se3.inverse(child[:-1]) @ child[1:]
+    steps[:, 1, 3] += 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1)
+    child = walked(steps, child[0])
+    return disturbed(parent, 9, 1e-3, 1e-3), disturbed(child, 10, 1e-3, 1e-3)
+
+
+def heavy_walk():
+    """Odometry whose steps have heavy tails."""
+    random = np.random.default_rng(13)
+    parent = wandering_poses(N_POSES, 13)
+    child = child_of(parent)
+    tails = np.sqrt(2.5 / random.chisquare(2.5, (N_POSES - 1, 1)))
+    drift = se3.exp(tails * random.normal(0.0, 2e-3, (N_POSES - 1, 6)))
+    child = walked(se3.inverse(child[:-1]) @ child[1:] @ drift, child[0])
+    return parent, child
+
+
+def antenna():
+    """Positions of an antenna: a jump, noisy stretches and errors that last."""
+    random = np.random.default_rng(11)
+    poses = wandering_poses(N_POSES, 11)
+    drift = np.zeros((N_POSES - 1, 6))
+    drift[:, 3:] = 2e-3 * random.normal(size=(N_POSES - 1, 3))
+    odometry = walked(se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift))
+    measured = poses[:, :3, :3] @ [0.8, -0.5, 1.2] + poses[:, :3, 3]
+    measured += 0.01 * random.normal(size=(N_POSES, 3))
+    measured += lasting_errors(12, N_POSES, 0.02, 15)[:, :3]
+    measured[150:180] += 0.3 * random.normal(size=(30, 3))
+    measured[250:] += [0.5, 0.2, -0.3]
+    return odometry, measured
+
+
+POSES = {
+    "drive": drive,
+    "bursts": bursts,
+    "target": target,
+    "sideways": sideways,
+    "heavy walk": heavy_walk,
+}
+
+
+@cache
+def numbers_of(case, tuning):
+    """Numbers of the solution of a case."""
+    if case in POSES:
+        parent, child = POSES[case]()
+        solution = estimator.solve(stamps(N_POSES), parent, child, tuning=tuning)
+        answer = solution.T_parent_child, solution.cov_parent_child_in_child
+    else:
+        odometry, measured = antenna()
+        with_scale = case == "antenna of another scale"
+        times_ns = stamps(N_POSES)
+        solution = positions.solve(times_ns, odometry, measured, with_scale, tuning)
+        answer = solution.lever_arm, solution.covariance
+    return np.concatenate([np.ravel(part) for part in (*answer, solution.levels)]).tolist()
+
+
+# Another value of each number, and a case that it changes.
+CHANGES = {
+    "start_reference": ("A", "drive"),
+    "decisive_centre": (0.02, "target"),
+    "most_poses": (150, "drive"),
+    "burst": ((0, 1, 2), "drive"),
+    "longest_gap": (1, "drive"),
+    "jitter": (-12.0, "drive"),
+    "jitter_precision": (0.1, "drive"),
+    "tau_precision": (0.6, "drive"),
+    "relative": ((0.2, 200.0), "drive"),
+    "first_white": ((0.1, 1.0), "drive"),
+    "first_walk": (0.04, "sideways"),
+    "caution": (20.0, "drive"),
+    "settled_loss": (0.1, "bursts"),
+    "first_radius": (3.0, "drive"),
+    "largest_radius": (6.0, "target"),
+    "good": (1.0, "drive"),
+    "poor": (0.1, "target"),
+    "shrink": (0.6, "drive"),
+    "least_curvature": (0.1, "drive"),
+    "outlier_rounds": (1, "target"),
+    "tail_rounds": (1, "bursts"),
+    "false_alarms": (0.3, "drive"),
+    "decisive": (1.0, "heavy walk"),
+    "walk_kurtosis": (0.75, "bursts"),
+    "heavy_kurtosis": (0.85, "drive"),
+    "first_jump_sigmas": (10.0, "bursts"),
+    "most_spikes": (0.4, "bursts"),
+    "negligible": (0.01, "drive"),
+    "widths": ((3,), "bursts"),
+    "least_gain_of_widths": (0.2, "bursts"),
+    "noisy": (0.4, "target"),
+    "strides": ((5,), "target"),
+    "fewest_strides": (25, "target"),
+    "least_gain": (120.0, "drive"),
+    "least_information": (0.6, "drive"),
+    "faded": (6.0, "drive"),
+    "longest_share": (0.008, "drive"),
+    "audible": (0.2, "drive"),
+    "audible_walk": (2e-3, "sideways"),
+    "first_of_path": (-8.0, "drive"),
+    "first_tau": (20.0, "drive"),
+    "last_tau": (0.12, "drive"),
+    "unseen_share": (0.1, "drive"),
+    "sizes": (tuple(2.0 * size for size in TUNING.sizes), "drive"),
+    "first_sizes": (tuple(2.0 * size for size in TUNING.first_sizes), "drive"),
+    "odds": (300.0, "drive"),
+    "none": (2e-6, "drive"),
+    "like_scale": (1.5, "sideways"),
+    "most_growth": (0.1, "drive"),
+    "max_rounds": (3, "sideways"),
+    "settled_sigmas": (0.2, "sideways"),
+    "unknown_m": (0.007, "sideways"),
+    "rounds": (5, "antenna"),
+    "fits": ((1, 2, 4), "antenna"),
+    "rotation_walk": ((-26.6, -12.8, -1.3), "antenna"),
+    "of_positions": (tuple(2.0 * sigma for sigma in TUNING.of_positions), "antenna"),
+    "any_scale": (2.0, "antenna of another scale"),
+    "accelerating_s": (0.4, "antenna"),
+    "near": (5.0, "antenna"),
+    "jump_factor": (20.0, "antenna"),
+    "neighbours": (5, "antenna"),
+    "worse": (32.0, "antenna"),
+    "window": (100, "antenna"),
+}
+
+
+def test_every_number_is_in_the_table():
+    assert list(CHANGES) == [field.name for field in fields(Tuning)]
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_number_that_is_passed_changes_the_solution(name):
+    value, case = CHANGES[name]
+    assert value != getattr(TUNING, name)
+    assert numbers_of(case, replace(TUNING, **{name: value})) != numbers_of(case, TUNING)
+
+
+def test_the_same_numbers_give_the_same_solution():
+    for case in ("drive", "antenna"):
+        assert numbers_of.__wrapped__(case, replace(TUNING)) == numbers_of(case, TUNING)
+
+
+def names_of_the_default(tree):
+    """Nodes that read TUNING, without those that make it the default of an argument or a field."""
+    is_default = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.arguments):
+            is_default |= {id(value) for value in (*node.defaults, *node.kw_defaults)}
+        if isinstance(node, ast.AnnAssign):
+            is_default.add(id(node.value))
+    names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    return [node for node in names if node.id == "TUNING" and id(node) not in is_default]
+
+
+def test_no_search_reads_the_default_instead_of_what_was_passed():
+    folder = ROOT / "hand_eye_calib"
+    searches = [*(folder / "core" / "noise").glob("*.py"), folder / "extras/partial/positions.py"]
+    reading = {}
+    for path in searches:
+        names = names_of_the_default(ast.parse(path.read_text(encoding="utf-8")))
+        if path.name != "tuning.py" and names:
+            reading[path.name] = [node.lineno for node in names]
+    assert len(searches) > 8
+    assert reading == {}
+
+
+def test_reading_the_default_is_detected():
+    source = "def f(tuning=TUNING):\n    x: int = TUNING\n    return TUNING.few\n"
+    assert [node.lineno for node in names_of_the_default(ast.parse(source))] == [3]
