@@ -12,7 +12,7 @@ nothing but Python.
 from importlib import import_module
 from typing import Any
 
-from hand_eye_calib import extras, formats, offline, online
+from hand_eye_calib import core, extras, formats, offline, online
 from hand_eye_calib.core.base.registry import PUBLIC_NAMES
 
 # Module of every public name; the extras register theirs.
@@ -36,7 +36,7 @@ _MODULES = {
     "compare": "hand_eye_calib.core.assessment.comparison",
 }
 
-for _layer in (formats, offline, online, extras):
+for _layer in (core, formats, offline, online, extras):
     _layer.register()
 _MODULES |= PUBLIC_NAMES
 

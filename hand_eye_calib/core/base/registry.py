@@ -133,6 +133,6 @@ TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a tar
 #: return None for a file of another format.
 FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")
 
-#: Estimators of streams that are no poses, by what both streams measure together. Called with the
-#: pose pairs, the options, and whether to cross-check.
-ESTIMATORS: Registry[Callable[..., Any]] = Registry("kind of streams")
+#: Functions that return a kind of data (:class:`hand_eye_calib.core.engine.kinds.Kind`), by what
+#: both sensors measure together.
+KINDS: Registry[Callable[[], Any]] = Registry("kind of streams")

@@ -25,7 +25,8 @@ from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_options
-from hand_eye_calib.core.engine.examination import INVERSIONS, check
+from hand_eye_calib.core.engine.kinds import kind_of
+from hand_eye_calib.core.engine.poses import INVERSIONS
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
@@ -43,10 +44,6 @@ _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 
 # Findings whose options are estimated, so that their uncertainty counts.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
-
-# Positions alone are paired anew from this time offset (s) on: their model knows it better than
-# speeds do.
-_MOST_MOVED_POSITIONS_S = 0.05
 
 # A clock rate counts as known if its spread is below this share of the largest time offset.
 _CLEAR_SPREAD = 0.5
@@ -117,7 +114,8 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
         calibration = snapshot.estimate(cross_check=checks)
     except NotEnoughDataError:
         # Some mistakes leave nothing to pair, or no scale to estimate.
-        repaired = _repaired_unsolved(snapshot) if snapshot.config.measured == "poses" else None
+        can_repair = kind_of(snapshot.config).has_conventions
+        repaired = _repaired_unsolved(snapshot) if can_repair else None
         if not repaired:
             raise
         return repaired
@@ -154,7 +152,9 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     config = snapshot.config
     is_free = config.method in ("auto", "adaptive") and config.reference == "auto"
     is_known = "time_offset" in config.given or len(snapshot.kept) > 0
-    if is_known or not is_free or config.measured != "poses" or not snapshot.correlation.is_clear:
+    if is_known or not is_free or not kind_of(config).has_conventions:
+        return None
+    if not snapshot.correlation.is_clear:
         return None
     coarse = TimeOffset(snapshot.correlation.offset_s, correlation=snapshot.correlation)
     # Motions over one time suffice for a first look.
@@ -178,8 +178,7 @@ def _clock_is_off(first: Attempt) -> bool:
         largest_s = clock.largest_s(snapshot.unpaired[1].duration_s)
         if clock.spread_s < _CLEAR_SPREAD * largest_s:
             moved_s = max(moved_s, largest_s - _CLEAR_SPREAD * clock.spread_s)
-    is_of_positions = calibration.measured == "positions"
-    return moved_s >= (_MOST_MOVED_POSITIONS_S if is_of_positions else MOST_MOVED_S)
+    return moved_s >= kind_of(snapshot.config).least_clock_change_s
 
 
 # ------------------------------------------------------------------ two readings
@@ -370,6 +369,11 @@ def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt
 
 
 # ------------------------------------------------------------------ one solve
+
+
+def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+    """Check the streams of a snapshot, with a result from them if there is one."""
+    return kind_of(snapshot.config).check(snapshot, calibration)
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -14,9 +14,8 @@ from hand_eye_calib.core.alignment.time_offset import (
 )
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
-from hand_eye_calib.core.base.registry import ESTIMATORS
 from hand_eye_calib.core.base.text import frame_name
-from hand_eye_calib.core.engine.estimation import cross_checked, solve_poses
+from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import StreamFrames
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -25,12 +24,12 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
-# Options that have no meaning for streams that are no poses but with these values.
-_OF_PARTS_ALONE = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
+# A model moves poses along their velocities by a smaller time offset (s). From this one on, the
+# poses are paired anew instead.
+MOST_MOVED_S = 0.003
 
-# An offset (s) that a model finds moves poses along their velocities: from this one on, they are
-# paired anew instead. One that nobody asked for is not taken without doubt from that one on.
-MOST_MOVED_S, UNASKED_S = 0.003, 1.0
+# A time offset (s) that nobody asked for is not taken without doubt from this one on.
+UNASKED_S = 1.0
 
 # Pose pairs of whole trajectories that are used unless an option says otherwise: the noise model
 # takes 8 kB for each, and hours at ten a second hold as many.
@@ -204,40 +203,15 @@ class Snapshot:
         """
         self._check_frames()
         resolved, pairs = self.resolved, self.pose_pairs
-        config = resolved.config
-        if len(pairs) < config.min_pairs:
+        if len(pairs) < resolved.config.min_pairs:
             raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
-        if config.measured != "poses":
-            result = resolved._estimate_part(cross_check is not False)
-        else:
-            solved = solve_poses(pairs, config, resolved.time_offset)
-            if cross_check or (cross_check is None and config.reference == "auto"):
-                result = cross_checked(solved, config, pairs)
-            else:
-                result = solved.calibration()
+        result = kind_of(resolved.config).solve(resolved, cross_check)
         return replace(
             result,
             parent_frame=self.parent_frame,
             child_frame=self.child_frame,
             warnings=self.frame_warnings + self.warnings + result.warnings,
         )
-
-    def _estimate_part(self, cross_check: bool) -> Calibration:
-        """The part of the extrinsic that streams without rotations or positions show."""
-        for name, allowed in _OF_PARTS_ALONE.items():
-            if getattr(self.config, name) not in allowed:
-                self.config.require_poses(f"{name} {getattr(self.config, name)}")
-        estimate = partial(ESTIMATORS[self.config.measured], cross_check=cross_check)
-        result = estimate(self.pose_pairs, self.config)
-        found_s, given_s = result.time_offset_s, float(self.config.time_offset)
-        if not abs(found_s - given_s) < UNASKED_S:
-            return replace(result, time_offset_s=given_s)
-        if len(self.kept) or not abs(found_s - given_s) > MOST_MOVED_S:
-            return result
-        # Interpolated where the other stream has its poses, rather than moved along its velocity.
-        config = replace(self.config, time_offset=found_s)
-        moved = replace(self, config=config).pose_pairs
-        return estimate(moved, config) if len(moved) >= self.config.min_pairs else result
 
     @cached_property
     def streams(self) -> tuple[Trajectory, Trajectory]:
@@ -326,7 +300,7 @@ def estimated_time_offset(
     config: CalibratorConfig, parent: Trajectory, child: Trajectory
 ) -> TimeOffset:
     """The time offset of two streams, from what the options say that both measure."""
-    of_speed = config.measured == "positions"
+    of_speed = kind_of(config).is_timed_by_speed
     return estimate_time_offset(parent, child, config.max_gap, of_speed)
 
 

@@ -2,27 +2,26 @@
 
 from typing import Any
 
-from hand_eye_calib.core.base.registry import ESTIMATORS, RESULT_PARTS
+from hand_eye_calib.core.base.registry import KINDS, RESULT_PARTS
 
 
 def register() -> None:
-    """Register the estimators of both kinds of streams."""
+    """Register both kinds of streams, and the bias of angular rates."""
     RESULT_PARTS["rate_bias"] = _rate_bias
-    ESTIMATORS["positions"] = _lever_arm
-    ESTIMATORS["rotations"] = _rotation
+    KINDS["positions"] = _positions
+    KINDS["rotations"] = _rotations
 
 
-def _lever_arm(pose_pairs: Any, config: Any, cross_check: bool) -> Any:
-    """Estimate the lever arm; positions have no cross-check."""
-    from hand_eye_calib.extras.partial.partial import estimate_lever_arm
+def _positions() -> Any:
+    from hand_eye_calib.extras.partial.kinds import POSITIONS
 
-    return estimate_lever_arm(pose_pairs, config)
+    return POSITIONS
 
 
-def _rotation(pose_pairs: Any, config: Any, cross_check: bool) -> Any:
-    from hand_eye_calib.extras.partial.partial import estimate_rotation
+def _rotations() -> Any:
+    from hand_eye_calib.extras.partial.kinds import ROTATIONS
 
-    return estimate_rotation(pose_pairs, config, cross_check=cross_check)
+    return ROTATIONS
 
 
 def _rate_bias() -> Any:

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
     from hand_eye_calib.core.base.plain import plain
     from hand_eye_calib.core.checks.findings import finding, gravest_first
-    from hand_eye_calib.core.engine.examination import check
+    from hand_eye_calib.core.engine.run import check
     from hand_eye_calib.core.engine.snapshot import whole_snapshot
     from hand_eye_calib.offline.report.evidence import summarise
 

@@ -30,8 +30,7 @@ from hand_eye_calib.core.checks.findings import answered, gravest_first
 from hand_eye_calib.core.checks.streams import check_positions, check_stream
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
-from hand_eye_calib.core.engine.examination import check
-from hand_eye_calib.core.engine.run import review
+from hand_eye_calib.core.engine.run import check, review
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration

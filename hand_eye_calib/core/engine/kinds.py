@@ -1,0 +1,49 @@
+"""Kinds of data on the road from streams to a result, and what each of them supplies.
+
+The road is the same for all kinds (:mod:`hand_eye_calib.core.engine.run`). A kind is registered in
+``KINDS`` (:mod:`hand_eye_calib.core.base.registry`) under what both sensors measure together
+(``measured`` of :class:`~hand_eye_calib.core.base.config.CalibratorConfig`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.registry import KINDS
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.results.calibration import Calibration
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What differs between kinds of data.
+
+    A snapshot is one of :mod:`hand_eye_calib.core.engine.snapshot`, which imports this module.
+
+    Attributes
+    ----------
+    solve : callable
+        ``solve(snapshot, cross_check)`` returns a calibration without frame names. The snapshot has
+        a time offset in seconds and enough pairs. A ``cross_check`` of None follows the options.
+    check : callable
+        ``check(snapshot, calibration)`` checks the streams; the calibration may be None.
+    least_clock_change_s : float
+        Change of the time offset (s) from which on the poses are paired anew.
+    is_timed_by_speed : bool
+        Whether speeds show the time offset, rather than angular rates.
+    has_conventions : bool
+        Whether checks find conventions, units and clocks of streams that cannot be solved as given.
+    """
+
+    solve: Callable[[Any, bool | None], Calibration]
+    check: Callable[[Any, Calibration | None], CheckResult]
+    least_clock_change_s: float
+    is_timed_by_speed: bool = False
+    has_conventions: bool = False
+
+
+def kind_of(config: CalibratorConfig) -> Kind:
+    """Return the kind of data of two streams, from what the options say that both measure."""
+    kind: Kind = KINDS[config.measured]()
+    return kind

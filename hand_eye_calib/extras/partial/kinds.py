@@ -1,0 +1,140 @@
+"""Streams of which one gives only a part of its poses: positions, rotations or angular rates."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from hand_eye_calib.core.alignment.time_offset import TimeOffset, correlate_rates
+from hand_eye_calib.core.checks import check as checking
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.findings import Finding, gravest_first
+from hand_eye_calib.core.engine.kinds import Kind, kind_of
+from hand_eye_calib.core.engine.poses import known_scale
+from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.extras.partial.checks import check_solved
+from hand_eye_calib.extras.partial.partial import estimate_lever_arm, estimate_rotation
+
+# Options that have a meaning for whole poses only, with the values that mean nothing.
+_OF_POSES = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
+
+# Positions alone are paired anew from this change of the time offset (s) on: their model knows it
+# better than speeds do.
+_LEAST_CHANGE_OF_POSITIONS_S = 0.05
+
+# Share of the squared residuals of positions that belong to another path which a fault must explain
+# to be named.
+_NAMES_UNRELATED = 0.6
+
+# Smaller time offsets (s) of streams that are no poses are found by every solve.
+_FOUND_BY_SOLVE_S = 0.25
+
+# Accuracy of a coarse time offset, in intervals between poses.
+_COARSE_INTERVALS = 0.2
+
+
+def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
+    """Estimate the lever arm; positions have no cross-check."""
+    return _solve(snapshot, estimate_lever_arm)
+
+
+def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
+    """Estimate the rotation, and the bias of angular rates."""
+    return _solve(snapshot, partial(estimate_rotation, cross_check=cross_check is not False))
+
+
+def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibration:
+    """Estimate the part of the extrinsic that the streams show, on the clock that the solve finds.
+
+    Raises
+    ------
+    ConfigError
+        If an option needs whole poses.
+    """
+    config = snapshot.config
+    for name, allowed in _OF_POSES.items():
+        value = getattr(config, name)
+        if value not in allowed:
+            config.require_poses(f"{name} {value}")
+    result = estimate(snapshot.pose_pairs, config)
+    given_s = float(config.time_offset)
+    moved_s = abs(result.time_offset_s - given_s)
+    if not moved_s < UNASKED_S:
+        return replace(result, time_offset_s=given_s)
+    if len(snapshot.kept) or not moved_s > MOST_MOVED_S:
+        return result
+    # Interpolated where the other stream has its poses, rather than moved along its velocity.
+    config = replace(config, time_offset=result.time_offset_s)
+    moved = replace(snapshot, config=config).pose_pairs
+    return estimate(moved, config) if len(moved) >= config.min_pairs else result
+
+
+def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+    """Check two streams of which one gives only a part of its poses.
+
+    The findings of the solve itself are among those of the check.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    calibration : Calibration, optional
+        A result from these streams. Its time offset and scale count as known.
+    """
+    config = snapshot.config
+    findings = [*calibration.findings] if calibration else []
+    known_s = float(snapshot.resolved.config.time_offset)
+    parent, child = snapshot.streams
+    if not len(snapshot.kept):  # pairs may have gaps where the streams have none
+        on_one_scale = child.scaled(known_scale(snapshot, calibration))
+        aligned = on_one_scale.shifted(known_s)
+        lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
+        findings += checking.check_parts(parent, aligned, config.max_gap, lever_arm_m)
+    hidden = calibration.hidden if calibration else []
+    if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
+        findings += _check_clock(parent, child, known_s, snapshot)
+    codes = {found.code for found in findings}
+    if calibration and len(hidden) < 3 and "time_offset" not in codes:
+        least_share = _NAMES_UNRELATED if "unrelated" in codes else 0.0
+        findings += check_solved(parent, child, calibration, config, least_share)
+    if hidden and not any(found.makes_unusable for found in findings):
+        findings.append(checking.unseen(hidden))
+    # Lengths in another unit are the cause of what the solve found.
+    findings.sort(key=lambda found: found.code != "lengths")
+    different = [found for index, found in enumerate(findings) if found not in findings[:index]]
+    return CheckResult(gravest_first(different))
+
+
+def _least_lever_arm(calibration: Calibration) -> float:
+    """Return the length (m) that the lever arm of a result has at least, within its uncertainty."""
+    sigmas = np.sqrt(np.diag(calibration.covariance_measured))[:3]
+    is_shown = [axis not in calibration.hidden for axis in "xyz"]
+    return checking.least_lever_arm(calibration.T_parent_child, np.where(is_shown, sigmas, np.inf))
+
+
+def _check_clock(
+    parent: Trajectory, child: Trajectory, known_s: float, snapshot: Snapshot
+) -> list[Finding]:
+    """Return the finding that the clocks differ, if speeds or angular rates show it clearly."""
+    of_speed = kind_of(snapshot.config).is_timed_by_speed
+    max_gap_s = snapshot.config.max_gap
+    correlation = correlate_rates(parent, child.shifted(known_s), max_gap_s, of_speed)
+    if not correlation.is_clear or abs(correlation.offset_s) < _FOUND_BY_SOLVE_S:
+        return []
+    sigma_s = _COARSE_INTERVALS * max(parent.interval_s, child.interval_s)
+    offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
+    return checking.check_offset(offset, known_s)
+
+
+#: Poses of one sensor and positions of the other on the road.
+POSITIONS = Kind(
+    solve=_solve_positions,
+    check=check,
+    least_clock_change_s=_LEAST_CHANGE_OF_POSITIONS_S,
+    is_timed_by_speed=True,
+)
+
+#: Rotations or angular rates of both sensors on the road.
+ROTATIONS = Kind(solve=_solve_rotations, check=check, least_clock_change_s=MOST_MOVED_S)
