@@ -5,8 +5,8 @@ The road is the same for all kinds (:mod:`hand_eye_calib.core.engine.run`). A ki
 (``measured`` of :class:`~hand_eye_calib.core.base.config.CalibratorConfig`).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -32,6 +32,9 @@ class Kind:
         Change of the time offset (s) from which on the poses are paired anew.
     is_timed_by_speed : bool
         Whether speeds show the time offset, rather than angular rates.
+    allowed : mapping
+        Options that have a meaning for whole poses only: their names, and the values that may be
+        set.
     has_conventions : bool
         Whether checks find conventions, units and clocks of streams that cannot be solved as given.
     """
@@ -39,8 +42,22 @@ class Kind:
     solve: Callable[[Any, bool | None], Calibration]
     check: Callable[[Any, Calibration | None], CheckResult]
     least_clock_change_s: float
+    allowed: Mapping[str, tuple[object, ...]] = field(default_factory=dict)
     is_timed_by_speed: bool = False
     has_conventions: bool = False
+
+    def require_allowed(self, config: CalibratorConfig) -> None:
+        """Check that no option is set that this kind of data cannot obey.
+
+        Raises
+        ------
+        ConfigError
+            If one is; the message names it.
+        """
+        options = config.to_options()
+        for name, values in self.allowed.items():
+            if options[name] not in values:
+                config.require_poses(f"{name} {options[name]}")
 
 
 def kind_of(config: CalibratorConfig) -> Kind:

@@ -200,12 +200,16 @@ class Snapshot:
             If fewer than ``min_pairs`` poses can be paired; the message says what is missing.
         InputError
             If both streams have the same sensor frame, or an option gives one of them the other's.
+        ConfigError
+            If an option has no meaning for what the streams measure.
         """
         self._check_frames()
+        kind = kind_of(self.config)
+        kind.require_allowed(self.config)
         resolved, pairs = self.resolved, self.pose_pairs
         if len(pairs) < resolved.config.min_pairs:
             raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
-        result = kind_of(resolved.config).solve(resolved, cross_check)
+        result = kind.solve(resolved, cross_check)
         return replace(
             result,
             parent_frame=self.parent_frame,

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from hand_eye_calib.core.alignment.time_offset import TimeOffset, correlate_rates
+from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, gravest_first
@@ -18,8 +19,26 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial.checks import check_solved
 from hand_eye_calib.extras.partial.partial import estimate_lever_arm, estimate_rotation
 
-# Options that have a meaning for whole poses only, with the values that mean nothing.
-_OF_POSES = {"method": ("auto", "adaptive"), "reference": ("auto",), "backend": ("fast",)}
+# Values of options that only whole poses obey: one method, one reference, one backend.
+_OF_POSES: dict[str, tuple[object, ...]] = {
+    "method": ("auto", "adaptive"),
+    "reference": ("auto",),
+    "backend": ("fast",),
+}
+
+# Positions have no cross-check by DNLO, whose options these are.
+_OF_POSITIONS: dict[str, tuple[object, ...]] = {
+    **_OF_POSES,
+    "threshold": (CalibratorConfig.threshold,),
+    "min_inlier_fraction": (CalibratorConfig.min_inlier_fraction,),
+}
+
+# Rotations have no lengths.
+_OF_ROTATIONS: dict[str, tuple[object, ...]] = {
+    **_OF_POSES,
+    "scale": ("none", "auto"),
+    "parent_scale": (1.0,),
+}
 
 # Positions alone are paired anew from this change of the time offset (s) on: their model knows it
 # better than speeds do.
@@ -47,18 +66,8 @@ def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
 
 
 def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibration:
-    """Estimate the part of the extrinsic that the streams show, on the clock that the solve finds.
-
-    Raises
-    ------
-    ConfigError
-        If an option needs whole poses.
-    """
+    """Estimate the part of the extrinsic that the streams show, on the clock of the solve."""
     config = snapshot.config
-    for name, allowed in _OF_POSES.items():
-        value = getattr(config, name)
-        if value not in allowed:
-            config.require_poses(f"{name} {value}")
     result = estimate(snapshot.pose_pairs, config)
     given_s = float(config.time_offset)
     moved_s = abs(result.time_offset_s - given_s)
@@ -133,8 +142,14 @@ POSITIONS = Kind(
     solve=_solve_positions,
     check=check,
     least_clock_change_s=_LEAST_CHANGE_OF_POSITIONS_S,
+    allowed=_OF_POSITIONS,
     is_timed_by_speed=True,
 )
 
 #: Rotations or angular rates of both sensors on the road.
-ROTATIONS = Kind(solve=_solve_rotations, check=check, least_clock_change_s=MOST_MOVED_S)
+ROTATIONS = Kind(
+    solve=_solve_rotations,
+    check=check,
+    least_clock_change_s=MOST_MOVED_S,
+    allowed=_OF_ROTATIONS,
+)

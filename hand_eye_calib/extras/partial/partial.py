@@ -50,8 +50,8 @@ _MENDED_PATH = 0.5
 _EXPECTED_SCALE = TUNING.of_positions[3]
 _SCALE_SIGMAS, _SHOWN_SCALE, _LEAST_SCALE = 5.0, 0.5, 1e-3
 
-# Where the frame of an odometry is, and where an antenna or a prism measures, is known to this (m)
-# along each axis.
+# Standard deviation (m) along each axis of where the frame of an odometry is, and of where an
+# antenna or a prism measures.
 _POINT_M = 0.005
 
 
@@ -88,8 +88,9 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     # What does not explain the positions has no time offset either.
     is_usable = not any(each.makes_unusable for each in findings)
     offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
-    kind = config.parent_kind if is_child else config.child_kind
-    allowance = _allowance(stamps_ns, poses, kind)
+    kinds = config.parent_kind, config.child_kind
+    of_poses, of_antenna = kinds if is_child else kinds[::-1]
+    allowance = _allowance(stamps_ns, poses, of_poses, of_antenna)
     return estimation.calibration_of(
         solution,
         fused,
@@ -109,12 +110,20 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     )
 
 
-def _allowance(stamps_ns: IntArray, poses: FloatArray, kind: str) -> FloatArray:
-    """Covariance (6, 6) of what no recording shows: the points that both sensors measure, and the
-    travel of an odometry in ``FLOOR_TRAVEL_S``, as for poses.
+def _allowance(
+    stamps_ns: IntArray, poses: FloatArray, kind_of_poses: str, kind_of_positions: str
+) -> FloatArray:
+    """Return the covariance (6, 6) of errors that no recording shows.
+
+    The point that each sensor measures is uncertain, unless the positions are exact. An odometry
+    adds its travel in ``FLOOR_TRAVEL_S``, as for poses.
     """
-    speed_m_s = covariance.usual_speed(stamps_ns, poses[:, :3, 3]) if kind == "odometry" else 0.0
-    variance = 2.0 * _POINT_M**2 + (covariance.FLOOR_TRAVEL_S * speed_m_s) ** 2
+    variance = _POINT_M**2
+    if kind_of_positions != "exact":
+        variance += _POINT_M**2
+    if kind_of_poses != "exact":
+        speed_m_s = covariance.usual_speed(stamps_ns, poses[:, :3, 3])
+        variance += (covariance.FLOOR_TRAVEL_S * speed_m_s) ** 2
     return variance * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
@@ -209,13 +218,12 @@ def _of_scale(
 def estimate_rotation(
     pose_pairs: PosePairs, config: CalibratorConfig, cross_check: bool = True
 ) -> Calibration:
-    """Solve and assess synchronised rotations, on one clock: a result without frame names whose
-    translation is zero, and unknown. Positions are not looked at. The poses already have the time
-    offset of the options, in seconds; a scale there is a ConfigError, as rotations have none.
-    With a ``cross_check`` it is compared with DNLO's answers from the same rotations.
+    """Solve and assess synchronised rotations on one clock.
+
+    The result has no frame names, and a translation of zero, which is unknown: positions do not
+    count. The poses already have the time offset of the options, in seconds. With a
+    ``cross_check`` the result is compared with DNLO's answers from the same rotations.
     """
-    if config.scale not in ("none", "auto"):
-        config.require_poses(f"scale {config.scale}")
     Ts_pw_p, as_read = (
         se3.from_rotation_translation(Ts[:, :3, :3], np.zeros((len(Ts), 3)))
         for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)

@@ -1,0 +1,118 @@
+"""Every option of the engine is obeyed or refused, whatever the streams measure."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from motions import as_trajectory, child_of, disturbed, wandering_poses
+
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+
+KINDS = ("poses", "positions", "rotations", "rates")
+
+# A value of each option that is not the default and that matters for the streams below.
+VALUES = {
+    "method": "dnl",
+    "reference": "B3",
+    "backend": "ipopt",
+    "threshold": 1e-5,
+    "min_inlier_fraction": 0.999,
+    "min_pairs": 1000,
+    "max_pairs": 100,
+    "keyframe.min_translation": 1.0,
+    "keyframe.min_rotation": 0.3,
+    "keyframe.min_interval": 0.25,
+    "max_gap": 0.01,
+    "time_offset": 0.02,
+    "scale": 1.1,
+    "parent_scale": 2.0,
+    "parent_measures": "rotations",
+    "child_measures": "rotations",
+    "parent_invert": "poses",
+    "child_invert": "orientations",
+    "parent_quaternion": "wxyz",
+    "child_quaternion": "wxyz",
+    "parent_kind": "exact",
+    "child_kind": "exact",
+    "prior.x": "1+/-0.1",
+    "prior.y": "1+/-0.1",
+    "prior.z": "1+/-0.1",
+    "prior.roll": "0.1+/-0.2",
+    "prior.pitch": "0.1+/-0.2",
+    "prior.yaw": "0.1+/-0.2",
+    "target.translation": 1e-3,
+    "target.rotation": 1e-4,
+    "target.axes": "z=10cm",
+    "parent_frame": "lidar",
+    "child_frame": "camera",
+}
+
+# Options that a kind of streams refuses: of methods of the paper, of lengths, of orientations.
+_OF_WHOLE_POSES = {"method", "reference", "backend"}
+REFUSED = {
+    "poses": set(),
+    "positions": {"threshold", "min_inlier_fraction", "parent_measures"}
+    | {"child_invert", "child_quaternion"}
+    | _OF_WHOLE_POSES,
+    "rotations": {"scale", "parent_scale"} | _OF_WHOLE_POSES,
+    "rates": {"scale", "parent_scale", "child_invert", "child_quaternion"} | _OF_WHOLE_POSES,
+}
+
+# What a stream measures already changes nothing.
+SAME = {("rotations", "parent_measures"), ("rotations", "child_measures")}
+SAME |= {("rates", "parent_measures")}
+
+# Options of one method of the paper are tried with that method.
+_OF_DNLO = ("threshold", "min_inlier_fraction", "backend")
+
+
+@cache
+def streams(kind):
+    """Noisy streams whose stamps differ by half an interval; the child has outliers."""
+    poses = wandering_poses(240)
+    parent = as_trajectory(disturbed(poses, 4, 0.002, 0.001))
+    of_child = disturbed(child_of(poses), 1, 0.002, 0.001)
+    of_child[50::60, :3, 3] += 0.5
+    of_child[50::60] = of_child[50::60] @ se3.exp(np.array([0, 0, 0, 0.5, 0, 0]))
+    child = as_trajectory(of_child).shifted(parent.interval_s / 2)
+    if kind == "positions":
+        return parent, Trajectory.from_positions(child.stamps_ns, child.poses[:, :3, 3])
+    if kind == "rotations":
+        return parent, replace(child, measures="rotations")
+    if kind == "rates":
+        steps = se3.inverse(child.poses[:-1]) @ child.poses[1:]
+        seconds = np.diff(child.stamps_ns)[:, None] * 1e-9
+        return parent, Trajectory.from_rates(child.stamps_ns[1:], se3.log(steps)[:, 3:] / seconds)
+    return parent, child
+
+
+@cache
+def document(kind, **options):
+    try:
+        result = whole_snapshot(*streams(kind), options).estimate()
+    except NotEnoughDataError as error:
+        return str(error)
+    return str(result.to_dict())
+
+
+def test_the_table_has_every_option():
+    assert set(VALUES) == set(CalibratorConfig().to_options())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("option", VALUES)
+def test_an_option_is_obeyed_or_refused(option, kind):
+    method = {"method": "dnlo", "reference": "B3"}
+    beside = method if kind == "poses" and option in _OF_DNLO else {}
+    options = {**beside, option: VALUES[option]}
+    if option in REFUSED[kind]:
+        with pytest.raises(ConfigError, match=option.replace("_", ".")):
+            document(kind, **options)
+        return
+    is_same = document(kind, **options) == document(kind, **beside)
+    assert is_same == ((kind, option) in SAME)
