@@ -14,10 +14,11 @@ from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Verdict
 from hand_eye_calib.online.live import cycle as module
-from hand_eye_calib.online.live.cycle import SolveCycle, StreamChecks
+from hand_eye_calib.online.live.cycle import SolveCycle
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.solving import Answer, Job, answer
+from hand_eye_calib.online.live.stream_checks import StreamChecks
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 QUICK = BufferLimits(pairing_starts=400, batch=100, batch_every=10)

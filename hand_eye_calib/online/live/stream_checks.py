@@ -1,0 +1,109 @@
+"""Findings of the stream checks of a live session."""
+
+import time
+
+import numpy as np
+
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
+from hand_eye_calib.core.checks.findings import Finding, Severity, answered, gravest_first
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.state import ChecksState, Level
+
+#: Codes of findings about the received poses of one stream. After pairing, which interpolates the
+#: poses, a check cannot detect these faults.
+RAW_POSE_CODES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
+
+
+class StreamChecks:
+    """Findings of the stream checks of a session.
+
+    An error counts at once. Any other finding counts if two checks in a row report it, because
+    odometry may be wrong by some per cent over a short recording. An error of the received poses
+    lasts for the whole session, because the session keeps these poses.
+    """
+
+    def __init__(self, log: NodeLog) -> None:
+        self._log = log
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new session without findings."""
+        self._result: CheckResult | None = None
+        self._checked_at_s = 0.0
+        self._suspected: set[tuple[str, str]] = set()
+        self._faults: dict[tuple[str, str], Finding] = {}
+        self._lasting: dict[tuple[str, str], Finding] = {}
+
+    def follow(self, config: CalibratorConfig) -> None:
+        """Drop lasting findings that are no errors with the new options."""
+        open_findings = {}
+        for key, finding in self._lasting.items():
+            (graded,) = answered([finding], config)
+            if graded.makes_unusable:
+                open_findings[key] = finding
+        self._lasting = open_findings
+
+    def take(self, result: CheckResult) -> None:
+        """Store the result of a check, and log new findings and those that are gone."""
+        before = self._faults
+        self._result = result
+        self._checked_at_s = time.monotonic()
+        suspects = {
+            (finding.code, finding.stream): finding
+            for finding in result.findings
+            if finding.severity is not Severity.NOTE
+        }
+        self._faults = {
+            key: finding
+            for key, finding in suspects.items()
+            if finding.makes_unusable or key in self._suspected
+        }
+        self._suspected = set(suspects)
+        for key, finding in self._faults.items():
+            if finding.makes_unusable and finding.code in RAW_POSE_CODES:
+                self._lasting[key] = finding
+        # Findings of this check replace lasting ones: their values are newer.
+        self._faults = {**self._lasting, **self._faults}
+        for key in self._faults.keys() - before.keys():
+            self._log.warning(_in_parameters(self._faults[key]))
+        for key in before.keys() - self._faults.keys():
+            self._log.info(f"no longer found: {before[key].what}")
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings that count against these streams, the gravest first."""
+        return tuple(self._faults.values())
+
+    def _earlier_findings(self, result: CheckResult) -> list[Finding]:
+        """Lasting findings that this check does not report."""
+        keys = {(finding.code, finding.stream) for finding in result.findings}
+        return [finding for key, finding in self._lasting.items() if key not in keys]
+
+    def faults(self) -> tuple[str, ...]:
+        """Text of the findings that count, one line each, with the parameters to set."""
+        return tuple(map(_in_parameters, self.findings))
+
+    def state(self) -> ChecksState:
+        """Return the diagnostics of the last check, with lasting findings."""
+        if self._result is None:
+            text = (
+                f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
+                f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
+            )
+            return ChecksState(level=Level.WARN, text=text)
+        findings = gravest_first([*self._result.findings, *self._earlier_findings(self._result)])
+        return ChecksState(
+            level=Level.WARN if self._faults else Level.OK,
+            text="; ".join(self.faults()) or "both streams can be of one rigid body",
+            age_s=time.monotonic() - self._checked_at_s,
+            findings=tuple(
+                f"{finding.severity.value}: {_in_parameters(finding)}" for finding in findings
+            ),
+        )
+
+
+def _in_parameters(finding: Finding) -> str:
+    """Text of a finding in one line, with the parameters to set."""
+    remedies = (f": set {name} to {value}" for name, value in finding.options.items())
+    return f"{finding}{''.join(remedies)}"
