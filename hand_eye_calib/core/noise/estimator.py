@@ -1,9 +1,8 @@
-"""The adaptive estimator: X by generalised least squares under a noise model that is estimated
-along with it.
+"""Adaptive estimator of X by generalised least squares.
 
-Instead of choosing which poses to compare, all evidence is weighed as the noise of these very
-trajectories asks for: white noise favours long baselines, drift short ones, time-correlated errors
-neither, and a jump cuts the trajectory. docs/adaptive.md derives and tests it.
+The noise model is estimated together with X, so that all increments are used with the right
+weights. White noise favours long baselines, drift short ones, time-correlated errors neither; a
+jump cuts the trajectory. docs/adaptive.md has the derivation and tests.
 """
 
 from __future__ import annotations
@@ -29,21 +28,21 @@ from hand_eye_calib.core.noise.increments import (
     Streams,
 )
 from hand_eye_calib.core.noise.noise_model import (
-    JITTER,
-    N_FAST,
     ROTATION,
-    TRANSLATION,
+    TIME_CONSTANTS,
     VARIANCES,
     WALK_ROTATION,
-    WALK_TRANSLATION,
     NoiseModel,
+    fast_sigmas,
 )
 from hand_eye_calib.core.noise.stages import STAGES, Fit, Problem, Workspace, is_settled, start
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import CorrelatedError, Noise
 
-# Stages that a quick solve leaves out; the first stages, whose fit a search may fall back on.
-_SLOW, _FIRST = frozenset({"tails", "lasting"}), 3
+# Stages that a quick solve leaves out.
+_SLOW = frozenset({"tails", "lasting"})
+# Number of first stages, whose fit a search may fall back on.
+_FIRST = 3
 
 # Standard deviations beyond which a systematic error is reported.
 PLAIN_SIGMAS = 3.0
@@ -54,9 +53,14 @@ _NOTABLE_JITTER_MS = 0.1
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 
+def _first_times(times_s: FloatArray) -> str:
+    times = ", ".join(f"{time_s:.3f}" for time_s in times_s[:5].tolist())
+    return f"{times} ..." if len(times_s) > 5 else times
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelSolution:
-    """What the answers for poses and for positions have in common.
+    """Common part of the solutions for poses and for positions.
 
     Attributes
     ----------
@@ -100,16 +104,18 @@ class ModelSolution:
     converged: bool
 
     def events(self, stamps_ns: IntArray) -> list[str]:
-        """Jumps and outliers in words, with the times (s) of the first."""
-        said, stamps_s = [], stamps_ns * 1e-9
-        for times_s, what, told in (
-            (stamps_s[1:][self.jumps], "jump", " of a trajectory, just before"),
-            (stamps_s[self.spikes], "outlier pose", ", left out, at"),
-        ):
-            if count := len(times_s):
-                first = ", ".join(f"{each:.3f}" for each in times_s[:5].tolist())
-                said.append(f"{counted(count, what)}{told} {first}{' ...' if count > 5 else ''} s")
-        return said
+        """Describe jumps and outliers, with the times (s) of the first."""
+        stamps_s = np.asarray(stamps_ns * 1e-9, dtype=np.float64)
+        jumps_s = stamps_s[1:][self.jumps]
+        outliers_s = stamps_s[self.spikes]
+        sentences = []
+        if len(jumps_s):
+            jumps = counted(len(jumps_s), "jump")
+            sentences.append(f"{jumps} of a trajectory, just before {_first_times(jumps_s)} s")
+        if len(outliers_s):
+            outlier_poses = counted(len(outliers_s), "outlier pose")
+            sentences.append(f"{outlier_poses}, left out, at {_first_times(outliers_s)} s")
+        return sentences
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +159,7 @@ class AdaptiveSolution(ModelSolution):
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
     def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
-        """Variance (rad^2) per axis of the rotation over so many typical intervals."""
+        """Variance (rad^2) per axis of the rotation over a number of typical intervals."""
         white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
         variance = 2 * white + n_intervals * walk
         for slow in self.noise.lasting:
@@ -164,71 +170,84 @@ class AdaptiveSolution(ModelSolution):
 
     @cached_property
     def noise(self) -> Noise:
-        """The noise in plain numbers: standard deviations per axis, systematic errors."""
-        sigmas = np.exp(0.5 * self.levels)
-        lasting = tuple(
-            CorrelatedError(
-                kind=kind,
-                part=part,
-                sigma=float(sigmas[at]),
-                tau_s=float(np.exp(self.levels[at + 1])),
-            )
-            for (kind, part), at in zip(self.model.slow, range(N_FAST, len(sigmas), 2), strict=True)
-        )
+        """Standard deviations per axis, and names of systematic errors."""
+        sigmas = fast_sigmas(self.levels)
+        lasting_sigmas = np.exp(0.5 * self.levels)[VARIANCES].tolist()
+        lasting = []
+        for process, sigma, level in zip(
+            self.model.slow, lasting_sigmas, self.levels[TIME_CONSTANTS], strict=True
+        ):
+            kind, part = process
+            tau_s = float(np.exp(level))
+            lasting.append(CorrelatedError(kind=kind, part=part, sigma=sigma, tau_s=tau_s))
         return Noise(
             in_words=(),
-            rotation_white_rad=float(sigmas[ROTATION]),
-            translation_white_m=float(sigmas[TRANSLATION]),
-            rotation_drift_rad_per_pose=float(sigmas[WALK_ROTATION]),
-            translation_drift_m_per_pose=float(sigmas[WALK_TRANSLATION]),
-            lasting=lasting,
+            rotation_white_rad=sigmas.rotation_rad,
+            translation_white_m=sigmas.translation_m,
+            rotation_drift_rad_per_pose=sigmas.walk_rotation_rad,
+            translation_drift_m_per_pose=sigmas.walk_translation_m,
+            lasting=tuple(lasting),
             systematic=self.systematic,
             misfit=self.misfit,
         )
 
     def describe(self, stamps_ns: IntArray) -> Noise:
-        """The noise in plain numbers and in words, with the times of jumps and outliers."""
-        said = [*self._noise_in_words(), *self._systematic_in_words(), *self.events(stamps_ns)]
-        return replace(self.noise, in_words=tuple(said))
+        """Return the noise in numbers and in words, with the times of jumps and outliers."""
+        sentences = [
+            *self._noise_in_words(),
+            *self._systematic_in_words(),
+            *self.events(stamps_ns),
+        ]
+        return replace(self.noise, in_words=tuple(sentences))
 
     def _noise_in_words(self) -> list[str]:
-        sigmas, lasting = np.exp(0.5 * self.levels), self.noise.lasting
-        white, drift = angle(sigmas[ROTATION]), f"{angle(sigmas[WALK_ROTATION])} from pose to pose"
+        sigmas = fast_sigmas(self.levels)
+        lasting = self.noise.lasting
+        white = angle(sigmas.rotation_rad)
+        drift = f"{angle(sigmas.walk_rotation_rad)} from pose to pose"
         if self.metres_per_pose:
-            white = f"{length(sigmas[TRANSLATION])} and {white}"
-            by_m, by_rad = sigmas[[WALK_TRANSLATION, WALK_ROTATION]] / self.metres_per_pose**0.5
-            drift = f"{length(by_m)} and {angle(by_rad)} after 1 m, ten times that after 100 m"
+            white = f"{length(sigmas.translation_m)} and {white}"
+            root_metres = self.metres_per_pose**0.5
+            after_1_m = length(sigmas.walk_translation_m / root_metres)
+            turned_after_1_m = angle(sigmas.walk_rotation_rad / root_metres)
+            drift = f"{after_1_m} and {turned_after_1_m} after 1 m, ten times that after 100 m"
         else:
             lasting = tuple(slow for slow in lasting if slow.part == "rotation")
-        jitter_ms = 1e3 * float(sigmas[JITTER])
-        return [
+        sentences = [
             f"Noise: {white} per axis of each pose (both sensors together).",
             f"Drift: {drift}.",
             *map(_slow_in_words, lasting),
-            *[f"stamps jitter by {jitter_ms:.2g} ms"] * (jitter_ms > _NOTABLE_JITTER_MS),
         ]
+        jitter_ms = 1e3 * sigmas.jitter_s
+        if jitter_ms > _NOTABLE_JITTER_MS:
+            sentences.append(f"stamps jitter by {jitter_ms:.2g} ms")
+        return sentences
 
     def _systematic_in_words(self) -> list[str]:
-        systematic, said = self.systematic.split("+"), []
+        systematic = self.systematic.split("+")
+        sentences = []
         if "scale" in systematic:
-            off, sigma = 100 * (self.scale - 1), 100 * self.scale_sigma
-            than = f"{'shorter' if off > 0 else 'longer'} than the parent's"
-            said.append(f"the child's lengths are {abs(off):.2f} +/- {sigma:.2g} % {than}")
+            off = 100 * (self.scale - 1)
+            sigma = 100 * self.scale_sigma
+            size = f"{abs(off):.2f} +/- {sigma:.2g} %"
+            longer = "shorter" if off > 0 else "longer"
+            sentences.append(f"the child's lengths are {size} {longer} than the parent's")
         if "bias" in systematic:
             bias = zip("xyz", 1000 * self.parameters[BIAS], strict=True)
             along = ", ".join(f"{axis} {value:.2g}" for axis, value in bias)
-            said.append(
+            sentences.append(
                 f"the child's path is off by {along} mm per metre travelled, along its axes"
             )
         if "rate" in systematic:
             rates = zip("xyz", *np.degrees(self.rate_bias), strict=True)
             about = ", ".join(f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates)
-            said.append(f"bias of the angular rates, along the child's axes: {about} deg/s")
+            sentences.append(f"bias of the angular rates, along the child's axes: {about} deg/s")
         elif "time" in systematic:
-            ms, sigma = 1000 * self.time_offset_s, 1000 * self.time_offset_sigma_s
+            ms = 1000 * self.time_offset_s
+            sigma = 1000 * self.time_offset_sigma_s
             late = "early" if ms > 0 else "late"
-            said.append(f"the child's stamps are {abs(ms):.1f} +/- {sigma:.2g} ms {late}")
-        return said
+            sentences.append(f"the child's stamps are {abs(ms):.1f} +/- {sigma:.2g} ms {late}")
+        return sentences
 
 
 def _slow_in_words(slow: CorrelatedError) -> str:
@@ -306,22 +325,27 @@ def _passed(workspace: Workspace, fit: Fit, stages: Sequence) -> Fit:
 
 
 def _strided(problem: Problem, fit: Fit) -> IntArray:
-    """Poses to keep: every so many, so that the rotation between them exceeds their noise."""
-    tuning, streams = problem.tuning, problem.streams
-    every = np.flatnonzero(~fit.outliers.spikes)
-    most = max((s for s in tuning.strides if len(every) >= s * tuning.fewest_strides), default=1)
-    noise = np.exp(0.5 * fit.levels[ROTATION])
-    rotations = streams.Ts_pw_p[every, :3, :3]
+    """Poses to keep: a stride whose rotation exceeds the rotation noise of a pose."""
+    tuning = problem.tuning
+    streams = problem.streams
+    sound_poses = np.flatnonzero(~fit.outliers.spikes)
+    longest_stride = 1
     for stride in tuning.strides:
-        turned = np.swapaxes(rotations[:-stride], 1, 2) @ rotations[stride:]
-        if noise < tuning.noisy * median(se3.rotation_angle(turned)):
-            return every[:: min(stride, most)]
-    return every[::most]
+        if len(sound_poses) >= stride * tuning.fewest_strides:
+            longest_stride = max(stride, longest_stride)
+    noise_rad = np.exp(0.5 * fit.levels[ROTATION])
+    rotations = streams.Ts_pw_p[sound_poses, :3, :3]
+    for stride in tuning.strides:
+        turns = np.swapaxes(rotations[:-stride], 1, 2) @ rotations[stride:]
+        if noise_rad < tuning.noisy * median(se3.rotation_angle(turns)):
+            return sound_poses[:: min(stride, longest_stride)]
+    return sound_poses[::longest_stride]
 
 
 def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
-    """The solution of some poses, jumps and outlier poses told of all."""
-    jumps, spikes = np.zeros(len(spikes) - 1, dtype=bool), spikes.copy()
+    """Expand the solution of a subset of poses to all poses."""
+    jumps = np.zeros(len(spikes) - 1, dtype=bool)
+    spikes = spikes.copy()
     weights = np.ones(len(spikes))
     jumps[kept[1:][fewer.jumps] - 1] = True
     spikes[kept[fewer.spikes]] = True
@@ -352,7 +376,8 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
     final = fit.moved(normal.step, columns)
     is_there = fit.sigmas > problem.tuning.none
-    parameters, sigmas = (np.where(is_there, each, 0.0) for each in (final.parameters, sigmas))
+    parameters = np.where(is_there, final.parameters, 0.0)
+    sigmas = np.where(is_there, sigmas, 0.0)
     return AdaptiveSolution(
         T_parent_child=final.T,
         cov_parent_child_in_child=covariance[:6, :6] + np.diag(unseen),

@@ -1,4 +1,4 @@
-"""What the adaptive estimator looks at: increments of the error between two trajectories.
+"""Increments of the error between two trajectories: residuals and their derivatives.
 
 Errors act on the right, in each sensor's own frame: ``T_pw_p Exp(a)`` and ``T_cw_c Exp(b)``. In the
 child's frame, with ``c = Ad(X^-1) a - b``,
@@ -9,13 +9,13 @@ for motions A, B between poses i and i + 1, errors w of the motions themselves, 
 in place of X. Systematic errors add their own columns: a scale, a bias per metre of the path, a
 time offset.
 
-Errors known so far are taken out of the poses before derivatives are taken there, and put back into
-the residuals: where noise is not small beside the motion from pose to pose, derivatives of noisy
-poses are noise themselves, and draw the answer (errors in variables).
+Derivatives are taken at poses without the errors estimated so far; the residuals contain these
+errors. Derivatives at noisy poses would be noise themselves if noise is not small beside the motion
+from pose to pose, and would bias X (errors in variables).
 
-The columns rest on steps free of each increment's own noise: the mean of the steps two before and
-two after. Steps that share the noise of the residuals would be drawn towards it, and a child whose
-steps are lost in noise would seem to shrink.
+The columns use steps without each increment's own noise: the mean of the steps two before and two
+after. Steps with the noise of the residuals would bias the scale: a child whose steps are lost in
+noise would seem to shrink.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ SYSTEMATIC = ("scale", "bias", "time")
 # What of a step may err anew: its length, and its direction.
 PATH_PARTS = ("scale", "direction")
 # Of streams without positions, and of those whose rotations are integrated rates.
-SYSTEMATIC_OF_ROTATIONS, SYSTEMATIC_OF_RATES = ("time",), ("time", "rate")
+SYSTEMATIC_OF_ROTATIONS = ("time",)
+SYSTEMATIC_OF_RATES = ("time", "rate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +75,10 @@ class Streams(Columns):
 
     @cached_property
     def twists(self) -> FloatArray:
-        """Velocity (N, 6), m/s and rad/s, of the child in its own frame: of the four motions around
-        a pose the mean of the middle two, component by component. Jumps are no velocity.
+        """Velocity (N, 6), m/s and rad/s, of the child in its own frame.
+
+        The mean of the middle two of the four motions around a pose, component by component: jumps
+        are no velocity.
         """
         rates = se3.log(self.motions_c) / np.diff(self.stamps_s)[:, None]
         padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
@@ -88,7 +91,7 @@ class Streams(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Course(Columns):
-    """How the sensors move, by steps free of each increment's own noise; sums over time.
+    """Motion of both sensors without each increment's own noise, summed over time.
 
     Attributes
     ----------
@@ -106,8 +109,10 @@ class Course(Columns):
 
 
 def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf) -> Course:
-    """Course of both sensors; the child's steps are the mean of what both streams say, the metres
-    that a bias of them grows with those that the parent travels: they have no bias.
+    """Course of both sensors.
+
+    The child's steps are the mean of both streams. A bias per metre grows with the metres that the
+    parent travels, which have no bias.
 
     Parameters
     ----------
@@ -117,14 +122,15 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
         Variance per axis up to which differences between a step and its neighbours count as
         noise. The smaller it is beside them, the less the steps are smoothed.
     """
-    of_parent, of_child = streams.motions_p[:, :3, 3], streams.motions_c[:, :3, 3]
-    rotation, lever_arm = T_parent_child[:3, :3], T_parent_child[:3, 3]
+    of_parent = streams.motions_p[:, :3, 3]
+    of_child = streams.motions_c[:, :3, 3]
+    rotation = T_parent_child[:3, :3]
+    lever_arm = T_parent_child[:3, 3]
     chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
     by_parent = (chords + of_parent) @ rotation
-    step, true_step = (
-        _cleaned(each, np.diff(streams.stamps_s), noise_m2)
-        for each in (0.5 * (of_child + by_parent), by_parent)
-    )
+    intervals_s = np.diff(streams.stamps_s)
+    step = _cleaned(0.5 * (of_child + by_parent), intervals_s, noise_m2)
+    true_step = _cleaned(by_parent, intervals_s, noise_m2)
     metres_c = np.linalg.norm(true_step, axis=1)
     axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
@@ -135,8 +141,9 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
 
 
 def _cleaned(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
-    """Steps (n, 3) with the mean velocity of those two before and two after, as far as what they
-    differ by may be noise.
+    """Smooth steps (n, 3) towards the mean velocity of the steps two before and two after.
+
+    Differences beyond the noise are kept.
     """
     rates = steps / intervals_s[:, None]
     around = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
@@ -189,9 +196,9 @@ def linearise(
     parameters : (8,) array
         Of all systematic errors, see the module.
     columns : sequence of int
-        Those whose derivatives are asked for.
+        Parameters whose derivatives are returned.
     error : (N, 6) array, optional
-        Errors that the poses were freed of.
+        Errors that were taken out of the poses.
     """
     back_c = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
     step = se3.times(back_c, np.diff(course.path, axis=0))
@@ -200,11 +207,13 @@ def linearise(
     by_child[:, :3, 3] = (1.0 + parameters[SCALE]) * by_child[:, :3, 3] - metres @ parameters[BIAS]
     back = se3.inverse(by_child)
     adjoints = se3.adjoint(back)
-    by_steps, by_bias = np.zeros((len(step), 6, 4)), back[:, :3, :3] @ metres
+    by_steps = np.zeros((len(step), 6, 4))
+    by_bias = back[:, :3, :3] @ metres
     by_steps[:, :3] = -back[:, :3, :3] @ np.dstack([step, se3.skew(step)])
     by_path = dict(zip(PATH_PARTS, np.split(by_steps, [1], axis=2), strict=True))
     of_all = np.zeros((len(step), 6, 6 + len(columns) + 1))
-    by_xi, residuals = of_all[:, :, :6], of_all[:, :, -1]
+    by_xi = of_all[:, :, :6]
+    residuals = of_all[:, :, -1]
     np.subtract(np.eye(6), adjoints, out=by_xi)
     for k, column in enumerate(columns, start=6):
         if column == SCALE:
@@ -225,22 +234,26 @@ def linearise(
 def _child_motions(
     streams: Streams, course: Course, parameters: FloatArray, has_rates: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Motions (n, 4, 4) of the child, freed of a time offset and of a bias of its rates; and what
-    that adds to their rotations, if they have rates.
+    """Motions (n, 4, 4) of the child without its time offset and bias of rates, and derivatives.
+
+    The derivatives (n, 3, 3) of their rotations by the bias are empty if there are no rates.
     """
-    Ts_cw_c, by_rate = streams.Ts_cw_c, np.empty(0)
+    Ts_cw_c = streams.Ts_cw_c
+    by_rate = np.empty(0)
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
-    found = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
+    child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
     if has_rates:
-        by_rate = _by_rate_bias(found[:, :3, :3], np.diff(streams.stamps_s))
-        found[:, :3, :3] = found[:, :3, :3] @ se3.rotation_exp(-by_rate @ parameters[RATE])
-    return found, by_rate
+        by_rate = _by_rate_bias(child_motions[:, :3, :3], np.diff(streams.stamps_s))
+        corrections = se3.rotation_exp(-by_rate @ parameters[RATE])
+        child_motions[:, :3, :3] = child_motions[:, :3, :3] @ corrections
+    return child_motions, by_rate
 
 
 def _by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
-    """What a bias of the rates (rad/s) adds to the rotations (n, 3, 3) over each interval: (n, 3,
-    3), the mean of the body's axes at both ends as seen at the end.
+    """Derivatives (n, 3, 3) of rotations (n, 3, 3) over each interval by a bias of rates (rad/s).
+
+    The mean of the body's axes at both ends, in the frame of the end.
     """
     mean_axes: FloatArray = 0.5 * (np.eye(3) + np.swapaxes(rotations, 1, 2))
     return intervals_s[:, None, None] * mean_axes

@@ -1,15 +1,19 @@
-"""The noise of two trajectories: which errors there are, how strong, and how they enter.
+"""Noise model of two trajectories.
 
-Every pose of both sensors has a white error (translation, rotation, and along the velocity, for
-stamps that jitter), the motions a random walk, and time-correlated errors are first-order
-Gauss-Markov processes: translations fixed to the child's body, translations and rotations fixed to
-the parent's world, each with one variance; so are the scale and the direction of travel.
+The error c of a pair of poses, in the child's frame, is the sum of these independent parts:
+
+- a white error: translation, rotation, and along the velocity, for stamps that jitter;
+- a random walk of the motions: translation and rotation;
+- first-order Gauss-Markov processes: translations fixed to the child's body, translations and
+  rotations fixed to the parent's world, the scale and the direction of travel.
+
+Each part has one variance for all axes. A level is the logarithm of a variance.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -37,7 +41,8 @@ VARIANCES = slice(N_FAST, None, 2)
 TIME_CONSTANTS = slice(N_FAST + 1, None, 2)
 
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
-TRANSLATIONS, ROTATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1.0, 1.0])
+TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0])
+ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
 # Variances (m^2, rad^2, s^2) and log variances are within these bounds.
 LOWEST_VARIANCE = 1e-14
@@ -47,6 +52,17 @@ _HIGHEST_LEVEL = 14.0
 # one matrix.
 _LEAST_WHITE = -14.0
 _LEAST_WALK = -12.0
+
+
+class FastSigmas(NamedTuple):
+    """Standard deviations of the errors that every model has, per axis."""
+
+    translation_m: float
+    rotation_rad: float
+    jitter_s: float
+    walk_translation_m: float
+    walk_rotation_rad: float
+
 
 #: A process of time-correlated errors, by its kind and its part: of the body or the world,
 #: translation or rotation; of the path, scale or direction.
@@ -63,7 +79,7 @@ LASTING: tuple[Slow, ...] = (
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Which errors there are.
+    """The errors that are in the model, and how they enter the state space.
 
     Attributes
     ----------
@@ -91,7 +107,7 @@ class NoiseModel:
         cut: BoolArray,
         prior: FloatArray,
     ) -> StateSpace:
-        """The state space of a linearisation.
+        """State space of a linearisation.
 
         Parameters
         ----------
@@ -104,11 +120,13 @@ class NoiseModel:
         cut : (n,) bool array
         prior : (p + 1, p + 1) array
         """
-        to_child, intervals_s = se3.adjoint(se3.inverse(T_parent_child)), np.diff(streams.stamps_s)
+        to_child = se3.adjoint(se3.inverse(T_parent_child))
+        intervals_s = np.diff(streams.stamps_s)
         # Rotation noise, half of it the parent's, which moves the child by the lever arm.
         both = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         is_swung = self.centre != "sensors"
-        ahead, behind = [np.zeros((len(intervals_s), 6, 0))], [linearisation.adjoints]
+        ahead = [np.zeros((len(intervals_s), 6, 0))]
+        behind = [linearisation.adjoints]
         for kind, part in self.slow:
             if kind == "path":
                 behind.append(-linearisation.by_path[part])
@@ -136,7 +154,8 @@ class NoiseModel:
         """Covariances (N, 6, 6) of c by rotation noise of 1 rad about the origin of a world."""
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         swing = np.zeros((len(poses), 6, 3))
-        swing[:, :3], swing[:, 3:] = se3.skew(se3.inverse(poses)[:, :3, 3]), np.eye(3)
+        swing[:, :3] = se3.skew(se3.inverse(poses)[:, :3, 3])
+        swing[:, 3:] = np.eye(3)
         if self.centre == "parent":
             swing = to_child @ swing
         return swing @ np.swapaxes(swing, 1, 2)
@@ -154,10 +173,13 @@ class NoiseModel:
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         translation, rotation = np.exp(levels[[TRANSLATION, ROTATION]])
-        half, turning = 0.5 * translation * TRANSLATIONS, 0.5 * rotation * ROTATIONS
-        of_child, of_parent = half[None], (to_child @ half @ to_child.T)[None]
+        half = 0.5 * translation * TRANSLATIONS
+        turning = 0.5 * rotation * ROTATIONS
+        of_child = half[None]
+        of_parent = (to_child @ half @ to_child.T)[None]
         if self.centre == "sensors":
-            of_parent, of_child = of_parent + to_child @ turning @ to_child.T, of_child + turning
+            of_parent = of_parent + to_child @ turning @ to_child.T
+            of_child = of_child + turning
         elif self.centre == "child":
             of_child = of_child + rotation * self._swing(streams, to_child)
         else:
@@ -165,7 +187,7 @@ class NoiseModel:
         return np.swapaxes(np.linalg.solve(of_parent + of_child, of_parent), 1, 2)
 
     def prior(self, levels: FloatArray) -> Prior:
-        """What is known beforehand, for a search from these levels."""
+        """Prior of the levels for a search from these levels."""
         tuning = self.tuning
         total = whole(levels)
         shortest = np.log(self.interval_s)
@@ -189,7 +211,7 @@ class NoiseModel:
     def with_lasting(
         self, processes: tuple[Slow, ...], levels: FloatArray
     ) -> tuple[NoiseModel, FloatArray]:
-        """The model with processes that last, and log levels to start a search at."""
+        """Return the model with time-correlated errors, and log levels to start a search at."""
         tuning = self.tuning
         shortest = tuning.first_tau * self.interval_s
         longest = max(tuning.last_tau * self.duration_s, shortest)
@@ -201,9 +223,10 @@ class NoiseModel:
     def lasting(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """The lasting part (N, 6) of the error c that states (N, d) make, in the child's frame."""
+        """Time-correlated part (N, 6) of the error c at states (N, d), in the child's frame."""
         to_child = se3.adjoint(se3.inverse(T_parent_child))
-        error, start = np.zeros((len(states), 6)), WHITE
+        error = np.zeros((len(states), 6))
+        start = WHITE
         for kind, part in self.slow:
             if kind != "path":
                 directions = _directions(kind, part, streams, to_child)
@@ -217,6 +240,11 @@ def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) ->
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
     return to_child[:, PARTS[part]] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
+
+
+def fast_sigmas(levels: FloatArray) -> FastSigmas:
+    """Standard deviations of white noise, jitter and walk at log levels."""
+    return FastSigmas(*np.exp(0.5 * levels)[:N_FAST].tolist())
 
 
 def whole(levels: FloatArray) -> FloatArray:

@@ -1,10 +1,10 @@
-"""Least squares from products of weighed columns; and symmetric positive definite matrices of d x d
-blocks on the diagonal and beside it, in time and memory linear in their size.
+"""Normal equations, and Cholesky factorisation of block tridiagonal matrices.
 
-The latter by cyclic reduction (Golub; Heller, SIAM J. Numer. Anal. 13, 1976): every other block is
-eliminated, all of them at once, and what is left is block tridiagonal again, half as long. It is a
-Cholesky factorisation in another order. Each level is a few products of stacked matrices, so that
-numpy's overhead grows with the logarithm of the number of blocks.
+The factorisation takes time and memory linear in the number of blocks, by cyclic reduction (Golub;
+Heller, SIAM J. Numer. Anal. 13, 1976). Each level eliminates every other block, all of them at
+once; the rest is block tridiagonal again, half as long. This is a Cholesky factorisation in another
+order. Each level is a few products of stacked matrices, so that numpy's overhead grows with the
+logarithm of the number of blocks.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ class Factor:
     """
 
     def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
-        # Every other block is eliminated, the second first. That needs the inverse root of its own
-        # block, and that times its coupling to the block before and, if there is one, behind.
+        # Each level eliminates every other block, from the second on. It stores the inverse root of
+        # each eliminated block, and that root times the couplings to the blocks before and behind;
+        # the last block may have none behind.
         self._levels: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _FEW:
@@ -83,7 +84,8 @@ class Factor:
             diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
             below = -transposed(behind) @ before[:n_behind]
         self._n_last, self._size, _ = diagonal.shape
-        whole, blocks = np.zeros((self._n_last, self._size) * 2), np.arange(self._n_last)
+        whole = np.zeros((self._n_last, self._size) * 2)
+        blocks = np.arange(self._n_last)
         whole[blocks, :, blocks] = diagonal
         whole[blocks[1:], :, blocks[:-1]] = below
         roots, logarithms = inverse_roots(whole.reshape(1, self._n_last * self._size, -1))
@@ -92,9 +94,11 @@ class Factor:
 
     def whiten(self, right: FloatArray) -> FloatArray:
         """``L^-1`` times columns (n, d, k), in the order of the elimination."""
-        whitened, start = np.empty(right.shape), 0
+        whitened = np.empty(right.shape)
+        start = 0
         for inverse, before, behind in self._levels:
-            own, right = inverse @ right[1::2], right[::2].copy()
+            own = inverse @ right[1::2]
+            right = right[::2].copy()
             right[: len(own)] -= transposed(before) @ own
             right[1 : 1 + len(behind)] -= transposed(behind) @ own[: len(behind)]
             whitened[start : start + len(own)] = own
@@ -109,7 +113,8 @@ class Factor:
         last = whitened[start:].reshape(len(self._last), -1)
         solved = (self._last.T @ last).reshape(whitened[start:].shape)
         for inverse, before, behind in reversed(self._levels):
-            rest, end = solved, start
+            rest = solved
+            end = start
             start -= len(inverse)
             own = whitened[start:end] - before @ rest[: len(inverse)]
             own[: len(behind)] -= behind @ rest[1 : 1 + len(behind)]
@@ -124,10 +129,14 @@ class Factor:
         shape = (self._n_last, self._size) * 2
         whole = (self._last.T @ self._last).reshape(shape).transpose(0, 2, 1, 3)
         blocks = np.arange(self._n_last)
-        diagonal, below = whole[blocks, blocks], whole[blocks[1:], blocks[:-1]]
+        diagonal = whole[blocks, blocks]
+        below = whole[blocks[1:], blocks[:-1]]
         for inverse, before, behind in reversed(self._levels):
-            n_own, n_behind, root = len(inverse), len(behind), transposed(inverse)
-            to_before, to_behind = -root @ before, -root[:n_behind] @ behind
+            n_own = len(inverse)
+            n_behind = len(behind)
+            root = transposed(inverse)
+            to_before = -root @ before
+            to_behind = -root[:n_behind] @ behind
             with_before = to_before @ diagonal[:n_own]
             with_before[:n_behind] += to_behind @ below[:n_behind]
             with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
@@ -138,8 +147,10 @@ class Factor:
             rest = diagonal
             diagonal = np.empty((len(rest) + n_own, *rest.shape[1:]))
             below = np.empty((len(diagonal) - 1, *rest.shape[1:]))
-            diagonal[::2], diagonal[1::2] = rest, own
-            below[::2], below[1::2] = with_before, with_behind
+            diagonal[::2] = rest
+            diagonal[1::2] = own
+            below[::2] = with_before
+            below[1::2] = with_behind
         return diagonal, below
 
 
@@ -162,7 +173,8 @@ class NormalEquations:
     """
 
     def __init__(self, products: FloatArray) -> None:
-        information, gradient = products[..., :-1, :-1], products[..., :-1, -1]
+        information = products[..., :-1, :-1]
+        gradient = products[..., :-1, -1]
         diagonal = np.einsum("...ii->...i", information)
         rounding = np.finfo(float).eps * diagonal.max(axis=-1, keepdims=True)
         scale = 1.0 / np.sqrt(np.maximum(diagonal, rounding + np.finfo(float).tiny))

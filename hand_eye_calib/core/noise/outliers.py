@@ -1,8 +1,8 @@
-"""Jumps, poses that are wrong by themselves, and heavy tails.
+"""Jumps, outlier poses, and heavy tails.
 
-What one increment or one pose's white error is expected to be from everything else, against what it
-is, in units of the covariance of the difference: chi-square with six degrees of freedom if nothing
-is wrong. With u = V^-1 r and P = V^-1 that is ``u_i' P_ii^-1 u_i`` (de Jong, Penzer, J. Amer.
+An increment or a pose's white error is compared with its prediction from all other data, in units
+of the covariance of the difference. This is chi-square with six degrees of freedom if nothing is
+wrong. With u = V^-1 r and P = V^-1 it is ``u_i' P_ii^-1 u_i`` (de Jong, Penzer, J. Amer.
 Statist. Assoc. 93, 1998), and follows from the smoothed states.
 """
 
@@ -39,28 +39,30 @@ _LEAST_VARIANCE = 1e-18
 
 @dataclass(frozen=True)
 class Outliers:
-    """Evidence that does not count.
+    """Jumps and outlier poses.
 
     Attributes
     ----------
     jumps : (n,) bool array
-        Increments across which a trajectory jumps for good.
+        Increments across which a trajectory jumps for good; they are no evidence.
     spikes : (N,) bool array
-        Poses that are wrong by themselves.
+        Outlier poses: wrong by themselves, and no evidence.
     """
 
     jumps: BoolArray
     spikes: BoolArray
 
     def across(self, kept: np.ndarray, longest_gap: int) -> Outliers:
-        """For some poses, in order: a jump between two of them counts for their increment, and so
-        does a gap of more poses than the longest.
+        """Return the outliers of a subset of poses.
+
+        An increment between two of them is a jump if a jump lies between, or if the gap is longer
+        than ``longest_gap`` poses.
         """
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
         return Outliers(jumps | (np.diff(kept) > longest_gap), self.spikes[kept])
 
     def differs_by(self, other: Outliers) -> float:
-        """Share of the evidence that counts in one but not in the other."""
+        """Share of poses and increments that are outliers in one but not in the other."""
         differing = np.sum(self.jumps != other.jumps) + np.sum(self.spikes != other.spikes)
         return float(differing) / len(self.spikes)
 
@@ -72,14 +74,13 @@ def first_outliers(
     residuals: FloatArray,
     tuning: Tuning,
 ) -> Outliers:
-    """What stands out of residuals (n, 6) without knowing their noise.
+    """Detect outliers in residuals (n, 6) without a noise model.
 
-    A pose between two jumps counts as an outlier, and its increments as evidence, until shown
-    otherwise; with a jump behind it where what stands out of the others stands out of the bridged
-    one, too.
+    A pose between two jumps is an outlier at first, and its increments are evidence. The increment
+    across it is a jump, too, if its residual stands out once the pose is bridged.
     """
     sizes = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
-    usual = np.array([median(each) for each in sizes.T])
+    usual = np.array([median(part_sizes) for part_sizes in sizes.T])
     limits = np.maximum(tuning.first_jump_sigmas * usual / MEDIAN_LENGTH, _LEAST_JUMP)
     jumps = (sizes > limits).any(axis=1)
     spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
@@ -87,7 +88,8 @@ def first_outliers(
         return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
     jumps = jumps & ~(spikes[1:] | spikes[:-1])
     if spikes.any():
-        poses, none = bridged(streams, T_parent_child, spikes), np.zeros(N_SYSTEMATIC)
+        poses = bridged(streams, T_parent_child, spikes)
+        none = np.zeros(N_SYSTEMATIC)
         bridging = linearise(poses, course, T_parent_child, none, ()).columns[:, :, -1]
         sizes = np.linalg.norm(bridging.reshape(-1, 2, 3), axis=2)
         jumps |= (sizes > limits).any(axis=1) & spikes[:-1]
@@ -95,15 +97,18 @@ def first_outliers(
 
 
 def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Chi-squares of all increments (n,) and of all poses' white errors (N,)."""
-    space, levels, (states, walk) = posterior.space, posterior.levels, posterior.restricted()
+    """Chi-squares of the increments (n,) and of the poses' white errors (N,)."""
+    space = posterior.space
+    levels = posterior.levels
+    states, walk = posterior.restricted()
     of_walk = _chi_squares(
         walk[:, :, 0],
         posterior.walk_covariance * space.relative[:, None, None],
         walk_covariance(posterior) + walk[:, :, 1:] @ transposed(walk[:, :, 1:]),
         space.cut,
     )
-    white, weights = states[:, :WHITE], np.where(spikes, 1.0, space.weights)
+    white = states[:, :WHITE]
+    weights = np.where(spikes, 1.0, space.weights)
     along = np.exp(levels[len(space.white)]) * space.twists
     of_white = _chi_squares(
         white[:, :, 0],
@@ -135,8 +140,9 @@ def judged(
     tuning: Tuning,
     with_spikes: bool = True,
 ) -> Outliers:
-    """Outliers by the chi-squares of increments (n,) and poses (N,): the largest of its
-    neighbourhood is one, and what a walk makes probable is no jump.
+    """Detect outliers by the chi-squares of increments (n,) and poses (N,).
+
+    An outlier is the largest of its neighbourhood. A step that the walk makes probable is no jump.
     """
     alarming = chi_square_quantile(tuning.false_alarms / len(of_white))
     # A step of the walk is a jump from the level of false alarms on if the others are normal, in
@@ -148,8 +154,8 @@ def judged(
         factor = float(max(median(ordinary) / CHI2[0.5][6], 1.0))
     decisive = of_walk > factor * alarming
     beside = np.maximum(of_white[1:], of_white[:-1])
-    found = decisive & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
-    jumps = (outliers.jumps & decisive) | found
+    new_jumps = decisive & _is_peak(of_walk) & (of_walk >= beside) & ~outliers.jumps
+    jumps = (outliers.jumps & decisive) | new_jumps
     spikes = outliers.spikes
     if with_spikes:
         walks = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
@@ -163,10 +169,10 @@ def _is_peak(values: FloatArray) -> BoolArray:
 
 
 def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
-    """Streams whose outlier poses of the child follow the parent's motion from the pose before.
+    """Replace outlier poses of the child by the pose before, moved as the parent moved.
 
-    A pose that is wrong by itself is no evidence, but its large error would not be small in the
-    increments on both sides of it, which are of first order.
+    An outlier pose is no evidence. The increments on both sides of it are linearised to first
+    order, so that its large error must not be in them.
     """
     Ts_cw_c = streams.Ts_cw_c.copy()
     at = np.flatnonzero(spikes[1:]) + 1
@@ -178,22 +184,24 @@ def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> 
 
 
 def tail_weights(posterior: Posterior, tuning: Tuning) -> FloatArray:
-    """Weights (N,) of white errors with Student's t distribution, whose level may change over time:
-    ``u = (nu + 6) / (nu m + E w' S^-1 w)``.
+    """Weights (N,) of white errors with Student's t distribution.
 
-    The level m of a pose is the mean of as many poses around it as predict it best, or 1 if none
-    do. Of the expectation, the share that smoothing takes from the white errors is spread over the
-    poses in inverse proportion to their weights.
+    ``u = (nu + 6) / (nu m + E w' S^-1 w)``, where the level m may change over time. m of a pose is
+    the mean over the number of poses around it that predicts it best, or 1 if none does. Smoothing
+    takes a share of the expectation; this share is spread over the poses in inverse proportion to
+    their weights.
     """
     states = posterior.states_after(posterior.normal.step)[:, :WHITE]
     pulled = se3.times(posterior.white, states)
     squares = (states * pulled).sum(axis=1)
-    weights, free = posterior.space.weights, posterior.space.weights == 0.0
+    weights = posterior.space.weights
+    free = posterior.space.weights == 0.0
     kept = min(float(np.mean((weights * squares)[~free])) / 6.0, 1.0)
     hidden = 6.0 * (1.0 - kept) / np.where(free, 1.0, weights)
     expected = np.where(free, 0.0, squares + hidden)
-    levels, of_all = [np.ones(len(expected))], np.array([~free, expected])
-    for width in tuning.widths:  # so many neighbours on either side
+    levels = [np.ones(len(expected))]
+    of_all = np.array([~free, expected])
+    for width in tuning.widths:
         sums = np.cumsum(np.pad(of_all, ((0, 0), (width + 1, width))), axis=1)
         n_around, around = sums[:, 2 * width + 1 :] - sums[:, : len(free)] - of_all
         levels.append((STUDENT + around) / (STUDENT + 6.0 * n_around))

@@ -1,8 +1,8 @@
-"""Noise levels by restricted maximum likelihood: exact derivatives, average information.
+"""Noise levels by restricted maximum likelihood (REML).
 
-The derivatives need only the blocks of the states' covariance on the diagonal and beside it; the
-curvature is the average of observed and expected information (Gilmour, Thompson, Cullis, Biometrics
-51, 1995), ``1/2 f_k' P f_l`` with ``f_k = dV/dlevel_k P r``.
+The derivatives are exact. They need only the blocks of the states' covariance on the diagonal and
+beside it. The curvature is the average of observed and expected information (Gilmour, Thompson,
+Cullis, Biometrics 51, 1995), ``1/2 f_k' P f_l`` with ``f_k = dV/dlevel_k P r``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MAX_STEPS = 20
 
 
 class Prior(NamedTuple):
-    """What is known of the log levels beforehand: means, precisions and bounds, (m,) each."""
+    """Prior of the log levels: means, precisions and bounds, (m,) each."""
 
     mean: FloatArray
     precision: FloatArray
@@ -35,7 +35,7 @@ class Prior(NamedTuple):
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
 
-# The space, levels and prior of what matters, if not all of it does.
+# Space, levels and prior without processes that do not matter; None if all matter.
 Rest: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
 
 
@@ -47,9 +47,27 @@ def fit(
     settled: float | None = None,
     smaller: Callable[[FloatArray, FloatArray], Rest] | None = None,
 ) -> tuple[Posterior, FloatArray]:
-    """The posterior at the levels of the least loss near a start, by Newton steps within a radius;
-    and the average information (m, m). Steps end if one promises to lower the loss by less than
-    ``settled``, by default the tuning's. What ``smaller`` leaves out on the way stays out.
+    """Minimise the loss over the levels by Newton steps within a radius.
+
+    Parameters
+    ----------
+    space : StateSpace
+    start : (m,) array
+        Levels at the start.
+    prior : Prior
+    tuning : Tuning
+    settled : float, optional
+        Steps end if one promises to lower the loss by less. Default: the tuning's.
+    smaller : callable, optional
+        Called with levels and information before each step. Returns the space, levels and prior
+        without processes that do not matter, or None if all matter.
+
+    Returns
+    -------
+    Posterior
+        At the levels of the least loss.
+    (m, m) array
+        Average information on the levels.
     """
     settled = tuning.settled_loss if settled is None else settled
     levels = np.clip(start, prior.lower, prior.upper)
@@ -58,7 +76,8 @@ def fit(
     loss = posterior.loss + prior.loss(levels)
     for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
-        if smaller and (rest := smaller(levels, information)):
+        rest = smaller(levels, information) if smaller else None
+        if rest:
             space, levels, prior = rest
             posterior = Posterior(space, levels)
             loss = posterior.loss + prior.loss(levels)
@@ -79,10 +98,13 @@ def fit(
                 gain = 0.0
             if gain > 0.0:
                 break
-            radius, gain = tuning.shrink * float(np.abs(step).max()), 0.0
+            radius = tuning.shrink * float(np.abs(step).max())
+            gain = 0.0
         if gain == 0.0:
             break
-        levels, posterior, loss = rival.levels, rival, loss - gain
+        levels = rival.levels
+        posterior = rival
+        loss = loss - gain
         if gain > tuning.good * promised:
             radius = min(2.0 * radius, tuning.largest_radius)
         elif gain < tuning.poor * promised:
@@ -95,12 +117,14 @@ def fit(
 def _step(
     levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior, radius: float
 ) -> tuple[FloatArray, bool]:
-    """Step of the levels that are free to move, damped to stay within the radius; and whether it
-    is undamped.
+    """Return the step of the levels, damped to stay within the radius, and whether it is undamped.
+
+    Levels at a bound that the gradient pushes against do not move.
     """
     free = (levels > prior.lower + 1e-9) | (gradient < 0)
     free &= (levels < prior.upper - 1e-9) | (gradient > 0)
-    step, damping = np.zeros(len(levels)), 0.0
+    step = np.zeros(len(levels))
+    damping = 0.0
     values, vectors = np.linalg.eigh(curvature[np.ix_(free, free)])
     along = vectors.T @ gradient[free]
     least = 0.05 * max(float(np.abs(gradient[free]).max(initial=0.0)) / radius, 1e-3)
@@ -114,7 +138,8 @@ def _step(
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Gradient (m,) of the loss by the log levels and the average information (m, m)."""
-    space, precision = posterior.space, posterior.white
+    space = posterior.space
+    precision = posterior.white
     states, walk = posterior.restricted()
     white = states[:, :WHITE]
     moments = white @ transposed(white)
@@ -138,7 +163,8 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 def walk_covariance(posterior: Posterior) -> FloatArray:
     """Covariance (n, 6, 6) of the walk's increments for known parameters."""
     covariance, below = posterior.factor.selected_inverse
-    space, back = posterior.space, transposed(posterior.space.behind)
+    space = posterior.space
+    back = transposed(posterior.space.behind)
     half = space.ahead_times(covariance[1:])
     own = space.ahead_times(transposed(half)) + transposed(back) @ covariance[:-1] @ back
     mixed = space.ahead_times(below) @ back
@@ -148,14 +174,17 @@ def walk_covariance(posterior: Posterior) -> FloatArray:
 
 
 def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
-    phi, rest, group = process.phi, process.rest, process.states
+    phi = process.phi
+    rest = process.rest
+    group = process.states
     covariance, below = posterior.factor.selected_inverse
     own = states[:, group]
     here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
     ahead = np.einsum("nii->n", below[:, group, group])
     ahead += np.einsum("nij,nij->n", own[1:], own[:-1])
     innovations = here[1:] - 2.0 * phi * ahead + phi**2 * here[:-1]
-    size, variance = own.shape[1], process.variance
+    size = own.shape[1]
+    variance = process.variance
     total = here[0] + float((innovations / rest).sum())
     by_variance = 0.5 * (size * len(here) - total / variance)
     by_phi = (phi * innovations / rest**2 - (ahead - phi * here[:-1]) / rest) / variance
@@ -164,7 +193,8 @@ def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) 
 
 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
-    space, variances = posterior.space, np.exp(posterior.levels)
+    space = posterior.space
+    variances = np.exp(posterior.levels)
     n_white = len(space.white)
     moved = np.zeros((*states.shape, len(variances)))
     pulled = (posterior.white @ states[:, :WHITE, None])[:, :, 0]
@@ -174,7 +204,8 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     along = variances[n_white] * (space.twists * pulled).sum(axis=1)
     moved[:, :WHITE, n_white] = along[:, None] * space.twists
     for at, process in enumerate(posterior.markov):
-        level, values = n_white + 1 + len(space.walk) + 2 * at, states[:, process.states]
+        level = n_white + 1 + len(space.walk) + 2 * at
+        values = states[:, process.states]
         moved[:, process.states, level] = values
         moved[:, process.states, level + 1] = process.by_tau(values)
     columns = space.observed(moved)

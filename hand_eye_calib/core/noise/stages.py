@@ -89,19 +89,25 @@ class Problem:
     tuning: Tuning = TUNING
 
     def known(self, fit: Fit) -> FloatArray:
-        """Products (p + 1, p + 1) that what is known of the parameters beforehand adds."""
-        values, weights = fit.parameters[self.columns], fit.sigmas[self.columns] ** -2.0
+        """Products (p + 1, p + 1) of the prior of the parameters."""
+        values = fit.parameters[self.columns]
+        weights = fit.sigmas[self.columns] ** -2.0
         return known_products(range(6, 6 + len(values)), values, weights, 7 + len(values))
 
     def space(
         self, fit: Fit, kept: IntArray | None = None, model: NoiseModel | None = None
     ) -> StateSpace:
         """State space of all or some of the poses, with a model other than that of the fit."""
-        poses, course, error, weights = fit.poses, fit.course, fit.error, fit.weights
+        poses = fit.poses
+        course = fit.course
+        error = fit.error
+        weights = fit.weights
         outliers = fit.outliers
         if kept is not None:
-            poses, course = poses[kept], course[kept]
-            error, weights = error[kept], weights[kept]
+            poses = poses[kept]
+            course = course[kept]
+            error = error[kept]
+            weights = weights[kept]
             outliers = outliers.across(kept, self.tuning.longest_gap)
         known = error if error.any() else None
         return (model or fit.model).state_space(
@@ -151,14 +157,14 @@ class Workspace:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Where a search stands.
+    """State of a search.
 
     Attributes
     ----------
     poses : Streams
-        Freed of the errors known so far, outlier poses bridged.
+        Without the errors estimated so far, outlier poses bridged.
     error : (N, 6) array
-        Those errors.
+        The errors taken out of the poses.
     course : Course
     T : (4, 4) array
         X.
@@ -168,7 +174,7 @@ class Fit:
     weights : (N,) array
         Of white errors; other than 1 where tails are heavy.
     sigmas : (8,) array
-        What systematic errors are known to beforehand.
+        Prior standard deviations of systematic errors.
     has_heavy_tails : bool
     parameters : (8,) array
         Of systematic errors.
@@ -187,8 +193,10 @@ class Fit:
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
 
     def moved(self, step: FloatArray, columns: list[int]) -> Fit:
-        """After a step of xi and of these parameters; X as it is if noise alone makes a step so
-        long, along a direction that the motion hardly shows.
+        """Return the fit after a step of xi and of the parameters of some columns.
+
+        X stays if the step is longer than any lever arm: noise along a direction that the motion
+        hardly shows.
         """
         is_long = np.linalg.norm(step[:3]) >= _LONGEST_STEP_M
         parameters = self.parameters.copy()
@@ -197,14 +205,15 @@ class Fit:
         return replace(self, T=T, parameters=parameters)
 
     def freed(self, streams: Streams, states: FloatArray) -> Fit:
-        """The fit with the given poses freed of the errors that latent states (N, d) make.
+        """Return the fit with the errors of latent states (N, d) taken out of the given poses.
 
         White errors are split between the sensors by their covariances, which holds for errors of
         these covariances only. A lasting error of some centimetres beside white noise of a
         millimetre would be taken for large and opposite rotations, so other errors are split in
         halves; outlier poses, too.
         """
-        spikes, T = self.outliers.spikes, self.T
+        spikes = self.outliers.spikes
+        T = self.T
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
         error = states[:, :WHITE] + self.model.lasting(states, self.poses, T)
         other_error = error - white_error
@@ -223,20 +232,20 @@ class Fit:
 def known_products(
     at: Sequence[int], values: FloatArray, weights: FloatArray, size: int
 ) -> FloatArray:
-    """Products (size, size) of what is known beforehand: that parameters at these places, which
-    have these values, are zero, with these precisions.
+    """Products (size, size) of a prior: parameters at some indices are zero.
+
+    ``values`` are the present values of these parameters, ``weights`` the precisions of the prior.
     """
-    known, at = np.zeros((size, size)), list(at)
-    known[at, at] = weights
-    known[at, -1] = known[-1, at] = weights * values
-    known[-1, -1] = weights @ values**2
-    return known
+    products = np.zeros((size, size))
+    indices = list(at)
+    products[indices, indices] = weights
+    products[indices, -1] = products[-1, indices] = weights * values
+    products[-1, -1] = weights @ values**2
+    return products
 
 
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
-    """Poses to fit noise levels with: evenly spread bursts, ever farther apart within each; None
-    for all of them.
-    """
+    """Poses to fit noise levels with: evenly spread bursts. None for all poses."""
     most = tuning.most_poses
     if n_poses <= most:
         return None
@@ -247,8 +256,9 @@ def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
 
 
 def start(problem: Problem) -> Fit:
-    """Robust first answer, and what it says about jumps, noise and the centre of its rotation."""
-    streams, tuning = problem.streams, problem.tuning
+    """Estimate X robustly, then jumps, noise levels and the centre of rotation noise."""
+    streams = problem.streams
+    tuning = problem.tuning
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
@@ -272,7 +282,7 @@ def start(problem: Problem) -> Fit:
 
 
 def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: float) -> str:
-    """What white rotation noise turns the trajectories about, see ``noise_model.CENTRES``."""
+    """Centre of white rotation noise, see ``noise_model.CENTRES``."""
     worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
     sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
     for centre, poses in worlds.items():

@@ -102,7 +102,7 @@ class StateSpace:
         return transposed(roots) @ roots, log_determinants + grown[:, 0, 0]
 
     def observed(self, states: FloatArray) -> FloatArray:
-        """What states (N, d, k) contribute to the increments, (n, 6, k)."""
+        """Contribution (n, 6, k) of states (N, d, k) to the increments."""
         observed = self.behind @ states[:-1]
         return np.subtract(self.ahead_times(states[1:]), observed, out=observed)
 
@@ -123,7 +123,7 @@ class StateSpace:
 
 
 class Markov:
-    """A group of processes at given levels.
+    """A group of independent Gauss-Markov processes with one variance and one time constant.
 
     Attributes
     ----------
@@ -139,14 +139,20 @@ class Markov:
 
     def __init__(self, states: slice, levels: FloatArray, intervals_s: FloatArray) -> None:
         ratio = intervals_s / np.exp(levels[1])
-        self.states, self.variance, self.phi = states, float(np.exp(levels[0])), np.exp(-ratio)
-        self.slope, self.rest = self.phi * ratio, -np.expm1(-2.0 * ratio)
+        self.states = states
+        self.variance = float(np.exp(levels[0]))
+        self.phi = np.exp(-ratio)
+        self.slope = self.phi * ratio
+        self.rest = -np.expm1(-2.0 * ratio)
         self.after = 1.0 / self.rest
-        self.beside, self.before = -self.phi * self.after, self.phi**2 * self.after
+        self.beside = -self.phi * self.after
+        self.before = self.phi**2 * self.after
 
     def by_tau(self, values: FloatArray) -> FloatArray:
         """Derivative by log tau of the states (N, k) that the covariance makes of fixed forces."""
-        phi, rest, slope = self.phi, self.rest, self.slope
+        phi = self.phi
+        rest = self.rest
+        slope = self.slope
         by_rest = 2.0 * phi * slope / rest**2
         beside = (slope / rest + phi * by_rest)[:, None]
         first = (2.0 * phi * slope / rest + phi**2 * by_rest)[:, None]
@@ -199,9 +205,12 @@ class Posterior:
     """
 
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
-        self.space, self.levels = space, levels
-        n_poses, n_white = len(space.weights), len(space.white) + 1
-        kept, given = ~space.cut, space.weights != 0.0
+        self.space = space
+        self.levels = levels
+        n_poses = len(space.weights)
+        n_white = len(space.white) + 1
+        kept = ~space.cut
+        given = space.weights != 0.0
         self.white, of_white = space.white_precision(levels)
         weights = space.weights[:, None, None]
         self._of_poses = weights * self.white
@@ -210,11 +219,14 @@ class Posterior:
         self.walk = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.relative)
         self._weights = self.evidence[:, None, None] * self.walk
-        self.markov, start, at = [], WHITE, n_white + len(space.walk)
+        self.markov = []
+        start = WHITE
+        at = n_white + len(space.walk)
         for size in space.sizes:
             of_group = slice(start, start + size), levels[at : at + 2]
             self.markov.append(Markov(*of_group, space.intervals_s))
-            start, at = start + size, at + 2
+            start += size
+            at += 2
         diagonal, below = self._blocks(0, n_poses - 1)
         np.einsum("nii->ni", diagonal)[:] *= 1.0 + _RAISED
         self.factor = Factor(diagonal, below)
@@ -238,10 +250,15 @@ class Posterior:
         from pose to pose. What is known of a pose by itself is in the block of the increment
         before, or of the first one.
         """
-        space, part, here = self.space, slice(start, end), slice(1, None)
-        ahead, behind, weights = space.ahead[part], space.behind[part], self._weights[part]
+        space = self.space
+        part = slice(start, end)
+        here = slice(1, None)
+        ahead = space.ahead[part]
+        behind = space.behind[part]
+        weights = self._weights[part]
         n, _, size = behind.shape
-        diagonal, below = np.zeros((n + 1, size, size)), np.zeros((n, size, size))
+        diagonal = np.zeros((n + 1, size, size))
+        below = np.zeros((n, size, size))
         diagonal[here, :WHITE, :WHITE] = weights
         weighed = np.matmul(weights, behind, out=below[:, :WHITE])
         if self.markov:
@@ -254,7 +271,8 @@ class Posterior:
         np.negative(weighed, out=weighed)
         diagonal[here, :WHITE, :WHITE] += self._of_poses[start + 1 : end + 1]
         for process in self.markov:
-            states, variance = range(size)[process.states], process.variance
+            states = range(size)[process.states]
+            variance = process.variance
             below[:, states, states] += process.beside[part, None] / variance
             diagonal[:-1, states, states] += process.before[part, None] / variance
             diagonal[1:, states, states] += process.after[part, None] / variance
@@ -271,28 +289,34 @@ class Posterior:
         return weighed, self.factor.whiten(self.space.gathered(weighed))
 
     def states_after(self, step: FloatArray) -> FloatArray:
-        """States (N, d) expected after a step of the parameters."""
+        """Expected states (N, d) after a step of the parameters."""
         mixing = np.r_[step, 1.0][:, None]
         return self.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
 
     def restricted(self) -> tuple[FloatArray, FloatArray]:
-        """States (N, d, 1 + q) and walk (n, 6, 1 + q): expected values and, behind them, what the
-        parameters' uncertainty adds, as columns whose squares sum to it.
+        """States (N, d, 1 + q) and walk (n, 6, 1 + q) for unknown parameters.
+
+        The first column is the expected value. The squares of the other columns sum to the variance
+        that the uncertainty of the parameters adds.
         """
-        size, normal = len(self.normal.step), self.normal
+        size = len(self.normal.step)
+        normal = self.normal
         mixing = np.zeros((size + 1, size + 1))
-        mixing[:-1, 0], mixing[-1, 0], mixing[:-1, 1:] = normal.step, 1.0, normal.root
+        mixing[:-1, 0] = normal.step
+        mixing[-1, 0] = 1.0
+        mixing[:-1, 1:] = normal.root
         states = self.factor.restore(_mixed(self.whitened, mixing))
         return states, _mixed(self.space.columns, mixing) - self.space.observed(states)
 
     def part_products(self) -> FloatArray:
-        """What each part adds to the products of J and, last, e: (K, p + 1, p + 1), K at most 20.
+        """Contributions (K, p + 1, p + 1) of parts of the recording to the products; K at most 20.
 
-        Leaving increments out as such would cut the trajectory there, and with white noise most is
-        known across the gap: answers without a part would scatter more than the error does. What a
-        part adds, its innovations, is independent of the other parts if the model is right.
+        Without the increments of a part the trajectory would be cut, although white noise leaves
+        most known across the gap: solutions without a part would scatter more than the error does.
+        The contribution of a part, its innovations, is independent of the other parts if the model
+        is right.
 
-        Each part is a quadratic form of the states at its two ends and of the columns: all states
+        Each part is a quadratic form of the states at its two ends and of the columns; all states
         between are eliminated. The forms are added in order of time.
         """
         n, _, n_columns = self.space.columns.shape
@@ -307,26 +331,34 @@ class Posterior:
             form[np.ix_(here, here)] += known
             known = _eliminated(form, size)
             totals.append(_eliminated(known, size))
-        # What is known beforehand counts in equal shares.
+        # The prior counts in equal shares.
         return np.diff(np.array(totals), axis=0) + self.space.prior / (len(ends) - 1)
 
     def _form_of_part(self, start: int, end: int) -> FloatArray:
         """Quadratic form (2 d + k, 2 d + k) of the states at pose ``start`` and at ``end`` and of k
         columns, of the increments between; of the states before the start nothing is known.
         """
-        space, part, size = self.space, slice(start, end), self.space.behind.shape[2]
+        space = self.space
+        part = slice(start, end)
+        size = self.space.behind.shape[2]
         diagonal, below = self._blocks(start, end)
         weighed = self._weights[part] @ space.columns[part]
         here = replace(space, ahead=space.ahead[part], behind=space.behind[part])
         forces = here.gathered(weighed)
         form = np.zeros((2 * size + forces.shape[2],) * 2)
-        first, last, columns = slice(size), slice(size, 2 * size), slice(2 * size, None)
-        form[first, first], form[last, last] = diagonal[0], diagonal[-1]
-        form[first, columns], form[last, columns] = forces[0], forces[-1]
-        form[columns, first], form[columns, last] = forces[0].T, forces[-1].T
+        first = slice(size)
+        last = slice(size, 2 * size)
+        columns = slice(2 * size, None)
+        form[first, first] = diagonal[0]
+        form[last, last] = diagonal[-1]
+        form[first, columns] = forces[0]
+        form[last, columns] = forces[-1]
+        form[columns, first] = forces[0].T
+        form[columns, last] = forces[-1].T
         form[columns, columns] = multiplied(space.columns[part], weighed)
         if len(diagonal) == 2:
-            form[last, first], form[first, last] = below[0], below[0].T
+            form[last, first] = below[0]
+            form[first, last] = below[0].T
             return form
         right = np.zeros((len(diagonal) - 2, size, len(form)))
         right[:, :, columns] = forces[1:-1]

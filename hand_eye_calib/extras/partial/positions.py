@@ -1,19 +1,17 @@
-"""The lever arm of a sensor that measures only positions: a GNSS antenna, the prism of a total
-station.
+"""Lever arm of a sensor that measures only positions: a GNSS antenna, the prism of a total station.
 
-The sensor's orientation is that of the other one, as that is known from its own odometry, in the
-world of the positions: a latent rotation of each pose that may be anything, but changes from pose
-to pose as the odometry says, up to its drift. So this is the state space of the adaptive estimator
-(:mod:`~hand_eye_calib.core.noise.state_space`) with a white rotation error without bounds; the
-rotations are updated from what the positions say of them, until they stay. The sensor's frame has
-the axes of the other one by convention: ``X = (I, l)``. The search starts where windows of the
-recording, each aligned by itself, fit best.
+Each pose has a latent rotation of the sensor in the world of the positions. It may be anything, but
+changes from pose to pose as the odometry of the other sensor says, up to its drift. This is the
+state space of the adaptive estimator (:mod:`~hand_eye_calib.core.noise.state_space`) with a white
+rotation error without bounds. The rotations are updated from the positions until they settle. The
+sensor's frame has the axes of the other sensor by convention: ``X = (I, l)``. The search starts
+from windows of the recording, each aligned by itself.
 
-Errors that act like a lever arm are parameters beside it, known beforehand to what sensors have: a
-scale and a direction of the odometry's path, and a time offset. What the positions answer to
-acceleration is in the covariance alone: on recorded drones even its sign depends on the frequency.
-A drone tilts to accelerate, so that positions which answer by kappa (s^2), as smoothed ones do,
-move the vertical lever arm by kappa g.
+Errors that act like a lever arm are parameters beside it, with the prior of usual sensors: a scale
+and a direction of the odometry's path, and a time offset. The response of positions to acceleration
+is in the covariance only: on recorded drones even its sign depends on the frequency. A drone tilts
+to accelerate, so that positions with a response kappa (s^2), as smoothed ones have, move the
+vertical lever arm by kappa g.
 """
 
 from __future__ import annotations
@@ -34,11 +32,11 @@ from hand_eye_calib.core.noise.noise_model import (
     N_FAST,
     ROTATION,
     ROTATIONS,
-    TRANSLATION,
     TRANSLATIONS,
     WALK_ROTATION,
     WALK_TRANSLATION,
     NoiseModel,
+    fast_sigmas,
 )
 from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.noise.outliers import Outliers, bridged, innovations, judged
@@ -88,30 +86,30 @@ class LeverArmSolution(ModelSolution):
     worse: BoolArray
 
     def describe(self, stamps_ns: IntArray) -> Noise:
-        """The noise in plain values and in words, as of an AdaptiveSolution."""
-        sigmas = np.exp(0.5 * self.levels)
-        white, walk = (float(sigmas[level]) for level in (TRANSLATION, WALK_TRANSLATION))
-        turned = float(sigmas[WALK_ROTATION])
-        said = [
-            f"each position is off by {length(white)} per axis, and the odometry drifts by "
-            f"{length(walk)} and {angle(turned)} from one to the next"
+        """Return the noise in numbers and in words, as of an AdaptiveSolution."""
+        sigmas = fast_sigmas(self.levels)
+        white = length(sigmas.translation_m)
+        drift = f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
+        sentences = [
+            f"each position is off by {white} per axis, and the odometry drifts by {drift} from "
+            "one to the next"
         ]
         if self.worse.any():
             share = f"{self.worse.mean():.0%} of the positions"
-            said.append(f"{share} are far less precise, and are left out")
+            sentences.append(f"{share} are far less precise, and are left out")
         response, sigma = 1e3 * np.array(self.response)
         if abs(response) > PLAIN_SIGMAS * sigma:
-            said.append(
+            sentences.append(
                 f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
                 "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
             )
-        said += self.events(stamps_ns)
+        sentences += self.events(stamps_ns)
         return Noise(
-            translation_white_m=white,
-            translation_drift_m_per_pose=walk,
-            rotation_drift_rad_per_pose=turned,
+            translation_white_m=sigmas.translation_m,
+            translation_drift_m_per_pose=sigmas.walk_translation_m,
+            rotation_drift_rad_per_pose=sigmas.walk_rotation_rad,
             misfit=self.misfit,
-            in_words=tuple(said),
+            in_words=tuple(sentences),
         )
 
 
@@ -147,7 +145,8 @@ def solve(
         if number + 1 in tuning.fits[1:]:
             state = state.with_outliers(posterior)
         normal = NormalEquations(_solved(posterior.products))
-        step, sigmas = normal.step, np.sqrt(np.diag(normal.covariance)[:3])
+        step = normal.step
+        sigmas = np.sqrt(np.diag(normal.covariance)[:3])
         is_small = np.abs(step[:3]) < tuning.settled_sigmas * sigmas
         is_settled = bool((is_small | (sigmas > tuning.unknown_m)).all())
         converged = number > tuning.fits[-1] and is_settled
@@ -159,7 +158,7 @@ def solve(
 
 @dataclass(frozen=True, kw_only=True)
 class _State:
-    """Where the search stands. The child's poses are its ``positions`` (N, 3), bridged where they
+    """State of the search. The child's poses are its ``positions`` (N, 3), bridged where they
     are left out, with the orientations known so far. ``X`` is (I, l). ``parameters`` are (9,); the
     lever arm and those that are asked for are known to ``sigmas`` (9,) beforehand. ``boost`` (n,)
     are factors of the walk's variance, above 1 at jumps; those around positions that are ``worse``
@@ -186,7 +185,7 @@ class _State:
         with_scale: bool,
         tuning: Tuning,
     ) -> _State:
-        """Where it begins."""
+        """State at the beginning."""
         stamps_s = streams.stamps_s
         n = len(streams) - 1
         sigmas = np.array(tuning.of_positions)
@@ -241,12 +240,12 @@ class _State:
         """Increments between poses, with the columns of the lever arm and of the parameters."""
         course = self.course
         moving = _accelerations(self.streams, self.X, self.tuning)
-        found = increments.linearise(
+        linearisation = increments.linearise(
             self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED
         )
-        answering = se3.times(found.adjoints, moving[:-1]) - moving[1:]
-        columns = np.insert(found.columns, -1, answering, axis=2)
-        return replace(found, columns=np.delete(columns, [3, 4, 5], axis=2))
+        answering = se3.times(linearisation.adjoints, moving[:-1]) - moving[1:]
+        columns = np.insert(linearisation.columns, -1, answering, axis=2)
+        return replace(linearisation, columns=np.delete(columns, [3, 4, 5], axis=2))
 
     def space(self, model: NoiseModel | None = None) -> StateSpace:
         """State space of all poses: without a rotation to estimate, with orientations that may be
@@ -309,8 +308,8 @@ class _State:
         """
         of_walk, of_white = innovations(posterior, self.left_out)
         tuning = self.tuning
-        found = judged(self.outliers, of_walk, of_white, tuning)
-        boost = np.where(found.jumps, np.maximum(tuning.jump_factor * of_walk, self.boost), 1.0)
+        outliers = judged(self.outliers, of_walk, of_white, tuning)
+        boost = np.where(outliers.jumps, np.maximum(tuning.jump_factor * of_walk, self.boost), 1.0)
         states = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], states)
@@ -319,14 +318,15 @@ class _State:
         worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), tuning, drift)
         Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
         streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
-        return replace(self, outliers=found, boost=boost, streams=streams, worse=worse)
+        return replace(self, outliers=outliers, boost=boost, streams=streams, worse=worse)
 
     def moved(self, posterior: Posterior, step: FloatArray) -> _State:
         """After a step, with the orientations that the positions ask for."""
         turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
-        X, parameters = self.X.copy(), self.parameters.copy()
+        X = self.X.copy()
+        parameters = self.parameters.copy()
         X[:3, 3] += step[:3]
         parameters[_SHARED] += step[3:]
         return replace(
@@ -366,8 +366,10 @@ def _solution(
     misfit = float(normal.cost) / max(3 * n_evidence - 3 - len(_SHARED), 1)
     # With the answer to acceleration, and by what it would move the lever arm.
     whole = posterior.normal
-    covariance, shift = max(misfit, 1.0) * whole.covariance, (whole.step[:-1] - normal.step)[:3]
-    sigmas, parameters = np.zeros(RESPONSE + 1), state.parameters.copy()
+    covariance = max(misfit, 1.0) * whole.covariance
+    shift = (whole.step[:-1] - normal.step)[:3]
+    sigmas = np.zeros(RESPONSE + 1)
+    parameters = state.parameters.copy()
     sigmas[[*_SHARED, RESPONSE]] = np.sqrt(np.diag(covariance)[3:])
     parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], whole.step[-1]]
     # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
@@ -404,18 +406,20 @@ def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -
     """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes, from steps on
     either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
     """
-    path, stamps_s = (streams.Ts_pw_p @ X)[:, :3, 3], streams.stamps_s
-    found, interval_s = np.zeros((len(path), 6)), float(np.median(np.diff(stamps_s)))
+    path = (streams.Ts_pw_p @ X)[:, :3, 3]
+    stamps_s = streams.stamps_s
+    accelerations = np.zeros((len(path), 6))
+    interval_s = float(np.median(np.diff(stamps_s)))
     k = max(round(tuning.accelerating_s / interval_s), 1)
     if len(path) <= 4 * k:
-        return found
+        return accelerations
     velocities = (path[k:] - path[:-k]) / (stamps_s[k:] - stamps_s[:-k])[:, None]
     spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
     changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
     back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
     is_near = spans_s < tuning.near * 4 * k * interval_s
-    found[2 * k : -2 * k, :3] = np.where(is_near, se3.times(back, changes), 0.0)
-    return found
+    accelerations[2 * k : -2 * k, :3] = np.where(is_near, se3.times(back, changes), 0.0)
+    return accelerations
 
 
 def _start(
@@ -425,7 +429,8 @@ def _start(
     ones count less; and the rotations (N, 3, 3) of the other sensor in the world of the positions,
     window by window.
     """
-    lever_arm, scale = np.zeros(3), 1.0
+    lever_arm = np.zeros(3)
+    scale = 1.0
     whole = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
     size = min(window, len(positions))
     axes, path, measured = (_windows(values, size) for values in whole)
@@ -459,8 +464,9 @@ def unexplained_share(
     size = max(len(positions) // _PATH_PARTS, min(_PATH_PARTS, len(positions)))
     expected, measured = (_windows(path, size) for path in (predicted, scale * positions))
     residuals = measured @ _rotations(measured, expected) - expected
-    left, whole = ((path**2).sum(axis=(1, 2)) for path in (residuals, measured))
-    return float(np.sqrt(np.median(left) / np.median(whole))) if np.median(whole) else 1.0
+    usual_residual = np.median((residuals**2).sum(axis=(1, 2)))
+    usual_path = np.median((measured**2).sum(axis=(1, 2)))
+    return float(np.sqrt(usual_residual / usual_path)) if usual_path else 1.0
 
 
 def _windows(values: FloatArray, size: int) -> FloatArray:
