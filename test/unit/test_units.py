@@ -65,7 +65,9 @@ class TestRatio:
             assert "parent_scale" not in found.options
             assert f"parent_scale {factor:g}" in found.advice
 
-    @pytest.mark.parametrize(("off", "is_exact"), [(1.002, 1.0), (1.004, 0.0), (0.96, 0.0)])
+    @pytest.mark.parametrize(
+        ("off", "is_exact"), [(1.002, 1.0), (1.004, 1.0), (1.006, 0.0), (0.96, 0.0)]
+    )
     def test_a_ratio_near_a_unit_is_a_question(self, off, is_exact):
         streams = moving_at(2.0), moving_at(0.6)
         found = in_other_units(off / 0.3048, 0.001 / 0.3048, *streams)
@@ -180,10 +182,12 @@ class TestNoisyChild:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [(classes, "arm_target"), (mixed, "mixed_arm")], ids=["target", "mixed"]
+    ("kind", "name", "seed"),
+    [(classes, "arm_target", 2002), (classes, "arm_target", 7003), (mixed, "mixed_arm", 2002)],
+    ids=["target", "small bias", "mixed"],
 )
-def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, name):
-    drive = kind.make(name, 2002)
+def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, name, seed):
+    drive = kind.make(name, seed)
     result = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), drive.child)
     assert result.verdict is hec.Verdict.DO_NOT_USE
     assert "unit_or_scale" in {each.code for each in result.findings if each.makes_unusable}

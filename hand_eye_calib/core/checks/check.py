@@ -50,6 +50,9 @@ _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "f
 
 # A scale is that of a unit within so many of its standard deviations, or to rounding (share).
 UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
+# A parent in another unit beside an odometry whose noise shortens its path, as that of simulated
+# arms did by 0.2 %, beyond what its standard deviation tells (share).
+_PARENT_UNIT_SHARE = 0.005
 # A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
 _UNIT_NEAR = 0.05
 
@@ -473,8 +476,8 @@ def in_other_units(
     changes the parent. The motion decides: a parent that would be too fast in metres is in that
     unit, a child that would hardly move in metres has a scale of its own. Where both are plausible
     in metres, the finding names both explanations. The result is not to be used within three
-    standard deviations of a unit, and with care within 5 %. Two streams in one wrong unit have no
-    ratio; :func:`~hand_eye_calib.core.checks.streams.check_lengths` asks about them.
+    standard deviations or 0.5 % of a unit, and with care within 5 %. Two streams in one wrong unit
+    have no ratio; :func:`~hand_eye_calib.core.checks.streams.check_lengths` asks about them.
 
     Parameters
     ----------
@@ -506,7 +509,8 @@ def _unit_of(total: float, sigma: float) -> tuple[float, bool]:
     for unit in _UNITS:
         factor = unit if total < 1.0 else 1.0 / unit
         off = abs(total - factor)
-        is_exact = off <= max(UNIT_SIGMAS * sigma, _UNIT_ROUNDING * factor)
+        share = _UNIT_ROUNDING if total < 1.0 else _PARENT_UNIT_SHARE
+        is_exact = off <= max(UNIT_SIGMAS * sigma, share * factor)
         if is_exact or off <= _UNIT_NEAR * factor:
             return unit, is_exact
     return 0.0, False
