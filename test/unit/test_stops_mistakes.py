@@ -365,3 +365,32 @@ def test_pairing_by_time_is_refused_for_stops(n_files, tmp_path, capsys):
     words = [str(tmp_path / name) if "." in name else name for name in names]
     assert main(["calibrate", *words, "--pair-by", "time"]) == 2
     assert "--pair-by time has no meaning for stops" in capsys.readouterr().err
+
+
+SIZED = {
+    "metres": (same, same),
+    "millimetres, target": (same, lambda Ts: scaled(Ts, 1e3)),
+    "millimetres, both": (lambda Ts: scaled(Ts, 1e3), lambda Ts: scaled(Ts, 1e3)),
+    "centimetres, target": (same, lambda Ts: scaled(Ts, 1e2)),
+    "scalar first, both": (scalar_first, scalar_first),
+}
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("size", [0.7, 1.2, 1.5])
+@pytest.mark.parametrize("name", SIZED)
+def test_the_options_that_a_finding_names_lead_to_the_right_answer(name, size, place):
+    of_robot, of_target = SIZED[name]
+    robot, tracking, truth = arm(place, seed=5)
+    sides = of_robot(robot), of_target(scaled(tracking, size))
+    refused = calibrate_arm(*sides)
+    assert refused.verdict is hec.Verdict.DO_NOT_USE
+    options = refused.reasons[0].options
+    assert options == {"scale": "estimate"}
+    result = calibrate_arm(*sides, CalibratorConfig(**options))
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[:3]) < WITHIN_M
+    assert result.verdict is not hec.Verdict.DO_NOT_USE
+    found = calibrate_arm(*sides, CalibratorConfig(scale="auto"))
+    np.testing.assert_allclose(found.T_parent_child, result.T_parent_child, atol=1e-9)
+    assert found.verdict is result.verdict

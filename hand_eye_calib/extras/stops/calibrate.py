@@ -22,6 +22,7 @@ from hand_eye_calib.core.geometry.frames import pose_stack
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import Residuals, gravest_first
 from hand_eye_calib.extras.stops.checks import (
+    Examination,
     GivenStops,
     Mistakes,
     examine,
@@ -52,6 +53,9 @@ _BY_NOISE = 3.0
 
 # Scales beyond this factor are no size of a target.
 _WRONG_SCALE = 10.0
+
+# Values of the option scale that have it found.
+_FOUND_SCALES = ("auto", "estimate")
 
 # Steps to the scale; a step below this share of its standard deviation ends them.
 _SCALE_ROUNDS = 10
@@ -258,12 +262,15 @@ def _given(
     return GivenStops(poses[0], poses[1], is_arm, has_positions)
 
 
-def _put_right(given: GivenStops, config: CalibratorConfig) -> GivenStops:
-    """The poses in the usual convention, in metres, from that of the options."""
-    scale = 1.0 if isinstance(config.scale, str) else config.scale
+def _put_right(given: GivenStops, config: CalibratorConfig, child_unit: float) -> GivenStops:
+    """Return the poses in the usual convention, in metres, from that of the options and a factor
+    from the child's lengths to metres.
+    """
     parent = se3.put_right(given.parent, config.parent_invert, config.parent_quaternion)
     child = se3.put_right(given.child, config.child_invert, config.child_quaternion)
-    return replace(given, parent=_scaled(parent, config.parent_scale), child=_scaled(child, scale))
+    return replace(
+        given, parent=_scaled(parent, config.parent_scale), child=_scaled(child, child_unit)
+    )
 
 
 def _scaled(Ts: FloatArray, factor: float) -> FloatArray:
@@ -275,8 +282,11 @@ def _scaled(Ts: FloatArray, factor: float) -> FloatArray:
 
 def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
     """Check the stops, repair what is certain, solve, and estimate the scale if it matters."""
-    stops = _put_right(given, config)
+    unit = 1.0 if isinstance(config.scale, str) else config.scale
+    stops = _put_right(given, config, unit)
     examination = examine(stops)
+    if config.scale in _FOUND_SCALES:
+        examination, unit = _without_unit_of_child(examination)
     findings = []
     for found in examination.findings:
         # Who has named the convention of both sides has decided.
@@ -297,10 +307,28 @@ def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
         undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
         warnings.append(f"repaired: {repair.what}. Solved with {told} (undo with {undo})")
         config = replace(config, **options)
-    stops = _put_right(given, config) if repairs else stops
+        unit = float(options.get("scale", unit))
+    stops = _put_right(given, config, unit)
     # The rough scale is that of lengths whose units are put right.
     scale = None if settled else examination.scale
-    return _with_scale(stops, config, scale, findings, warnings)
+    return _with_scale(stops, config, unit, scale, findings, warnings)
+
+
+def _without_unit_of_child(examination: Examination) -> tuple[Examination, float]:
+    """Take the unit of the child's lengths out of the findings: it is part of a scale that is
+    found. Return the rest, and the factor to metres.
+    """
+    unit = 1.0
+    for found in (*examination.findings, *examination.repairs):
+        if _is_unit_of_child(found):
+            unit = float(found.options["scale"])
+    findings = tuple(found for found in examination.findings if not _is_unit_of_child(found))
+    repairs = tuple(found for found in examination.repairs if not _is_unit_of_child(found))
+    return replace(examination, findings=findings, repairs=repairs), unit
+
+
+def _is_unit_of_child(found: Finding) -> bool:
+    return {*found.options} == {"scale"}
 
 
 def _composed(repair: Finding, config: CalibratorConfig) -> dict[str, Any]:
@@ -330,12 +358,15 @@ def _as_set(found: Finding, config: CalibratorConfig) -> Finding:
 def _with_scale(
     given: GivenStops,
     config: CalibratorConfig,
+    base: float,
     rough_scale: float | None,
     findings: list[Finding],
     warnings: list[str],
 ) -> _Solved:
-    """Solve with the scale that the options ask for, or that the stops clearly show."""
-    base = 1.0 if isinstance(config.scale, str) else config.scale
+    """Solve with the scale that the options ask for, or that the stops clearly show.
+
+    The child's lengths are multiplied by ``base`` already.
+    """
     wants_scale = config.scale == "estimate"
     if wants_scale and not given.has_positions:
         raise ConfigError("scale estimate needs positions; both sides have rotations alone")
@@ -348,16 +379,18 @@ def _with_scale(
         free = _with_free_scale(given, start, is_inverse)
         scale, sigma = free[2], free[3]
         off = _off_scale(scale, sigma, len(stops))
-        is_clear = off > _SCALE_SHARE
-        is_given = "scale" in config.given and config.scale not in ("auto", "estimate")
+        is_auto = config.scale == "auto"
+        is_clear = off > _SCALE_SHARE or (is_auto and base != 1.0)
+        is_given = "scale" in config.given and config.scale not in _FOUND_SCALES
         is_size = 1.0 / _WRONG_SCALE < scale < _WRONG_SCALE
         is_used = wants_scale or (is_clear and is_size and not is_given)
-        if is_clear and not wants_scale:
+        is_asked = wants_scale or (is_auto and is_size)
+        if is_clear and not is_asked:
             findings = [*findings, scale_finding(base * scale, base * sigma)]
         if is_used:
             fit, stops = free[0], free[1]
             if not wants_scale:
-                undo = "none" if base == 1.0 else base
+                undo = "none" if base == 1.0 or is_auto else base
                 warnings = [
                     *warnings,
                     f"solved with the child's lengths times {base * scale:.4f} +/- "
