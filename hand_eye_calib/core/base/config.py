@@ -5,7 +5,7 @@ the documentation are made from these dataclasses or tested against them.
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import InitVar, dataclass
 from typing import Any, NamedTuple, Self
 
@@ -336,6 +336,11 @@ MOST_OTHERS = 7  # further child sensors of the node
 def other_names(count: int = MOST_OTHERS) -> list[str]:
     """Names of the inputs of so many further child sensors."""
     return [f"child{number}" for number in range(2, count + 2)]
+
+
+def defaults_of(names: Iterable[str]) -> dict[str, Any]:
+    """Return the default values of options of the engine, by name."""
+    return {name: getattr(CalibratorConfig, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)

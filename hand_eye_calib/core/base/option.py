@@ -21,6 +21,11 @@ _GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
+def options_in_words(options: Options) -> str:
+    """Return options and their values as messages print them: ``scale 0.001, time_offset 0.2``."""
+    return ", ".join(f"{name} {value}" for name, value in options.items())
+
+
 def option(
     default: OptionValue,
     doc: str,

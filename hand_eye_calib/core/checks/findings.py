@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.core.base.config import METHODS, CalibratorConfig
+from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, defaults_of
 from hand_eye_calib.core.results.records import Finding, Severity, gravest_first
 
 __all__ = ["Finding", "Severity", "answered", "finding", "graded", "gravest_first"]
@@ -522,7 +522,7 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
         if each.code in CONVENTIONS:
             # A stream that was put right already, and needs it again, was right before.
             set_so = [name for name, value in options.items() if given[name] == value]
-            options |= {name: getattr(CalibratorConfig, name) for name in set_so}
+            options |= defaults_of(set_so)
         is_answered = options and all(given.get(name) == options[name] for name in options)
         if each.code == "jumps" and METHODS[config.method].rejects_outliers:
             is_answered = is_answered or each.evidence["share"] < _FEW_JUMPS

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
-from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.config import defaults_of
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, gravest_first
@@ -117,8 +117,8 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
     # The poses as they came in: repairs apply once.
-    usual: Options = {name: getattr(CalibratorConfig, name) for name in STREAM_REPAIRS}
-    parent, child = replace(snapshot, config=replace(snapshot.config, **usual)).streams
+    as_given = replace(snapshot.config, **defaults_of(STREAM_REPAIRS))
+    parent, child = replace(snapshot, config=as_given).streams
     return replace(
         snapshot,
         config=replace(config, max_gap=snapshot.max_gap_s),

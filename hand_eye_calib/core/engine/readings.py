@@ -14,7 +14,7 @@ import numpy as np
 
 from hand_eye_calib.core.alignment.similarity import estimate_scale
 from hand_eye_calib.core.base.errors import NotEnoughDataError
-from hand_eye_calib.core.base.option import Options
+from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, finding, gravest_first
 from hand_eye_calib.core.checks.hypotheses import Readings, findings_of
@@ -171,7 +171,7 @@ def _unclear(
     """Return the finding that two readings are possible, with both answers."""
     texts = []
     for reading_options, answer in zip(options, answers, strict=True):
-        values = ", ".join(f"{name} {value}" for name, value in reading_options.items())
+        values = options_in_words(reading_options)
         reading = f"with {values}" if values else "as the streams are"
         pose = _in_words(answer.T_parent_child) if answer else "no result"
         texts.append(f"{reading} ({pose})")

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from hand_eye_calib.core.alignment.time_offset import TimeOffset, refine_time_offset
-from hand_eye_calib.core.base.config import METHODS, CalibratorConfig
+from hand_eye_calib.core.base.config import METHODS, defaults_of
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
-from hand_eye_calib.core.base.option import Options
+from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
@@ -279,11 +279,10 @@ def _repair_message(
 ) -> str:
     """Say what was repaired, with which options, and how to undo it."""
     what = [found.what for found in findings if {*found.options} & {*options}]
-    done = ", ".join(f"{name} {value}" for name, value in options.items())
-    undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
     return (
-        f"repaired: {'; '.join(what)}. Solved with {done}: {second.calibration.verdict.value}; as "
-        f"the streams are: {verdict_as_given} (undo with {undo})"
+        f"repaired: {'; '.join(what)}. Solved with {options_in_words(options)}: "
+        f"{second.calibration.verdict.value}; as the streams are: {verdict_as_given} "
+        f"(undo with {options_in_words(defaults_of(options))})"
     )
 
 
@@ -349,9 +348,10 @@ def _saying_estimates(attempt: Attempt, options: Options, findings: Collection[F
     rate = calibration.clock_rate
     if rate and rate.is_used:
         what["time_offset"] += f" and {rate}"
+    usual = defaults_of(options)
     messages = [
         f"{what[name]}: solved with {name} {value}; to take the stream as it is, give {name} "
-        f"{getattr(CalibratorConfig, name)}"
+        f"{usual[name]}"
         for name, value in options.items()
     ]
     return _with_offset_doubt(attempt.with_messages(options, messages), [])

@@ -11,9 +11,9 @@ import numpy as np
 from hand_eye_calib.core.assessment.covariance import UNKNOWN_SIGMAS, combined
 from hand_eye_calib.core.assessment.prior import fuse
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.config import CalibratorConfig, defaults_of
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
-from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.base.option import option_name, options_in_words
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.engine.estimation import calibration_of
@@ -303,9 +303,9 @@ def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
     warnings = []
     for repair in repairs:
         options = _composed(repair, config)
-        told = ", ".join(f"{name} {value}" for name, value in options.items())
-        undo = ", ".join(f"{name} {getattr(CalibratorConfig, name)}" for name in options)
-        warnings.append(f"repaired: {repair.what}. Solved with {told} (undo with {undo})")
+        done = options_in_words(options)
+        undo = options_in_words(defaults_of(options))
+        warnings.append(f"repaired: {repair.what}. Solved with {done} (undo with {undo})")
         config = replace(config, **options)
         unit = float(options.get("scale", unit))
     stops = _put_right(given, config, unit)

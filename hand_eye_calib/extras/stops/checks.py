@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.config import defaults_of
 from hand_eye_calib.core.base.stats import median, medians, robust_regression, robust_weights
 from hand_eye_calib.core.checks.findings import CONVENTIONS, Finding, Severity, conventions, finding
 from hand_eye_calib.core.geometry import se3
@@ -602,19 +602,16 @@ def _named(
 
 def _ambiguous(mistakes: Mistakes, other: Mistakes) -> Finding:
     """Return the finding that two explanations fit alike, with the options of both."""
-    options = {"the first": _options_of(mistakes), "the other": _options_of(other)}
-    # Each names what the other one would set, so that both are settled.
-    for own, rival in (("the first", "the other"), ("the other", "the first")):
-        for name in options[rival]:
-            options[own].setdefault(name, getattr(CalibratorConfig, name))
-    readings = []
-    for values in options.values():
-        readings.append(" ".join(f"{name} {value}" for name, value in values.items()))
+    first = _options_of(mistakes)
+    second = _options_of(other)
+    # Both explanations name all options that one of them sets, so that the options decide.
+    of_first = first | defaults_of(name for name in second if name not in first)
+    of_second = second | defaults_of(name for name in first if name not in second)
     return finding(
         "ambiguous_stops",
-        options=options["the other"],
-        given=readings[0],
-        other=readings[1],
+        options=of_second,
+        given=" ".join(f"{name} {value}" for name, value in of_first.items()),
+        other=" ".join(f"{name} {value}" for name, value in of_second.items()),
     )
 
 

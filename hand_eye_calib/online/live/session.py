@@ -5,7 +5,7 @@ from copy import deepcopy
 from dataclasses import fields, replace
 from pathlib import Path
 
-from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig, defaults_of
 from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator, Calibrators
@@ -203,8 +203,7 @@ def _of_other(config: CalibratorConfig) -> CalibratorConfig:
     of_child = {each.name for each in fields(config) if each.name.startswith(("prior_", "child_"))}
     numbers = ("time_offset", "scale")
     of_child |= {name for name in numbers if not isinstance(getattr(config, name), str)}
-    defaults = {name: getattr(CalibratorConfig, name) for name in of_child}
-    return replace(config, given=config.given - of_child, **defaults)
+    return replace(config, given=config.given - of_child, **defaults_of(of_child))
 
 
 def output_path(directory: str, base: Path | None = None) -> Path:
