@@ -281,6 +281,16 @@ class CalibratorConfig(OptionSet):
         return name in self.given and getattr(self, name) not in ("auto", "estimate")
 
     @property
+    def given_time_offset_s(self) -> float:
+        """Time offset (s) if it is a number; 0 if it is to be estimated."""
+        return 0.0 if isinstance(self.time_offset, str) else self.time_offset
+
+    @property
+    def given_scale(self) -> float:
+        """Factor of the child's lengths if it is a number; 1 if it is a word."""
+        return 1.0 if isinstance(self.scale, str) else self.scale
+
+    @property
     def measured(self) -> str:
         """What both sensors measure together: poses, rotations or positions.
 

@@ -33,8 +33,8 @@ class Kind:
     is_timed_by_speed : bool
         Whether speeds show the time offset, rather than angular rates.
     allowed : mapping
-        Options that have a meaning for whole poses only: their names, and the values that may be
-        set.
+        Options that have a meaning for whole poses only: the names of their fields, and the values
+        that may be set.
     has_conventions : bool
         Whether checks find conventions, units and clocks of streams that cannot be solved as given.
     """
@@ -54,10 +54,10 @@ class Kind:
         ConfigError
             If one is; the message names it.
         """
-        options = config.to_options()
         for name, values in self.allowed.items():
-            if options[name] not in values:
-                config.require_poses(f"{name} {options[name]}")
+            value = getattr(config, name)
+            if value not in values:
+                config.require_poses(f"{name} {value}")
 
 
 def kind_of(config: CalibratorConfig) -> Kind:

@@ -42,8 +42,8 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     config = snapshot.config
     result = checking.check_streams(
         *snapshot.streams,
-        time_offset_s=_known_offset_s(snapshot, calibration),
-        scale=known_scale(snapshot, calibration),
+        time_offset_s=calibration.time_offset_s if calibration else config.given_time_offset_s,
+        scale=calibration.scale if calibration else config.given_scale,
         max_gap_s=snapshot.max_gap_s,
         correlate=lambda: snapshot.correlation,
         known=_known_extrinsic(calibration),
@@ -61,22 +61,6 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
             for found in findings
         ]
     return replace(result, findings=gravest_first(findings))
-
-
-def _known_offset_s(snapshot: Snapshot, calibration: Calibration | None) -> float:
-    """Return the time offset (s) of the result, or that of the options."""
-    if calibration:
-        return calibration.time_offset_s
-    given = snapshot.config.time_offset
-    return 0.0 if isinstance(given, str) else given
-
-
-def known_scale(snapshot: Snapshot, calibration: Calibration | None) -> float:
-    """Return the factor of the child's lengths of the result, or that of the options."""
-    if calibration:
-        return calibration.scale
-    given = snapshot.config.scale
-    return 1.0 if isinstance(given, str) else given
 
 
 def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:

@@ -51,8 +51,8 @@ _CLEAR_SPREAD = 0.5
 
 @dataclass(frozen=True)
 class _Reading:
-    """Chosen reading of both streams: an attempt with its findings, doubts about the choice, and
-    the options that are settled with it.
+    """Chosen reading of both streams: its findings, doubts about the choice, and the options that
+    are settled with it.
     """
 
     findings: tuple[Finding, ...]
@@ -226,9 +226,7 @@ def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
     no repair is certain.
     """
     result = check(snapshot)
-    given_s = snapshot.config.time_offset
-    known_s = 0.0 if isinstance(given_s, str) else given_s
-    reading = _reading_of(snapshot, result, (), known_s)
+    reading = _reading_of(snapshot, result, (), snapshot.config.given_time_offset_s)
     certain = _certain(reading.findings, snapshot.config.given)
     repaired = _repaired(snapshot, reading.findings, certain, (), "no result")
     return repaired and repaired.with_doubts(reading.doubts)

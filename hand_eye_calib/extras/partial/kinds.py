@@ -12,7 +12,6 @@ from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, gravest_first
 from hand_eye_calib.core.engine.kinds import Kind, kind_of
-from hand_eye_calib.core.engine.poses import known_scale
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
@@ -97,7 +96,8 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
     if not len(snapshot.kept):  # pairs may have gaps where the streams have none
-        on_one_scale = child.scaled(known_scale(snapshot, calibration))
+        scale = calibration.scale if calibration else config.given_scale
+        on_one_scale = child.scaled(scale)
         aligned = on_one_scale.shifted(known_s)
         lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
         findings += checking.check_parts(parent, aligned, config.max_gap, lever_arm_m)

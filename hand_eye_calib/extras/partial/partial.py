@@ -66,7 +66,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         If no lever arm explains the positions.
     """
     stamps_ns, is_child = pose_pairs.stamps_ns, config.child_measures == "positions"
-    given = 1.0 if isinstance(config.scale, str) else config.scale
+    given = config.given_scale
     of_parent, of_child = pose_pairs.Ts_pw_p, pose_pairs.child_scaled(given).Ts_cw_c
     poses, measured = (of_parent, of_child) if is_child else (of_child, of_parent)
     positions = measured[:, :3, 3]

@@ -282,17 +282,18 @@ def _scaled(Ts: FloatArray, factor: float) -> FloatArray:
 
 def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
     """Check the stops, repair what is certain, solve, and estimate the scale if it matters."""
-    unit = 1.0 if isinstance(config.scale, str) else config.scale
+    unit = config.given_scale
     stops = _put_right(given, config, unit)
     examination = examine(stops)
     if config.scale in _FOUND_SCALES:
         examination, unit = _without_unit_of_child(examination)
     findings = []
     for found in examination.findings:
-        # Who has named the convention of both sides has decided.
-        is_decided = found.code == "ambiguous" and {*found.options} <= config.given
-        if not is_decided:
-            findings.append(_as_set(found, config) if found.code != "ambiguous" else found)
+        if found.code != "ambiguous":
+            findings.append(_as_set(found, config))
+        elif not {*found.options} <= config.given:
+            # Whoever sets the convention of both sides has decided.
+            findings.append(found)
     settled = {found.code for found in examination.repairs if {*found.options} & config.given}
     repairs = []
     for repair in examination.repairs:
