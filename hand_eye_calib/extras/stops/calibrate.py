@@ -27,6 +27,8 @@ from hand_eye_calib.extras.stops.checks import (
     Mistakes,
     examine,
     scale_finding,
+    scaled,
+    stops_of,
     turns_about_two_axes,
 )
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld, Stops, solve
@@ -269,12 +271,8 @@ def _put_right(given: GivenStops, config: CalibratorConfig, child_unit: float) -
     parent = se3.put_right(given.parent, config.parent_invert, config.parent_quaternion)
     child = se3.put_right(given.child, config.child_invert, config.child_quaternion)
     return replace(
-        given, parent=_scaled(parent, config.parent_scale), child=_scaled(child, child_unit)
+        given, parent=scaled(parent, config.parent_scale), child=scaled(child, child_unit)
     )
-
-
-def _scaled(Ts: FloatArray, factor: float) -> FloatArray:
-    return se3.from_rotation_translation(Ts[:, :3, :3], factor * Ts[:, :3, 3])
 
 
 # ------------------------------------------------------------------ the solve
@@ -441,16 +439,11 @@ def _fit(given: GivenStops, scale: float) -> tuple[RobotWorld, Stops, bool, floa
     """The likelier solution of both ways round, if both are possible, and its lead."""
     fits = []
     for is_inverse in (False, True) if given.is_arm else (False,):
-        stops = _stops(given, scale, is_inverse)
+        stops = stops_of(given, Mistakes(is_inverse=is_inverse), scale)
         fits.append((solve(stops), stops, is_inverse))
     fits.sort(key=lambda fit: fit[0].objective)
     lead = fits[1][0].objective - fits[0][0].objective if given.is_arm else np.inf
     return *fits[0], lead
-
-
-def _stops(given: GivenStops, scale: float, is_inverse: bool) -> Stops:
-    scaled = replace(given, child=_scaled(given.child, scale))
-    return Stops.of_one(*scaled.sides(Mistakes(is_inverse=is_inverse)))
 
 
 def _with_free_scale(
@@ -458,7 +451,7 @@ def _with_free_scale(
 ) -> tuple[RobotWorld, Stops, float, float]:
     """Solution, stops, scale and its standard deviation, with the scale as one more value."""
     for _ in range(_SCALE_ROUNDS):
-        stops = _stops(given, scale, is_inverse)
+        stops = stops_of(given, Mistakes(is_inverse=is_inverse), scale)
         fit = solve(stops, stretch=np.inf)
         if not np.isfinite(fit.scale_sigma):
             break

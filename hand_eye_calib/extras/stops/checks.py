@@ -131,6 +131,10 @@ class GivenStops:
             A = se3.inverse(A)
         return A, B
 
+    def child_scaled(self, factor: float) -> "GivenStops":
+        """Return the stops with the child's lengths multiplied by a factor."""
+        return replace(self, child=scaled(self.child, factor))
+
 
 @dataclass(frozen=True)
 class Mistakes:
@@ -200,6 +204,16 @@ class Examination:
     findings: tuple[Finding, ...] = ()
     repairs: tuple[Finding, ...] = ()
     scale: float | None = None
+
+
+def scaled(Ts: FloatArray, factor: float) -> FloatArray:
+    """Return poses (N, 4, 4) with their lengths multiplied by a factor."""
+    return se3.from_rotation_translation(Ts[:, :3, :3], factor * Ts[:, :3, 3])
+
+
+def stops_of(given: GivenStops, mistakes: Mistakes, scale: float = 1.0) -> Stops:
+    """Return the stops of A X = Z B without mistakes, with a factor of the child's lengths."""
+    return Stops.of_one(*given.child_scaled(scale).sides(mistakes))
 
 
 def examine(given: GivenStops) -> Examination:
@@ -510,20 +524,17 @@ def _explained(few: GivenStops) -> tuple[Mistakes, RoughFit, list[Mistakes]]:
 def _rivals(few: GivenStops, plain: Collection[Mistakes]) -> list[tuple[Mistakes, RoughFit]]:
     """Return the mistakes with the best rough fits."""
     rivals = []
-    for parent, child in itertools.product(_WAYS, _WAYS):
-        for is_inverse in (False, True):
-            mistakes = Mistakes(parent, child, is_inverse)
-            if mistakes not in plain:
-                rivals.append((mistakes, rough_fit(few, mistakes)))
+    for ways in itertools.product(_WAYS, _WAYS, (False, True)):
+        mistakes = Mistakes(*ways)
+        if mistakes not in plain:
+            rivals.append((mistakes, rough_fit(few, mistakes)))
     rivals.sort(key=lambda rival: -rival[1].log_likelihood)
     return rivals[:_SOLVED]
 
 
 def _objective(few: GivenStops, mistakes: Mistakes, fit: RoughFit) -> float:
     """Negative log likelihood of the stops without these mistakes, in lengths of the parent."""
-    A, B = few.sides(mistakes)
-    B = se3.from_rotation_translation(B[:, :3, :3], (fit.scale or 1.0) * B[:, :3, 3])
-    return solve(Stops.of_one(A, B)).objective
+    return solve(stops_of(few, mistakes, fit.scale or 1.0)).objective
 
 
 def _decisive(n_stops: int) -> float:
@@ -543,15 +554,16 @@ def rough_fit(given: GivenStops, mistakes: Mistakes) -> RoughFit:
         X, Z = closest_rotations(A[:, :3, :3], B[:, :3, :3], weights)
         left = se3.rotation_angle(np.swapaxes(Z @ B[:, :3, :3], 1, 2) @ A[:, :3, :3] @ X)
         weights = robust_weights("cauchy", (left / max(median(left), 1e-12)) ** 2)
+    left_rad = median(left)
     spread = max(median(_upper(angles_between(A))), median(_upper(angles_between(B))))
     # Rotations of a few degrees are not judged: noise may be as large.
-    turning = median(left) / max(spread, _ROTATES)
+    turning = left_rad / max(spread, _ROTATES)
     if not given.has_positions:
         return RoughFit(turning, 0.0)
     placing, position, scale = _placed(A, B, Z)
     distance = (scale or 1.0) * median(np.linalg.norm(B[:, :3, 3], axis=1))
-    beyond = position / max(median(left) * distance, 1e-12)
-    logs = np.log(max(median(left), 1e-12)) + np.log(max(position, 1e-12))
+    beyond = position / max(left_rad * distance, 1e-12)
+    logs = np.log(max(left_rad, 1e-12)) + np.log(max(position, 1e-12))
     return RoughFit(turning, placing, beyond, scale, -3.0 * len(A) * float(logs))
 
 
