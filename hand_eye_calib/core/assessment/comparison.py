@@ -21,7 +21,7 @@ from hand_eye_calib.core.results.verdict import target_of
 
 _Named = tuple[str, Calibration | Extrinsic]
 
-# An axis is the same if changes of so many targets would have been seen.
+# Largest undetected change of an axis, in targets, with which the axis counts as the same.
 SEEN_TARGETS = 5.0
 
 

@@ -24,7 +24,8 @@ CHI2 = {
 }
 LARGEST_OF_SIX = 3.341479
 
-# A change of so many standard deviations beyond a limit exceeds it nine times out of ten.
+# Standard normal quantile of 0.9: a value this many standard deviations above a limit exceeds the
+# limit in nine of ten cases.
 NINE_TIMES_OUT_OF_TEN = 1.281552
 
 # Degrees of freedom of Student's t distribution for heavy tails.
@@ -32,9 +33,10 @@ STUDENT = 4.0
 
 _MAX_STEPS = 20
 
-# Of a robust regression: singular values below this share of the largest are rounding, and so are
-# residuals below this length.
+# Singular values of a regression below this share of the largest are rounding.
 _RANK_TOLERANCE = 1e-9
+
+# Smallest length of residuals that weights are relative to.
 _SMALLEST_UNIT = 1e-12
 
 

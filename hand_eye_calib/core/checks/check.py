@@ -4,9 +4,8 @@ wrong with them.
 1. Each stream alone (:mod:`~hand_eye_calib.core.checks.streams`).
 2. The angular rates (:mod:`~hand_eye_calib.core.alignment.time_offset`): whether they agree at any
    clock offset. Reordered or inverted quaternions, units and axes do not affect them.
-3. The whole motion (:mod:`~hand_eye_calib.core.checks.hypotheses`): which usual mistake, undone,
-makes
-   the streams agree.
+3. The whole motion (:mod:`~hand_eye_calib.core.checks.hypotheses`): the usual mistake without
+   which the streams agree.
 4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
 """
 
@@ -50,8 +49,8 @@ _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "f
 
 # A scale is that of a unit within so many of its standard deviations, or to rounding (share).
 UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
-# A parent in another unit beside an odometry whose noise shortens its path, as that of simulated
-# arms did by 0.2 %, beyond what its standard deviation tells (share).
+# Distance of a scale from a parent's unit that is still that unit (share). Noise of the child
+# biases the scale: by 0.2 % for simulated arms, several standard deviations.
 _PARENT_UNIT_SHARE = 0.005
 # A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
 _UNIT_NEAR = 0.05
@@ -191,7 +190,7 @@ def _check_explained(
         # Of one reading, the distance of the sensors is that of the worlds.
         lengths = check_lengths(streams.parent, streams.child)
     if readings and lengths:
-        # Neither noise nor shape tells which reading is right before the unit is known.
+        # Noise and shape decide between the readings only if the unit of length is known.
         readings = None
         findings = [found for found in findings if found not in of_reading]
     findings = _in_metres(findings, [*lengths, *sizes], about.scale)

@@ -96,7 +96,7 @@ class Attempt:
         )
 
     def with_messages(self, options: Options, messages: Collection[str]) -> "Attempt":
-        """Return the attempt with options that were set, and with warnings that say so."""
+        """Return the attempt with options that were set, and with warnings about these options."""
         warnings = tuple(dict.fromkeys((*messages, *self.calibration.warnings)))
         calibration = replace(self.calibration, warnings=warnings)
         return replace(

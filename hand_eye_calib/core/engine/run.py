@@ -262,7 +262,7 @@ def _repaired(
         return None
     message = _repair_message(second, findings, options, verdict_as_given)
     second = second.with_messages({**options, **second.options}, (message, *second.messages))
-    # The child may have a scale of its own instead.
+    # A ratio of lengths does not exclude that the child has its own scale.
     doubts = [
         replace(found, severity=Severity.WARNING, options={})
         for found in findings
@@ -392,9 +392,9 @@ def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
 def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:
     """Return the options, by name, that repair a stream for certain and that the user did not set.
 
-    Units and conventions are set as they are. Anything else is estimated, so that its uncertainty
-    counts. Lengths that differ by a few per cent only give a warning: odometry whose scale drifts
-    looks like that, too.
+    Units and conventions get their values. Time offset and scale are estimated, so that the result
+    contains their uncertainty. A difference of lengths of a few per cent gives only a warning,
+    because odometry with a drifting scale has the same effect.
     """
     certain: dict[str, float | str] = {}
     for found in findings:

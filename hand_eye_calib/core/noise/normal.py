@@ -15,8 +15,8 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Blocks that are left when they have at most so many rows together are one dense matrix. As many
-# triangular matrices are inverted row by row, all at once: half the time of LAPACK.
+# Number of rows up to which the remaining blocks become one dense matrix; and number of triangular
+# matrices from which on a row-wise inversion of the whole stack takes half the time of LAPACK.
 _FEW = 64
 
 # Least share of what a parameter's own diagonal promises that counts as information: rounding.

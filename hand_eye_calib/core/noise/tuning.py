@@ -121,8 +121,9 @@ class Tuning:
     # The search begins at a time constant between this many intervals and this share of the time.
     first_tau: float = 10.0
     last_tau: float = 0.06
-    # Errors fixed to the body last on all scales (flicker). A recording hardly shows those about as
-    # long as itself, and X takes their mean: this share of the variance of those found.
+    # Share of the variance of detected body-fixed errors that undetected ones have. Such errors
+    # have all time scales (flicker). Errors about as long as the recording are not detected; X
+    # contains their mean.
     unseen_share: float = 0.05
 
     # -- Systematic errors --
@@ -138,8 +139,9 @@ class Tuning:
     # A bias of the path counts with this share of its gain against a scale: a scale, or a bias
     # along the direction of travel, explains most of it.
     like_scale: float = 0.75
-    # No error is assumed that can hardly be told from X, whose standard deviations would grow by
-    # this factor: by 4 or more if a child slips sideways on a road, by 2 or less in simulations.
+    # A systematic error is not modelled if the standard deviations of X grow by this factor with
+    # it: the error and X are hardly separable then. A child that slips sideways on a road has 4 or
+    # more, simulations have 2 or less.
     most_growth: float = 3.0
 
     # -- The end --
@@ -169,7 +171,7 @@ class Tuning:
     near: float = 2.5
     # A jump is a step of the walk with this many times the variance that it needs.
     jump_factor: float = 10.0
-    # The quality of a solution is that of so many positions around.
+    # Number of neighbouring positions over which the quality of a position is measured.
     neighbours: int = 11
     # Positions whose squared errors exceed that of the best quarter of the recording by this factor
     # are left out: they would hardly count, and their errors last.
