@@ -16,7 +16,8 @@ from reproduction.ablation import Case, outcome, real_cases, simulated_cases
 from reproduction.writing import seed_of, study_parser, write_csv
 
 # One recording of each family, none longer than this.
-_FAMILIES, _MOST_POSES = ("kitti", "zxl19"), 1450
+_FAMILIES = ("kitti", "zxl19")
+_MOST_POSES = 1450
 
 
 def chosen(folder: Path | None, seed: int) -> list[Case]:
@@ -65,7 +66,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     arguments = parser.parse_args()
     cases = chosen(arguments.data_folder, seed_of(arguments.seed))
-    whole, rows = measured(cases), []
+    whole = measured(cases)
+    rows = []
     for field in dataclasses.fields(TUNING)[1:]:
         row: dict[str, object] = {"constant": field.name, "value": getattr(TUNING, field.name)}
         largest = 0.0

@@ -90,8 +90,11 @@ def measured_node(report, arguments):
     if SLOW in os.environ:
         cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)
 
-    latencies, durations, used = [], [], []
-    receive, sent_at = TopicInput._receive, place_of_sending_time()
+    latencies = []
+    durations = []
+    used = []
+    receive = TopicInput._receive
+    sent_at = place_of_sending_time()
 
     def stopwatch(self, data, info):
         begun = time.time()
@@ -104,11 +107,14 @@ def measured_node(report, arguments):
             used[1:] = [(time.monotonic(), cpu_seconds())]
 
     TopicInput._receive = stopwatch
-    stop, conclude, solves = CalibratorNode.stop, cycle.SolveCycle.conclude, []
+    stop = CalibratorNode.stop
+    conclude = cycle.SolveCycle.conclude
+    solves = []
     cycle.SolveCycle.conclude = lambda *answered: solves.append(0) or conclude(*answered)
 
     def stop_and_report(self, timeout_s):
-        (start_s, start_cpu_s), (end_s, end_cpu_s) = used[0], used[-1]
+        start_s, start_cpu_s = used[0]
+        end_s, end_cpu_s = used[-1]
         result = self._cycle.result
         document = {
             "received": len(latencies),
@@ -158,8 +164,10 @@ def publish(publishers, first, n_poses, rate_hz):
 
     message = Odometry()
     message.header.frame_id = "world"
-    place, turn = message.pose.pose.position, message.pose.pose.orientation
-    streams, begun = parts(first, n_poses, rate_hz), time.monotonic()
+    place = message.pose.pose.position
+    turn = message.pose.pose.orientation
+    streams = parts(first, n_poses, rate_hz)
+    begun = time.monotonic()
     for k in range(n_poses):
         time.sleep(max(0.0, begun + k / rate_hz - time.monotonic()))
         for publisher, (stream, (stamps_ns, positions, quats)) in zip(
@@ -268,7 +276,9 @@ def loaded_node(folder, name, seconds, disturb=None, **environment):
     """
     from ros_harness import free_domain
 
-    rate_hz, domain, report = 400, free_domain(), folder / f"{name}.json"
+    rate_hz = 400
+    domain = free_domain()
+    report = folder / f"{name}.json"
     options = {
         "method": "dnlo",
         "reference": "B5",
@@ -298,10 +308,13 @@ def loaded_node(folder, name, seconds, disturb=None, **environment):
 
 def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
     """Rows (what, value, promise, kept) of the node under load."""
-    latency, code = seen["latency"], seen["code"]
-    lost, reported = seen["published"] - seen["received"], seen["lost_as_reported"]
+    latency = seen["latency"]
+    code = seen["code"]
+    lost = seen["published"] - seen["received"]
+    reported = seen["lost_as_reported"]
     is_reported = abs(lost - reported) <= MOST_UNREPORTED * lost
-    quick, promised = latency[1] < most_latency_s, f"p99 < {1000 * most_latency_s:.0f}"
+    quick = latency[1] < most_latency_s
+    promised = f"p99 < {1000 * most_latency_s:.0f}"
     callbacks = _ms(seen["duration"])
     last = f"{seen['pairs']}, {seen['error']:.2f}"
     rows = [
@@ -330,7 +343,8 @@ def _ms(values):
 
 def soak(hours):
     """Rows of the engine fed for hours."""
-    rate_hz, minute = 100, 6000
+    rate_hz = 100
+    minute = 6000
     calibrator = Calibrator(CalibratorConfig(reference="B5"))
     history = []
     for hour in range(hours):
@@ -352,10 +366,14 @@ def soak(hours):
         history.append((resident_mb(), 1e3 * float(np.median(solves)), 1e6 * p99))
         said = "{:.1f} MB, solve {:.0f} ms, per pose p99 {:.1f} us".format(*history[-1])
         print(f"hour {hour + 1}: {said}, {result.n_poses} poses", flush=True)
-    (first_mb, first_ms, _), (last_mb, last_ms, _) = history[0], history[-1]
-    memory, solve = f"{first_mb:.1f}, {last_mb:.1f}", f"{first_ms:.0f}, {last_ms:.0f}"
-    is_flat, worst = last_ms < MOST_SLOWDOWN * first_ms, max(p99 for *_, p99 in history)
-    grown, n_poses = last_mb / first_mb - 1, result.n_poses
+    first_mb, first_ms, _ = history[0]
+    last_mb, last_ms, _ = history[-1]
+    memory = f"{first_mb:.1f}, {last_mb:.1f}"
+    solve = f"{first_ms:.0f}, {last_ms:.0f}"
+    is_flat = last_ms < MOST_SLOWDOWN * first_ms
+    worst = max(p99 for *_, p99 in history)
+    grown = last_mb / first_mb - 1
+    n_poses = result.n_poses
     return [
         (f"memory after 1 h, {hours} h (MB)", memory, "within 10 %", grown < MOST_GROWTH),
         ("solve after the first, last hour (ms)", solve, "flat", is_flat),
@@ -379,13 +397,19 @@ def kill(folder, kills):
     """Rows of the node killed and resumed."""
     from ros_harness import NodeProcess, Peer, free_domain
 
-    rate_hz, domain, output = 100, free_domain(), folder / "kill"
+    rate_hz = 100
+    domain = free_domain()
+    output = folder / "kill"
     peer = Peer(domain)
     publishers = peer.publishers()
     words = f"-p output_directory:={output}", "-p journal:=resume", "-p solve_period:=0.5"
     save_result(earlier_result(), output)
     before = fingerprints(output)
-    lost_s, resumed, unchanged, first, count = [], 0, 0, 0, 0
+    lost_s = []
+    resumed = 0
+    unchanged = 0
+    first = 0
+    count = 0
     for attempt in range(kills + 1):
         node = NodeProcess(domain, folder / f"node{attempt}.log", words)
         if attempt:

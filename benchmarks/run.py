@@ -33,7 +33,8 @@ from suite import baseline, processes, rows, table  # noqa: E402
 from suite.data import LONG, MESSAGES, SHORT, drives  # noqa: E402
 
 BASELINE = Path(__file__).resolve().parent / "baseline.json"
-USUAL, FULL = (100, SHORT, LONG, 10_000, 100_000), (1_000_000,)
+USUAL = (100, SHORT, LONG, 10_000, 100_000)
+FULL = (1_000_000,)
 
 
 def everything(is_full):

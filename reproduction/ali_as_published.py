@@ -56,7 +56,8 @@ def solve(pairs: MotionPairs) -> Solution:
     rows = np.asarray(np.linalg.qr(residual_rows(pairs), mode="r"))
     start_gradient = np.abs(_derivatives(_IDENTITY, rows)[1]).max()
     rows *= np.sqrt(min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny)))
-    parameters, shift = _IDENTITY, 0.0
+    parameters = _IDENTITY
+    shift = 0.0
     for _ in range(_MAX_ITERATIONS):
         value, gradient, hessian = _derivatives(parameters, rows)
         step, shift = _descent_step(gradient, hessian, shift)
@@ -82,7 +83,8 @@ def _descent_step(
     """Newton step and the shift of the Hessian's diagonal it took: none, else about a third of the
     last one and up.
     """
-    shift, growth = 0.0, 8.0 if last_shift else 100.0
+    shift = 0.0
+    growth = 8.0 if last_shift else 100.0
     while np.linalg.eigvalsh(hessian)[0] + shift <= 0.0:
         if shift:
             shift *= growth
@@ -149,7 +151,8 @@ def _derivatives(parameters: FloatArray, rows: FloatArray) -> tuple[float, Float
     """Cost, gradient (7,) and Hessian (7, 7)."""
     x, derivative = _lift(parameters)
     q = parameters[:4]
-    residuals, slope = rows @ x, rows @ derivative
+    residuals = rows @ x
+    slope = rows @ derivative
     factor, factor_gradient, factor_hessian = _factor(q)
     weighted = np.tensordot((residuals @ rows)[:9], _P, axes=1)
     cross = np.outer(factor_gradient, 2 * weighted @ q)

@@ -66,7 +66,8 @@ def known_in(name: str, folder: Path | None) -> frozenset[str]:
 
 def recording(name: str, folder: Path | None) -> Clean:
     """The recording of this name."""
-    kind, seed = kind_of(name), name.rpartition(" ")[2]
+    kind = kind_of(name)
+    seed = name.rpartition(" ")[2]
     if kind not in CLASSES and kind not in _HILLY:
         return _real(folder)[name]
     made: Simulated | SimulatedDrive

@@ -21,7 +21,8 @@ from reproduction.writing import write_csv, write_text
 
 _AS_PUBLISHED = (ALI_AS_PUBLISHED, "dnl", "dnlo", "park", "taylor", "zhuang")
 _NOISE_FREE = 1e-6
-_AT, _RECTIFIED = "e_at (m)", "rectified: e_at (m)"
+_AT = "e_at (m)"
+_RECTIFIED = "rectified: e_at (m)"
 
 
 class Shown:
@@ -74,7 +75,8 @@ RULES: list[Callable[[Shown], Found]] = []
 
 def write(name: str, results: Results) -> list[Path]:
     """Write ``NAME.md`` and ``NAME.csv``; returns the paths."""
-    shown, found = Shown(results), []
+    shown = Shown(results)
+    found = []
     for rule in RULES:
         holds, in_part, evidence = rule(shown)
         verdict = "Holds" if holds else "Holds in part" if in_part else "Does not hold"
@@ -148,7 +150,8 @@ def _smallest_motions_first(shown: Shown) -> Found:
 def _drift_of_dnlo(shown: Shown) -> Found:
     """With drift the differences between the references are minute, apart from A (DNLO)."""
     a, *others = shown.drift("dnlo")
-    spread, of_a = max(others) / min(others), a / min(others)
+    spread = max(others) / min(others)
+    of_a = a / min(others)
     holds = spread < 2 and a > 3 * max(others)
     return holds, False, f"At 0.05: factor {spread:.2f} among the others, A {of_a:.1f} times."
 
@@ -161,7 +164,8 @@ def _components(shown: Shown) -> Found:
         np.array([found[name][reference].centre for reference in REFERENCES])
         for name in ("x", "y", "z", "roll", "pitch", "yaw")
     )
-    height, tilt = (z / np.minimum(x, y)).max(), (np.maximum(roll, pitch) / yaw).max()
+    height = (z / np.minimum(x, y)).max()
+    tilt = (np.maximum(roll, pitch) / yaw).max()
     said = f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
     return height < 0.5 and tilt < 0.5, False, said
 
@@ -278,7 +282,8 @@ def _zhuang_on_the_short_drive(shown: Shown) -> Found:
     """
     rows = shown.drives["kitti_short"]
     best = best_variants(rows)
-    zhuang, (_, variant) = best.loc["zhuang"].iloc[0], best["e_rt (m)"].idxmin()
+    zhuang = best.loc["zhuang"].iloc[0]
+    _, variant = best["e_rt (m)"].idxmin()
     holds = best["e_rt (m)"].idxmin()[0] == best[_AT].idxmax()[0] == "zhuang"
     dnl = rows.loc[("dnl", "B1"), "e_rt (m)"]
     said = f"Zhuang {variant}: e_rt {zhuang['e_rt (m)']:.3f} m, e_at {zhuang[_AT]:.3f} m"
@@ -299,7 +304,8 @@ def _long_drive(shown: Shown) -> Found:
     """On the long drive the middle step lengths are best: B5, and for DNLO C5, marginally better
     than B5 (5.2, Table 2).
     """
-    best, dnlo = shown.variants("kitti_long"), shown.drives["kitti_long"][_AT]["dnlo"]
+    best = shown.variants("kitti_long")
+    dnlo = shown.drives["kitti_long"][_AT]["dnlo"]
     middle = all(name in ("B5", "C5", "C10") for name in best.values())
     holds = middle and best["dnlo"] == "C5" and dnlo["B5"] > dnlo["C5"]
     rectified = _listed(shown.variants("kitti_long", _RECTIFIED))
@@ -327,7 +333,8 @@ def _usual_reference(shown: Shown) -> Found:
 @RULES.append
 def _reference_against_method(shown: Shown) -> Found:
     """The choice of the reference matters more than the choice of the method (5.2, 6)."""
-    said, holds = [], []
+    said = []
+    holds = []
     for dataset in (*SIMULATED, *KITTI):
         of = shown.drives[dataset][_AT] if dataset in KITTI else None
         errors = np.array(

@@ -20,7 +20,8 @@ _OfChild = Callable[[Trajectory, float, Random], Trajectory]
 _OfBoth = Callable[[Trajectory, Trajectory, float, Random], Streams]
 
 # Time between two world jumps, and between the stamps of poses that arrive together (s).
-_BETWEEN_JUMPS_S, _TOGETHER_S = 20.0, 0.001
+_BETWEEN_JUMPS_S = 20.0
+_TOGETHER_S = 0.001
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class Fault:
 
 
 _ALL: list[Fault] = []
-_THREE, _SECONDS = (0.0, 1.0, 2.0), (0.05, 0.1, 0.2)
+_THREE = (0.0, 1.0, 2.0)
+_SECONDS = (0.05, 0.1, 0.2)
 
 
 def _both(
@@ -488,7 +490,9 @@ def _group(initials: str) -> tuple[Fault, ...]:
     return tuple(fault for fault in _ALL if fault.code.replace("clock", "S")[0] in initials)
 
 
-FAULTS, LATER, SILENT = _group("S"), _group("UVW"), _group("X")
+FAULTS = _group("S")
+LATER = _group("UVW")
+SILENT = _group("X")
 # Groups of the page: title to faults.
 GROUPS = {
     "Faults": FAULTS,

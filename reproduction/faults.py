@@ -45,7 +45,8 @@ _NO_ANSWER = "no answer"
 _SHORT = {"DO NOT USE": "no", "USE WITH CARE": "care", "USE": "use"}
 
 # Fault of a case without one, in a recording that the faults are put into, and in a clean one.
-_SOUND, _CLEAN = "none", "clean"
+_SOUND = "none"
+_CLEAN = "clean"
 
 _FAULTS = {fault.code: fault for fault in chain(*GROUPS.values())}
 
@@ -93,7 +94,8 @@ def run(arguments: argparse.Namespace) -> str:
     """Solve the cases, and write the text about them and those solved before into the page; returns
     the text.
     """
-    folder, out = arguments.data_folder, arguments.out
+    folder = arguments.data_folder
+    out = arguments.out
     todo = clean_cases(folder) if arguments.clean else cases(folder)
     tasks = {case.key: (case, folder) for case in todo}
     found = kept(out / "faults.jsonl", _plain_outcome, tasks, arguments.jobs)
@@ -200,7 +202,8 @@ def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
     rig = next(rig for rig in real_rigs(folder or Path())[0] if rig.name == name)
     (recording,) = rig.recordings.values()
     found = check_streams(recording.parent, recording.child)
-    parent, child = recording.parent, recording.child
+    parent = recording.parent
+    child = recording.child
     offset = next(f for f in found.findings if f.code == "time_offset")
     child = child.shifted(float(offset.options["time_offset"]))
     fit = found.fit
@@ -217,7 +220,8 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     by_fault: dict[str, list[Outcome]] = {}
     for found in outcomes:
         by_fault.setdefault(found.key.split()[0], []).append(found)
-    clean, sound = by_fault.pop(_CLEAN, []), by_fault.pop(_SOUND, [])
+    clean = by_fault.pop(_CLEAN, [])
+    sound = by_fault.pop(_SOUND, [])
     faulty = list(chain.from_iterable(by_fault.values()))
     unsafe = [found for found in faulty if found.verdict == "USE" and found.z > _LIMIT_Z]
     parts = []

@@ -41,7 +41,8 @@ _POINT = ["dataset", "level", "method", "reference", "metric"]
 
 def write_error_figure(name: str, results: Results) -> list[Path]:
     """Write a figure of :data:`FIGURE_METHODS`, its numbers and comparison; returns the paths."""
-    table, methods = results.ours, FIGURE_METHODS[name]
+    table = results.ours
+    methods = FIGURE_METHODS[name]
     choices = [choice for dataset in SIMULATED for choice in _choices(dataset, methods, table)]
     numbers = _numbers(choices, table)
     paths = [
@@ -98,7 +99,8 @@ def _titles(name: str, results: Results) -> tuple[str, str]:
         return f"{number}. Calibration errors of each method's best variant on {where}", note
     method = TITLES[FIGURE_METHODS[name][0]]
     if name == "figS1_proper":
-        method, number = "the proper Ali", f"Beside {label}"
+        method = "the proper Ali"
+        number = f"Beside {label}"
     return f"{number}. Calibration errors of {method} for every reference, on {where}", _INTERVALS
 
 
@@ -146,7 +148,8 @@ def _coinciding(choices: Sequence[Choice], table: Table, alone: bool) -> list[li
 def _compare(
     name: str, numbers: pd.DataFrame, choices: Sequence[Choice], results: Results
 ) -> list[Path]:
-    compared, theirs = numbers.copy(), _numbers(choices, results.theirs)
+    compared = numbers.copy()
+    theirs = _numbers(choices, results.theirs)
     parts = ["centre", "low", "high"]
     published = [f"published_{part}" for part in parts]
     compared[published] = theirs[parts]

@@ -34,11 +34,13 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
     """Error and variances of the axes that are known and that the motion shows; ``rest`` is what is
     in the floor besides its sizes.
     """
-    parent, found = case.streams[0], answer(*case.streams, case.options)
+    parent = case.streams[0]
+    found = answer(*case.streams, case.options)
     if found is None:
         return
     speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
-    stated, whole = found.sigmas_measured**2, found.sigmas**2
+    stated = found.sigmas_measured**2
+    whole = found.sigmas**2
     error = deviation(found.T_parent_child, case.T_parent_child)
     for k in np.flatnonzero(np.isfinite(stated) & np.isfinite(case.sigmas)):
         yield {
@@ -101,7 +103,8 @@ def main() -> None:
     parser.add_argument("--pieces", type=int, default=6, help="of each recording. Default: 6")
     arguments = parser.parse_args()
     folder = arguments.data_folder or parser.error("name the recordings with --data-folder")
-    seed, asked = seed_of(None), ("time_offset", "scale", "prior")
+    seed = seed_of(None)
+    asked = ("time_offset", "scale", "prior")
     cases = real_cases(folder, arguments.pieces, np.random.default_rng(seed), asked)
     found = pd.DataFrame([row for case in cases for row in axes(case)])
     show(arguments.page, {"floor": f"Seed {seed}.\n\n{table(found)}"})

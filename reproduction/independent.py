@@ -66,7 +66,8 @@ def closure(
     Ts_a: FloatArray, X: FloatArray, Z: FloatArray, Ts_b: FloatArray
 ) -> tuple[float, float]:
     """Root mean squares of the angles (deg) and distances (mm) between ``A X`` and ``Z B``."""
-    left, right = Ts_a @ X, Z @ Ts_b
+    left = Ts_a @ X
+    right = Z @ Ts_b
     turned = np.swapaxes(left[:, :3, :3], 1, 2) @ right[:, :3, :3]
     angle_deg = np.degrees(np.sqrt(np.mean(se3.rotation_angle(turned) ** 2)))
     apart = np.sum((left[:, :3, 3] - right[:, :3, 3]) ** 2, axis=1)
@@ -101,27 +102,35 @@ def ethz(folder: Path) -> Iterator[Row]:
         if apart_s <= _WITHIN_S and apart_s < best.get(nearest, (np.inf, 0))[0]:
             best[nearest] = (apart_s, row)
     pairs = sorted((f"ethz-absolute-{i:05d}-{row:05d}", i, row) for i, (_, row) in best.items())
-    motions, poses, seconds, same = [], [], [], 0
+    motions = []
+    poses = []
+    seconds = []
+    same = 0
     for seed, beginning in enumerate(_DIGESTS):
         order = list(range(len(pairs)))
         random.Random(seed).shuffle(order)
         held, fitted = ([pairs[k] for k in sorted(part)] for part in (order[:16], order[16:48]))
         name = hashlib.sha256("\n".join(pair[0] for pair in fitted).encode()).hexdigest()
         same += name.startswith(beginning)
-        A, B = hand[[i for _, i, _ in fitted]], eye[[row for _, _, row in fitted]]
+        A = hand[[i for _, i, _ in fitted]]
+        B = eye[[row for _, _, row in fitted]]
         started = time.process_time()
         fit = solve(Stops.of_one(A, B))
         seconds.append(time.process_time() - started)
-        A, B = hand[[i for _, i, _ in held]], eye[[row for _, _, row in held]]
-        X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
+        A = hand[[i for _, i, _ in held]]
+        B = eye[[row for _, _, row in held]]
+        X = fit.Ts_parent_child[0]
+        Z = fit.Ts_world_world[0]
         motions.append(closure_of_motions(X, A, B))
         poses.append(closure(A, X, Z, B))
     source = f"{names[0]} {digest(files[0])}, {same} of 5 splits"
     text = "{:.4f} deg, {:.3f} mm"
-    ours, published = text.format(*np.mean(motions, axis=0)), text.format(0.8672, 13.821)
+    ours = text.format(*np.mean(motions, axis=0))
+    published = text.format(0.8672, 13.821)
     figure = "closure of A X = X B, 16 poses held out, mean of 5"
     yield Row("ETHZ arm", figure, ours, published, source)
-    ours, published = text.format(*np.mean(poses, axis=0)), text.format(0.6247, 10.779)
+    ours = text.format(*np.mean(poses, axis=0))
+    published = text.format(0.6247, 10.779)
     yield Row("ETHZ arm", "closure of A X = Z B", ours, published, source)
     yield Row("ETHZ arm", "time of a solve", f"{1e3 * np.median(seconds):.0f} ms", "30 ms", source)
 
@@ -130,11 +139,13 @@ def camodocal(folder: Path) -> Iterator[Row]:
     """The example of handeye_calib_camodocal: motions between neighbours."""
     path = folder / "independent" / "camodocal_example" / "TransformPairsInput.yml"
     samples = read_arm_samples(path)
-    A, B = samples.robot, samples.tracking
+    A = samples.robot
+    B = samples.tracking
     X = solve(Stops.of_one(A, B)).Ts_parent_child[0]
     motions = [se3.inverse(Ts[:-1]) @ Ts[1:] for Ts in (A, B)]
     angle_deg, apart_mm = closure(motions[0], X, X, motions[1])
-    figure, ours = "closure between neighbours", f"{angle_deg:.2f} deg, {apart_mm:.2f} mm"
+    figure = "closure between neighbours"
+    ours = f"{angle_deg:.2f} deg, {apart_mm:.2f} mm"
     source = f"{path.name} {digest(path)}"
     yield Row("CamOdoCal's example", figure, ours, "7.82 deg, 36.97 mm", source)
 
@@ -211,7 +222,9 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
     generator = np.random.default_rng()
     start_ns, end_ns = velodyne.stamps_ns[[0, -1]]
     for seconds, published in _SHRIMP_PUBLISHED.items():
-        errors, stated, verdicts = [], [], []
+        errors = []
+        stated = []
+        verdicts = []
         for _ in range(n_segments):
             first = generator.integers(start_ns, end_ns - seconds * 10**9)
             pair = (between(each, first, first + seconds * 10**9) for each in (nav, velodyne))
@@ -249,12 +262,14 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
     data = folder / "independent" / "ntu_viral"
     published = np.loadtxt(data / "trans_B2prism.csv", delimiter=",")
     text = " ".join(f"{value:.4f}" for value in published)
-    offsets, precisions = [], []
+    offsets = []
+    precisions = []
     for flight in ("eee_01", "nya_01", "sbs_01"):
         parent = hec.read_trajectory(data / f"{flight}_odometry.csv", "csv")
         child = hec.read_trajectory(data / f"{flight}_leica_pose.csv", "csv", measures="positions")
         result = hec.calibrate(parent, child, child_measures="positions", time_offset="estimate")
-        offset, sigmas = result.T_parent_child[:3, 3], result.sigmas[:3]
+        offset = result.T_parent_child[:3, 3]
+        sigmas = result.sigmas[:3]
         offsets.append(offset)
         precisions.append(1.0 / result.sigmas_measured[:3] ** 2)
         ours = " ".join(f"{value:.4f}" for value in offset)

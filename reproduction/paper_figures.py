@@ -23,8 +23,13 @@ if TYPE_CHECKING:
     from reproduction.results import Summary
 
 # Okabe, Ito 2008, without the yellow that vanishes on white.
-_BLACK, _SKY, _GREEN, _BLUE = "#000000", "#56B4E9", "#009E73", "#0072B2"
-_VERMILION, _PURPLE, _GREY = "#D55E00", "#CC79A7", "#666666"
+_BLACK = "#000000"
+_SKY = "#56B4E9"
+_GREEN = "#009E73"
+_BLUE = "#0072B2"
+_VERMILION = "#D55E00"
+_PURPLE = "#CC79A7"
+_GREY = "#666666"
 _SMALL = ("font_size", "axes_labelsize", "xtick_labelsize", "ytick_labelsize", "axes_titlesize")
 _WHITE = dict.fromkeys(("figure_facecolor", "savefig_facecolor"), "white")
 _STYLE = dict.fromkeys(_SMALL, 7.0) | _WHITE | {"savefig_dpi": 200, "lines_linewidth": 1.1}
@@ -66,7 +71,9 @@ _ZERO = 1e-6
 
 # Of the axes' height: distance of labels. Of the levels' range: room for a label, and for each of
 # its letters.
-_LABEL_GAP, _LABEL_ROOM, _LETTER = 0.088, 0.12, 0.075
+_LABEL_GAP = 0.088
+_LABEL_ROOM = 0.12
+_LETTER = 0.075
 
 _SMALL_BOLD: dict[str, Any] = {"fontweight": "bold", "fontsize": 6.2}
 _BARS: dict[str, Any] = {"elinewidth": 0.7, "capsize": 1.2, "capthick": 0.7, "mew": 0.8}
@@ -162,7 +169,8 @@ def _write_plainly(ax: Axes) -> None:
 
 
 def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
-    first, last = lines[0].levels[0], lines[0].levels[-1]
+    first = lines[0].levels[0]
+    last = lines[0].levels[-1]
     span = last - first
     for number, line in enumerate(lines):
         # Side by side, so that the intervals can be told apart.
@@ -191,7 +199,8 @@ def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
     to_fraction = ax.transData + ax.transAxes.inverted()
     last = lines[0].levels[-1]
     heights = [to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines]
-    placed, order = list(heights), sorted(range(len(heights)), key=lambda index: heights[index])
+    placed = list(heights)
+    order = sorted(range(len(heights)), key=lambda index: heights[index])
     for before, after in pairwise(order):
         placed[after] = max(placed[after], placed[before] + _LABEL_GAP)
     shift = max(0.0, 0.02 - min(placed)) - max(0.0, max(placed) - 0.98)

@@ -63,7 +63,10 @@ PLATFORMS = {
 
 # A consumer gyroscope: bias (rad/s), noise of a sample (rad/s), walk of the bias (rad/s per root
 # s), and by how much its stamps are late (s).
-_BIAS, _RATE_NOISE, _BIAS_WALK, _LATE_S = 0.01, np.radians(0.1), np.radians(0.002), 0.005
+_BIAS = 0.01
+_RATE_NOISE = np.radians(0.1)
+_BIAS_WALK = np.radians(0.002)
+_LATE_S = 0.005
 
 # The rotation of the child's rates turns by this (rad) when the mount moves.
 _TURNED = np.radians(2.0) * np.array([0.6, 0.48, 0.64])
@@ -256,7 +259,8 @@ KINDS = {"positions": (positions, OF_POSITIONS), "rates": (rates, OF_RATES)}
 def distance(kind: str, result: Calibration, truth: FloatArray) -> float:
     """Largest error of a known axis over its standard deviation with the allowance."""
     if kind == "positions":
-        errors, part = result.T_parent_child[:3, 3] - truth, slice(0, 3)
+        errors = result.T_parent_child[:3, 3] - truth
+        part = slice(0, 3)
     else:
         errors = se3.rotation_log(truth @ result.T_parent_child[:3, :3].T)
         part = slice(3, 6)
@@ -269,7 +273,10 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
     """Rows of the table of a kind, one for each fault."""
     make, faults = KINDS[kind]
     for fault in faults:
-        verdicts, codes, distances, far = Counter[str](), Counter[str](), [], 0
+        verdicts = Counter[str]()
+        codes = Counter[str]()
+        distances = []
+        far = 0
         for platform in PLATFORMS:
             for seed in seeds:
                 recording = make(platform, fault, seed)

@@ -45,13 +45,21 @@ MACHINES = {
 # An RTK receiver: rate, white noise of a fixed solution (m); outages per second and how long they
 # last (s); float solutions per minute, how long they last (s), their error (m) and its correlation
 # time (s).
-_FIXES_HZ, _FIXED_M = 5.0, 0.01
-_OUTAGES_HZ, _OUTAGE_S = 0.2, (0.5, 1.5)
-_FLOATS_PER_MIN, _FLOAT_S, _FLOAT_M, _FLOAT_TAU_S = 1.0, (5.0, 15.0), 0.3, 5.0
+_FIXES_HZ = 5.0
+_FIXED_M = 0.01
+_OUTAGES_HZ = 0.2
+_OUTAGE_S = (0.5, 1.5)
+_FLOATS_PER_MIN = 1.0
+_FLOAT_S = (5.0, 15.0)
+_FLOAT_M = 0.3
+_FLOAT_TAU_S = 5.0
 
 # A consumer gyroscope: rate, noise per sample (rad/s), bias and its walk (rad/s, per root s), and
 # by how much its stamps are late (s).
-_RATES_HZ, _RATE_NOISE, _BIAS, _BIAS_WALK = 200.0, np.radians(0.1), 0.01, np.radians(0.002)
+_RATES_HZ = 200.0
+_RATE_NOISE = np.radians(0.1)
+_BIAS = 0.01
+_BIAS_WALK = np.radians(0.002)
 _LATE_S = 0.005
 _TURNING: dict[str, tuple[_Motion, SensorErrors]] = {
     "hand-held, visual-inertial odometry": (motions.hand_held, VIO),
@@ -73,7 +81,8 @@ def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, F
     step_s = 1.0 / machine.rate_hz
     n_poses = round(machine.duration_s * machine.rate_hz)
     times_s: FloatArray = step_s * np.arange(n_poses, dtype=np.float64)
-    true_poses, twists = motion.at(times_s), motion.twists(times_s)
+    true_poses = motion.at(times_s)
+    twists = motion.twists(times_s)
     poses = draw(machine.odometry, true_poses, twists, step_s, odometry_rng).poses
     n_fixes = round((machine.duration_s - 1.0) * _FIXES_HZ)
     fixes_s: FloatArray = (np.arange(n_fixes, dtype=np.float64) + 0.25) / _FIXES_HZ
@@ -120,7 +129,8 @@ def _covers(ratios: FloatArray) -> str:
 def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
     """Rows of the table of simulated receivers."""
     for name in MACHINES:
-        errors, stated = [], []
+        errors = []
+        stated = []
         for seed in range(n_seeds):
             parent, child, lever_arm = simulated_positions(name, seed)
             result = hec.calibrate(parent, child)
@@ -159,7 +169,9 @@ def simulated_rates(
 def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
     """Rows of the table of simulated gyroscopes."""
     for name in _TURNING:
-        angles, ratios, offsets = [], [], []
+        angles = []
+        ratios = []
+        offsets = []
         for seed in range(n_seeds):
             parent, child, rotation = simulated_rates(name, seed)
             result = hec.calibrate(parent, child)

@@ -297,6 +297,7 @@ def _read_results(path: Path, level_column: str | None) -> PublishedResults:
 
 def _result(row: Mapping[str, str]) -> PublishedResult:
     numbers = np.array(row["T"].replace("[", " ").replace("]", " ").split(), dtype=float)
-    e_rt, e_at = float(row["err_tr"]), float(row["abs_tr"])
+    e_rt = float(row["err_tr"])
+    e_at = float(row["abs_tr"])
     e_rR, e_aR = (float(np.radians(float(row[column]))) for column in ("err_R", "abs_R"))
     return PublishedResult(numbers.reshape(4, 4), Errors(e_rt, e_rR, e_at, e_aR))

@@ -29,7 +29,8 @@ from reproduction.published import KEYFRAMES, KITTI_DRIVES, RECTIFIED
 # Parts of a drive, by how many there are.
 PARTS = {2: "halves", 3: "thirds"}
 
-_ASL_COLUMNS, _ZXL19_COLUMNS = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
+_ASL_COLUMNS = "t,x,y,z,qx,qy,qz,qw"
+_ZXL19_COLUMNS = "t,x,y,z,qw,qx,qy,qz"
 
 # A part's parent stream reaches this far over the child's (ns), for interpolation and for the
 # search for the offset.
@@ -200,7 +201,8 @@ def _zxl19(folder: Path) -> list[Rig]:
     def recordings(parent: str, child: str) -> dict[str, Recording]:
         return {f"bag{n}": Recording(bag[parent], bag[child]) for n, bag in enumerate(sensors, 1)}
 
-    lidars, cameras = recordings("INS", "LO"), recordings("INS", "VO")
+    lidars = recordings("INS", "LO")
+    cameras = recordings("INS", "VO")
     # The road is flat: heights are a matter for a tape measure. The lidar leans a little against
     # the axis of turning, so that without this the unknown height would be part of what is
     # uncertain of x and y.

@@ -38,7 +38,8 @@ class Summary:
 def mean_summary(values: ArrayLike) -> Summary:
     """Mean and 95 % confidence interval of (N,) values."""
     values = np.asarray(values)
-    mean, n = values.mean(), len(values)
+    mean = values.mean()
+    n = len(values)
     half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
     whiskers = float(values.min()), float(values.max())
     return Summary(float(mean), float(mean - half), float(mean + half), whiskers, n)

@@ -40,7 +40,8 @@ def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
     random = np.random.default_rng((21, seed))
     drive = dataclasses.replace(HILLY_DRIVE, poses=n_poses, child_rate=10.0, child_delay=0.0)
     parent = simulate_drive((22, seed), drive).parent
-    Xs, poses = [np.eye(4)], []
+    Xs = [np.eye(4)]
+    poses = []
     for sensor, (white_m, white_rad, walk_m, walk_rad) in enumerate(errors):
         if sensor > 0:
             Xs.append(se3.exp(np.r_[random.uniform(-1, 1, 3), random.normal(0, 0.7, 3)]))
@@ -86,7 +87,8 @@ def outcome(rig: Rig) -> Outcome:
     """Calibrate a rig, all its extrinsics against the truth."""
     names = [f"s{index}" for index in range(len(rig.Xs))]
     found = calibrate_rig(trajectories_of(rig, names))
-    errors, own = {}, []
+    errors = {}
+    own = []
     for first, second in combinations(range(len(names)), 2):
         back = se3.inverse(rig.Xs[second]) @ rig.Xs[first]
         errors[first, second] = se3.log(back @ found.T(names[first], names[second]))

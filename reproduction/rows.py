@@ -42,11 +42,13 @@ _COLUMNS = (
 )
 
 # Errors agree within this share of the published one, or this many metres or degrees.
-_RELATIVE, _ABSOLUTE = 1e-3, 1e-6
+_RELATIVE = 1e-3
+_ABSOLUTE = 1e-6
 
 # An objective is above another when it is so by more than this share, and by more than the rounding
 # of a perfect fit.
-_OBJECTIVE_SHARE, _OBJECTIVE_FLOOR = 1e-6, 1e-15
+_OBJECTIVE_SHARE = 1e-6
+_OBJECTIVE_FLOOR = 1e-15
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,10 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
         for row in table.itertuples()
     ]
     same = agree(table[list(METRICS)].to_numpy(), table[list(PUBLISHED)].to_numpy())
-    table["agrees"], table["same_e_at"] = same.all(axis=1), same[:, 2]
-    ours, theirs = table["objective"].to_numpy(), table["published_objective"].to_numpy()
+    table["agrees"] = same.all(axis=1)
+    table["same_e_at"] = same[:, 2]
+    ours = table["objective"].to_numpy()
+    theirs = table["published_objective"].to_numpy()
     table["verdict"] = np.select(
         [np.isnan(theirs), _is_above(ours, theirs), _is_above(theirs, ours)],
         ["", "higher", "lower"],

@@ -41,7 +41,8 @@ def put_into_page(page: Path, name: str, text: str) -> None:
     """Put Markdown, without a heading at its beginning, between the lines ``<!-- NAME: begin -->``
     and ``<!-- NAME: end -->`` of a page. Raises InputError if it has no such lines.
     """
-    begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->"
+    begin = f"<!-- {name}: begin -->\n"
+    end = f"<!-- {name}: end -->"
     before, found, rest = page.read_text(encoding="utf-8").partition(begin)
     _, closed, after = rest.partition(end)
     if not (found and closed):

@@ -10,15 +10,18 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.writer import write_streams
 
-JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+NOETIC = get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(
     get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
 )
 NOETIC.register(
     get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage")
 )
-TF, PATH = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path"
-ODOMETRY, POSE_STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+TF = "tf2_msgs/msg/TFMessage"
+PATH = "nav_msgs/msg/Path"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 STORAGES = ("mcap", "sqlite3", "rosbag1")
 
 
@@ -73,11 +76,9 @@ def header(typestore, stamp_ns, frame):
 
 def pose(typestore, matrix, kind="Pose"):
     """A Pose or Transform of a (4, 4) matrix."""
-    types, translation, quat_xyzw = (
-        typestore.types,
-        matrix[:3, 3].tolist(),
-        se3.to_quat_xyzw(matrix).tolist(),
-    )
+    types = typestore.types
+    translation = matrix[:3, 3].tolist()
+    quat_xyzw = se3.to_quat_xyzw(matrix).tolist()
     vector = types["geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"](
         *translation
     )
@@ -138,7 +139,8 @@ def path_message(stamps_ns, poses, frame="map"):
 
 def imu(rates, first_covariance=0.0, stamp_ns=12_000_000_005):
     """A serialised Imu with angular rates (rad/s)."""
-    covariance, of_rates = np.zeros(9), np.zeros(9)
+    covariance = np.zeros(9)
+    of_rates = np.zeros(9)
     of_rates[0] = first_covariance
     types = JAZZY.types
     vector = types["geometry_msgs/msg/Vector3"]
@@ -171,9 +173,11 @@ def fix(status, latitude=60.0, longitude=25.0, altitude=30.0, stamp_ns=12_000_00
 
 def write_messages(path, messages, storage="mcap"):
     """Write (bag time, topic, type, make) messages, in the order of bag time."""
-    typestore, serialize = JAZZY, JAZZY.serialize_cdr
+    typestore = JAZZY
+    serialize = JAZZY.serialize_cdr
     if storage == "rosbag1":
-        typestore, serialize = NOETIC, NOETIC.serialize_ros1
+        typestore = NOETIC
+        serialize = NOETIC.serialize_ros1
         writer = rosbag1.Writer(path)
     else:
         plugin = rosbag2.StoragePlugin[storage.upper()]

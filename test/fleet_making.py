@@ -42,7 +42,8 @@ def recordings_of(seed, count, unknown_z=False):
     """Extrinsics (N, 4, 4) of one rig as a calibration finds them, and covariances (N, 6, 6)."""
     random = np.random.default_rng(seed)
     X = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
-    Ts, covariances = [], []
+    Ts = []
+    covariances = []
     for _ in range(count):
         root = random.normal(size=(6, 6)) * np.r_[np.full(3, 0.003), np.full(3, 0.001)]
         covariance = root @ root.T + np.diag([1e-6] * 3 + [1e-8] * 3)

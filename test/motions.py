@@ -87,7 +87,8 @@ def write_pair(folder, parent, child):
 
 def messages(stream, trajectory):
     """What the engine is given for each pose."""
-    positions, quats = trajectory.poses[:, :3, 3].tolist(), se3.to_quat_xyzw(trajectory.poses)
+    positions = trajectory.poses[:, :3, 3].tolist()
+    quats = se3.to_quat_xyzw(trajectory.poses)
     poses = zip(trajectory.stamps_ns.tolist(), positions, quats.tolist(), strict=True)
     return [(stream, *pose) for pose in poses]
 

@@ -16,7 +16,8 @@ NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 def dofs(sigmas, hidden=()):
     """What is known of six axes: the hidden ones nothing, the others to these sigmas."""
-    seen, unseen = DofVerdict.OBSERVED, DofVerdict.UNOBSERVABLE
+    seen = DofVerdict.OBSERVED
+    unseen = DofVerdict.UNOBSERVABLE
     return tuple(
         DofObservability(name, unseen if name in hidden else seen, float(sigma))
         for name, sigma in zip(NAMES, sigmas, strict=True)

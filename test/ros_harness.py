@@ -50,7 +50,8 @@ RELIABLE_INPUTS = [
     for stream in ("parent", "child")
 ]
 
-_domains, _held = itertools.count(os.getpid()), {}
+_domains = itertools.count(os.getpid())
+_held = {}
 
 
 def values_of(status):
@@ -109,7 +110,8 @@ def parts_of(message):
 
 def matrix(transform):
     """(4, 4) array of a TransformStamped."""
-    t, q = transform.transform.translation, transform.transform.rotation
+    t = transform.transform.translation
+    q = transform.transform.rotation
     return se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
 
 
@@ -150,11 +152,13 @@ def _run_node(arguments, log_file, environment, before):
 
 
 def _forked_solver(*_, **__):
-    (stdin, to), (back, stdout) = os.pipe(), os.pipe()
+    stdin, to = os.pipe()
+    back, stdout = os.pipe()
     streams = [Connection(each) for each in (stdin, stdout, os.dup(2))]
     solver = _Forked(target=_solve, args=streams, daemon=True)
     solver.start()
-    solver.stdin, solver.stdout = os.fdopen(to, "wb"), os.fdopen(back, "rb")
+    solver.stdin = os.fdopen(to, "wb")
+    solver.stdout = os.fdopen(back, "rb")
     return solver
 
 

@@ -90,7 +90,8 @@ def aims(rows, memory):
     """What the package aims at, as text: [what, aim, measured, whether it is met]; rows that were
     not measured are left out.
     """
-    measured, seconds = ratios(rows, memory), {row.key: row.seconds for row in rows}
+    measured = ratios(rows, memory)
+    seconds = {row.key: row.seconds for row in rows}
     found = [
         (name, f"at least {aim:g}", f"{measured[name]:.3g}", measured[name] >= aim)
         for name, aim in _AT_LEAST.items()

@@ -16,7 +16,8 @@ from reproduction.published import load_kitti_long, load_kitti_short
 
 REFERENCE = "B5"
 # Pairs with B5; the KITTI drives have 448 and 2,343 poses in common.
-SHORT, LONG = 443, 2338
+SHORT = 443
+LONG = 2338
 # Messages of both streams together.
 MESSAGES = 40_000
 STREAMS = ("parent", "child")
@@ -106,11 +107,14 @@ def simulated_drive(n_poses, seed=0):
     stamps_ns = _PERIOD_NS * np.arange(n_poses)
     Ts_pw_p, Ts_cw_c = np.empty((2, n_poses, 4, 4))
     random = np.random.default_rng(seed)
-    place, shift = np.zeros(3), np.zeros(3)
+    place = np.zeros(3)
+    shift = np.zeros(3)
     for first in range(0, n_poses, _POSES_AT_A_TIME):
         part = slice(first, first + _POSES_AT_A_TIME)
         s = stamps_ns[part] * 1e-9
-        yaw, roll, pitch = 1.5 * np.sin(0.11 * s), 0.05 * np.sin(0.7 * s), 0.06 * np.sin(1.1 * s)
+        yaw = 1.5 * np.sin(0.11 * s)
+        roll = 0.05 * np.sin(0.7 * s)
+        pitch = 0.06 * np.sin(1.1 * s)
         about_z = np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1)
         rotations = se3.rotation_exp(about_z) @ se3.rotation_exp(
             np.stack([roll, pitch, np.zeros_like(yaw)], axis=1)
@@ -118,7 +122,8 @@ def simulated_drive(n_poses, seed=0):
         places = place + np.cumsum(rotations[:, :, 0], axis=0)
         jumps = random.normal(size=places.shape) * 0.5 * (random.random((len(places), 1)) < 0.02)
         shifts = shift + np.cumsum(jumps, axis=0)
-        place, shift = places[-1], shifts[-1]
+        place = places[-1]
+        shift = shifts[-1]
         Ts = se3.from_rotation_translation(rotations, places)
         noise = se3.exp(random.normal(size=(2, len(Ts), 6)) * _SIGMA)
         Ts_pw_p[part] = Ts @ noise[0]

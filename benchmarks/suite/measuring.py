@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 # Seconds for one row, the shortest time that is told apart, and repeats at least and at most.
-_BUDGET_S, _SHORTEST_S = 1.0, 2e-3
-_FEWEST, _MOST = 2, 25
+_BUDGET_S = 1.0
+_SHORTEST_S = 2e-3
+_FEWEST = 2
+_MOST = 25
 _FEWEST_TURNS = 3
 
 
@@ -75,7 +77,8 @@ def measure_in_turn(size, slow, fast, clock=time.process_time):
         result = work()
         return clock() - start, result
 
-    slow_s, fast_s = [], []
+    slow_s = []
+    fast_s = []
     _, of_fast = timed(fast[1])  # does not count: it warms up
     while len(slow_s) < _FEWEST_TURNS or sum(slow_s) < _BUDGET_S:
         seconds, of_slow = timed(slow[1])

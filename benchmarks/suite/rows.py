@@ -35,8 +35,10 @@ TOPICS = ("/lidar/odometry", "/camera/odometry")
 
 def solver_rows(drive, is_full):
     """Rows of everything between synchronised poses and the answer, for one drive."""
-    poses, pairs = drive.poses, drive.pairs
-    size, most = len(pairs), _FULL if is_full else _USUAL
+    poses = drive.poses
+    pairs = drive.pairs
+    size = len(pairs)
+    most = _FULL if is_full else _USUAL
 
     def row(name, work, answer=None):
         measured, result = measure(name, size, work)
@@ -71,7 +73,8 @@ def solver_rows(drive, is_full):
         for method in ("park", "taylor", "zhuang", "ali"):
             yield row(method, solved(method), extrinsic)
     if size <= _JACKKNIFE:
-        method, solution = Method("dnlo"), solved("dnlo")()
+        method = Method("dnlo")
+        solution = solved("dnlo")()
         yield row(
             "jackknife and covariance",
             lambda: assess(
@@ -97,7 +100,8 @@ def opencv_rows(drives):
         return
     methods = OPENCV_METHODS
     for size in (SHORT, LONG):
-        poses, found = drives[size].poses, []
+        poses = drives[size].poses
+        found = []
         for method in methods:
             row, T_parent_child = measure(
                 f"opencv {method.lower()}",
@@ -134,7 +138,8 @@ def opencv(cv2, method, Ts_pw_p, Ts_cw_c):
 
 def engine_rows(n_messages):
     """Time per message of the engine: at the median, and at the 99th percentile."""
-    calibrator, times = Calibrator(), []
+    calibrator = Calibrator()
+    times = []
     streams = parts(0, n_messages // 2, 100)
     for pose in range(n_messages // 2):
         for stream, (stamps_ns, positions, quats) in streams.items():

@@ -12,7 +12,8 @@ from suite.data import LONG, REFERENCE, SHORT
 
 _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"))
 _MARK = "<!-- tables of benchmarks/run.py: {} -->\n"
-_BEGIN, _END = _MARK.format("begin"), _MARK.format("end")
+_BEGIN = _MARK.format("begin")
+_END = _MARK.format("end")
 
 
 class Table(NamedTuple):

@@ -94,7 +94,8 @@ def arranged(
     """The layout that fits the sensors best, whether its numbers are ``T_child_parent``, and
     whether the names of the frames say so.
     """
-    roles, found = (role_of(parent_frame), role_of(child_frame)), []
+    roles = (role_of(parent_frame), role_of(child_frame))
+    found = []
     for order, layout in enumerate(layouts):
         ways = (False, True) if layout.is_inverted is None else (layout.is_inverted,)
         for is_inverted in ways:
@@ -115,10 +116,12 @@ def export_text(result: Judged, name: str) -> str:
         raise ConfigError(f"unknown format {name!r}; known are {', '.join(formats())}")
     if result.verdict is Verdict.DO_NOT_USE:
         raise InputError(f"nothing is written: {result.headline}")
-    frames, T = (result.parent_frame, result.child_frame), result.T_parent_child
+    frames = (result.parent_frame, result.child_frame)
+    T = result.T_parent_child
     layout, is_inverted, is_certain = arranged(formats()[name], *frames)
     if layout.is_inverted is False and not layout.target:  # the vehicle or robot, if it is known
-        frames, T = (result.mounting[0], result.child_frame), result.mounting[1]
+        frames = (result.mounting[0], result.child_frame)
+        T = result.mounting[1]
     if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
         raise InputError(
             f"nothing is written: this recording does not determine {axes_in_words(unknown)}; "
@@ -159,7 +162,9 @@ def export_text(result: Judged, name: str) -> str:
 
 def _numbers(T: FloatArray) -> dict[str, str]:
     """The texts of a pose (4, 4) that layouts need."""
-    t, R, rpy = T[:3, 3], T[:3, :3], se3.rotation_to_rpy(T[:3, :3])
+    t = T[:3, 3]
+    R = T[:3, :3]
+    rpy = se3.rotation_to_rpy(T[:3, :3])
     qx, qy, qz, qw = quat_xyzw = se3.to_quat_xyzw(T)
     numbers = dict(zip(AXES, [*t, *rpy], strict=True)) | {"y_frd": -t[1], "z_frd": -t[2]}
     numbers |= {"qx": qx, "qy": qy, "qz": qz, "qw": qw}

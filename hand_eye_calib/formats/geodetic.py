@@ -65,7 +65,8 @@ def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
 
 def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
     """Positions (N, 3) along the axes of the earth, from its centre (m)."""
-    sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)
+    sin_lat = np.sin(lat_rad)
+    cos_lat = np.cos(lat_rad)
     eccentricity_2 = _FLATTENING * (2.0 - _FLATTENING)
     normal = _RADIUS_M / np.sqrt(1.0 - eccentricity_2 * sin_lat**2)
     from_axis = (normal + height_m) * cos_lat
@@ -75,8 +76,10 @@ def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArra
 
 def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
     """East, north and up (N, 3, 3), as columns, along the axes of the earth."""
-    sin_lat, cos_lat = np.sin(lat_rad), np.cos(lat_rad)
-    sin_lon, cos_lon = np.sin(lon_rad), np.cos(lon_rad)
+    sin_lat = np.sin(lat_rad)
+    cos_lat = np.cos(lat_rad)
+    sin_lon = np.sin(lon_rad)
+    cos_lon = np.cos(lon_rad)
     east = np.stack([-sin_lon, cos_lon, np.zeros_like(lat_rad)], axis=1)
     north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=1)
     up = np.stack([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat], axis=1)

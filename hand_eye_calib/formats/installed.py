@@ -110,7 +110,8 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
     """The pose of the child sensor in the parent sensor's frame, in a document of any format; an
     InputError if it is not there.
     """
-    nodes, frames = [*_nodes(document, ())], FrameTree("the file")
+    nodes = [*_nodes(document, ())]
+    frames = FrameTree("the file")
     for parent, child, *pose in filter(None, (_named(*each) for each in nodes)):
         frames.add(str(parent), str(child), pose_of(*pose))
     if frames.edges:
@@ -147,7 +148,8 @@ def _nodes(document: Any, above: tuple[str, ...]) -> Iterator[_Node]:
 
 def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
     """Parent, child and pose of a node that names both frames; empty for another one."""
-    header, about = node.get("header"), node.get("parameters")
+    header = node.get("header")
+    about = node.get("parameters")
     if isinstance(header, Mapping) and "child_frame_id" in node:  # TransformStamped
         return header.get("frame_id"), node["child_frame_id"], node.get("transform")
     if {"parent", "child", "value"} <= node.keys():

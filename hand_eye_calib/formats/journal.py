@@ -155,7 +155,9 @@ def _read(path: Path) -> tuple[Document, "array[int]", "array[float]", int]:
     """
     about: Document = {}
     # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
-    stamps_ns, values, whole_bytes = array("q"), array("d"), 0
+    stamps_ns = array("q")
+    values = array("d")
+    whole_bytes = 0
     with open_regular(path) as file, suppress(*_UNREADABLE):
         while (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
             if line.startswith(b"# {"):

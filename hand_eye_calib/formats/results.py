@@ -157,7 +157,8 @@ def keep_earlier_results(directory: str | Path) -> str:
     """Copy the result files and the report of a directory into its folder ``previous`` before they
     are replaced; returns words about it, empty if there are none. An InputError if that fails.
     """
-    previous, names = Path(directory, "previous"), (*_NAMES, "report.html")
+    previous = Path(directory, "previous")
+    names = (*_NAMES, "report.html")
     found = [path for name in names if (path := Path(directory, name)).exists()]
     with writing(previous):
         if found:
@@ -202,7 +203,8 @@ def load_result(path: str | Path) -> Calibration:
 
 def _xacro_text(calibration: Calibration) -> str:
     """A fixed joint from the parent's to the child's link, for a robot description with both."""
-    parent, child = calibration.mounting[0], calibration.child_frame
+    parent = calibration.mounting[0]
+    child = calibration.child_frame
     # Quoted for XML, and kept from being evaluated by xacro.
     joint, parent, child = (
         quoteattr(printable(text).replace("$", "$$"))
@@ -233,7 +235,8 @@ def _template(name: str) -> str:
 
 def _remarks(calibration: Calibration) -> list[str]:
     """What a person who opens the file must know, in lines."""
-    parent, child = calibration.mounting[0], calibration.child_frame
+    parent = calibration.mounting[0]
+    child = calibration.child_frame
     remarks = [
         calibration.headline,
         *(f"{reason.sentence}: {reason.what_to_do}" for reason in calibration.reasons),
@@ -245,4 +248,5 @@ def _remarks(calibration: Calibration) -> list[str]:
 
 
 # Their names in the package's public interface.
-load, save = load_result, save_result
+load = load_result
+save = save_result

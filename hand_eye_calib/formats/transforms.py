@@ -19,7 +19,8 @@ from hand_eye_calib.core.geometry.frames import FrameTree, check_pose
 _JUMP_BACK_NS = STAMP_UNITS["s"]
 
 # Transforms of each moving edge from which its rate is taken, and most that are kept.
-_RATE_FROM, _MOST_KEPT = 5, 2000
+_RATE_FROM = 5
+_MOST_KEPT = 2000
 
 # x y z qx qy qz qw of a frame in its parent.
 _Row = tuple[float, ...]
@@ -64,7 +65,8 @@ class TfStream:
     """
 
     def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
-        self.source, self.max_gap_s = source, max_gap_s
+        self.source = source
+        self.max_gap_s = max_gap_s
         self._tree = tree or FrameTree("/tf and /tf_static")
         self._moving: dict[str, _MovingEdge] = {}
         self._last_ns: dict[str, int] = {}
@@ -84,7 +86,9 @@ class TfStream:
         x y z qx qy qz qw of the moving edges there. An InputError if it is no pose, or its frame
         has another parent already.
         """
-        parent, frame, edges = transform.world_frame, transform.sensor_frame or "", self._tree.edges
+        parent = transform.world_frame
+        frame = transform.sensor_frame or ""
+        edges = self._tree.edges
         before = edges[frame].is_static if frame in edges else None
         row = (*transform.position, *transform.quat_xyzw)
         if is_static or frame in self._moving:
@@ -113,7 +117,8 @@ class TfStream:
         return "its transforms do not come at the same times"
 
     def _find_chain(self) -> None:
-        self._slowest, frames = "", []
+        self._slowest = ""
+        frames = []
         with suppress(InputError):
             up, down = self._tree.route(*self.source)
             frames = [each for each in up + down if not self._tree.edges[each].is_static]

@@ -102,7 +102,8 @@ def calibrate(
     ('lidar', 'camera')
     """
     values = {name: value for name, value in locals().items() if value is not None}
-    first, second = parent, child
+    first = parent
+    second = child
     if not (isinstance(first, Trajectory) and isinstance(second, Trajectory)):
         from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
 
@@ -116,10 +117,12 @@ def calibrate(
 
 def _options_in_words() -> str:
     """The options of :func:`calibrate` for its docstring, from where they are declared."""
-    names, lines = inspect.signature(calibrate).parameters, []
+    names = inspect.signature(calibrate).parameters
+    lines = []
     for field in fields(CalibratorConfig):
         if field.name in names:
-            meta, default = field.metadata, repr(field.default) if field.default != "" else "none"
+            meta = field.metadata
+            default = repr(field.default) if field.default != "" else "none"
             unit = f" {meta['unit']}" if meta["unit"] else ""
             kind = " or ".join(map(repr, meta["choices"] or ())) or type(field.default).__name__
             lines += [f"{field.name} : {kind}, optional"]

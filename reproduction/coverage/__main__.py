@@ -41,7 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def run() -> int:
         first = seed_of(arguments.seed)
-        folder, seeds = arguments.data_folder, range(first, first + arguments.seeds)
+        folder = arguments.data_folder
+        seeds = range(first, first + arguments.seeds)
         rigs, absent = real_rigs(folder) if folder else ([], ["every real recording"])
         tasks = [
             task

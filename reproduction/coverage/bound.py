@@ -110,7 +110,9 @@ def normal_equations(
 
 
 def _latents(side: Side, dt: float) -> list[_Latent]:
-    errors, Ts, G = side.errors, side.Ts, side.to_error
+    errors = side.errors
+    Ts = side.Ts
+    G = side.to_error
     nowhere = np.zeros((len(Ts) - 1, 6, 6))
     found = [
         _Latent(_phi(dt, part.tau_s), part.sigma**2, G @ directions(part, Ts), nowhere)
@@ -132,9 +134,12 @@ def _drifting(
     adjoints: FloatArray, walk_inverse: FloatArray, latents: list[_Latent]
 ) -> _StateSpace:
     """States (d, latents), d a random walk of unknown start."""
-    count, size = len(adjoints), 6 + sum(len(latent.variances) for latent in latents)
-    F, Q_inverse = np.zeros((count, size, size)), np.zeros((count, size, size))
-    F[:, :6, :6], Q_inverse[:, :6, :6] = adjoints, walk_inverse
+    count = len(adjoints)
+    size = 6 + sum(len(latent.variances) for latent in latents)
+    F = np.zeros((count, size, size))
+    Q_inverse = np.zeros((count, size, size))
+    F[:, :6, :6] = adjoints
+    Q_inverse[:, :6, :6] = walk_inverse
     first = np.zeros((size, size))
     at = 6
     for latent in latents:

@@ -62,7 +62,8 @@ def simulate(
     motion = kind.motion(motion_rng, kind.duration_s)
     drawn = _mount(mount_rng, kind.lever_m)
     X = drawn if T_parent_child is None else T_parent_child
-    Ts, twists = motion.at(times_s), motion.twists(times_s)
+    Ts = motion.at(times_s)
+    twists = motion.twists(times_s)
     to_child = se3.adjoint(se3.inverse(X))
     parent = draw(kind.parent, Ts, twists, dt, parent_rng)
     child = draw(kind.child, Ts @ X, twists @ to_child.T, dt, child_rng)

@@ -8,7 +8,8 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 
 # Medians of chi-squared with 6 and 3 degrees of freedom.
-MEDIAN_6, MEDIAN_3 = 5.348, 2.366
+MEDIAN_6 = 5.348
+MEDIAN_3 = 2.366
 
 # Intervals that are meant to cover so much.
 COVERAGE = 0.90

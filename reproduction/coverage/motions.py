@@ -30,7 +30,8 @@ class Motion:
     def twists(self, times_s: FloatArray) -> FloatArray:
         """Twists (M, 6) in the body's frame at times (M,): m/s and rad/s."""
         step = 1.0 / _RATE
-        before, after = self.at(times_s - step), self.at(times_s + step)
+        before = self.at(times_s - step)
+        after = self.at(times_s + step)
         return se3.log(se3.inverse(before) @ after) / (2.0 * step)
 
 

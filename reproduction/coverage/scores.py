@@ -223,7 +223,9 @@ def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:
     """Error (6,) of a closed chain of answers, first parent to last child, with its covariance
     (6, 6), both in the frame of the last child. Scales are those of the parents in turn.
     """
-    closed, covariance, scale = np.eye(4), np.zeros((6, 6)), 1.0
+    closed = np.eye(4)
+    covariance = np.zeros((6, 6))
+    scale = 1.0
     for one in answers:
         T = one.T_parent_child.copy()
         T[:3, 3] *= scale

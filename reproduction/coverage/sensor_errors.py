@@ -62,8 +62,10 @@ class Tail:
 
 def _bursts(rng: np.random.Generator, count: int, share: float, length: float) -> BoolArray:
     """Whether each pose (N,) lies in a burst; bursts last ``length`` poses on average."""
-    inside, flags = False, np.empty(count, dtype=bool)
-    leave, enter = 1.0 / length, share / (1.0 - share) / length
+    inside = False
+    flags = np.empty(count, dtype=bool)
+    leave = 1.0 / length
+    enter = share / (1.0 - share) / length
     for i, draw in enumerate(rng.random(count)):
         inside = bool(draw >= leave if inside else draw < enter)
         flags[i] = inside
@@ -77,7 +79,8 @@ def mixture_information(share: float, factor: float, dimensions: int = 6) -> flo
     r = np.linspace(1e-6, 8.0 * factor + 8.0, 400_000)
     core = (1.0 - share) * np.exp(-0.5 * r**2)
     wide = share * factor**-dimensions * np.exp(-0.5 * (r / factor) ** 2)
-    density, slope = core + wide, r * (core + wide / factor**2)
+    density = core + wide
+    slope = r * (core + wide / factor**2)
     seen = density > 1e-300
     weight = r[seen] ** (dimensions - 1)
     total = np.sum(weight * density[seen])
@@ -155,7 +158,8 @@ def _white(
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """White errors (N, 6) and their inverse Fisher information (N, 6, 6)."""
-    factors, known = np.ones(len(twists)), np.ones(len(twists))
+    factors = np.ones(len(twists))
+    known = np.ones(len(twists))
     if errors.tail is not None:
         factors = errors.tail.draw(tail_rng, len(twists), dt)
         known = factors**2 if errors.tail.kind == "bursts" else known / errors.tail.information()

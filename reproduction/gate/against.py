@@ -80,12 +80,14 @@ def row(cases: list[Case], found: list[Any], others: dict[str, list[Any]]) -> di
         ratios = np.exp(np.nanmean(logs, axis=0)) if logs else [np.nan] * 2
         cells[f"over {name}"] = " ".join(f"{ratio:.2f}" for ratio in ratios)
     inside: list[list[bool]] = [[], []]
-    squares, nees = [], []
+    squares = []
+    nees = []
     for case, one in zip(cases, found, strict=True):
         if one is None:
             continue
         to_parent = np.kron(np.eye(2), one[0][:3, :3])
-        off, told = deviation(one[0], case.T_parent_child), one[3] & np.isfinite(case.sigmas)
+        off = deviation(one[0], case.T_parent_child)
+        told = one[3] & np.isfinite(case.sigmas)
         for index, covariance in enumerate(one[1:3]):
             variances = np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
             inside[index] += [*(np.abs(off) < _90_PERCENT * np.sqrt(variances))[told]]

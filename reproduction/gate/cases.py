@@ -84,7 +84,8 @@ def _pieces(
     recording: Recording, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Trajectory, Trajectory]]:
     """Random pieces of a recording; those with too few poses are left out."""
-    parent, child = recording.parent, recording.child
+    parent = recording.parent
+    child = recording.child
     first_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
     length_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1]) - first_ns
     for _ in range(count):

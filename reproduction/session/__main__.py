@@ -21,7 +21,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = study_parser("reproduction.session", __doc__)
     add = parser.add_argument
     add("study", choices=tuple(STUDIES))
-    out, about = Path("reproduced"), "where results are kept; they are not solved again"
+    out = Path("reproduced")
+    about = "where results are kept; they are not solved again"
     add("--rows", metavar="DIR", type=Path, default=out, help=f"{about}. Default: {out}")
     add("--seeds", type=int, default=4, help="recordings of a class. Default: 4")
     add("--first-seed", type=int, default=0, help="fresh recordings. Default: 0")
@@ -57,7 +58,8 @@ def _stop(arguments: argparse.Namespace) -> str:
 def _together(arguments: argparse.Namespace) -> str:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     tasks = {f"{name} {seed}": (name, seed) for name in together.SIMULATED for seed in seeds}
-    path, jobs = arguments.rows / "together_simulated.jsonl", arguments.jobs
+    path = arguments.rows / "together_simulated.jsonl"
+    jobs = arguments.jobs
     simulated = kept(path, together.simulated, tasks, jobs)
     rigs = [rig for rig in _rigs(arguments) if not rig.is_refused and len(rig.recordings) > 1]
     recorded = {f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings}

@@ -28,7 +28,8 @@ SHIFTED = {
     "car": ("car_ins_lidar", "car_two_slams"),
 }
 SHIFTS = {"0.5 deg": np.radians(0.5), "2 deg": np.radians(2.0), "1 cm": 0.01, "5 cm": 0.05}
-_BEFORE_S, _AFTER_S = 900.0, 1800.0
+_BEFORE_S = 900.0
+_AFTER_S = 1800.0
 
 # The monitor takes no more poses a second than this.
 _RATE_HZ = 10.0
@@ -113,7 +114,8 @@ def alarm_table(found: Sequence[Watched]) -> str:
                 "about x, y, z (deg)": triple(np.degrees(visible[3:]), form=".2g"),
             }
         )
-    hours, alarms = sum(each.hours for each in found), sum(each.alarms for each in found)
+    hours = sum(each.hours for each in found)
+    alarms = sum(each.alarms for each in found)
     return (
         f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
         f"ten minutes of any of them would show nine times out of ten.\n\n{markdown_table(rows)}"

@@ -138,7 +138,8 @@ def _until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
 
 def _stopped(recorded: Recorded, steps: Sequence[Step], factor: float) -> Stop:
     """Let the goal judge the results of a recording in turn."""
-    goal, is_stuck = Goal(factor * TARGET), False
+    goal = Goal(factor * TARGET)
+    is_stuck = False
     worst: list[float] = []
     for step in steps:
         progress = goal.add(step.calibration, step.seen)

@@ -24,10 +24,12 @@ from reproduction.writing import markdown_table
 # Simulated rigs: recordings of so many seconds, whose mounts differ by this (m, rad) per axis times
 # a factor between 1/2 and 2 that is drawn for each rig.
 SIMULATED = ("hand_vio_walk", "agv_ramps", "drone_gnss_vio", "car_ins_lidar")
-_SECONDS, _RECORDINGS = 90.0, 6
+_SECONDS = 90.0
+_RECORDINGS = 6
 _SCATTER = np.repeat([0.008, np.radians(0.12)], 3)
 # A recording that does not belong: of a mount that was knocked, in a direction that is drawn.
-_KNOCK_M, _KNOCK_RAD = 0.05, np.radians(2.0)
+_KNOCK_M = 0.05
+_KNOCK_RAD = np.radians(2.0)
 _NORMAL_90 = 1.645
 
 
@@ -48,13 +50,15 @@ def simulated(name: str, seed: int) -> dict[str, Any]:
     rng = np.random.default_rng((31, seed, sorted(CLASSES).index(name)))
     X = simulate(dataclasses.replace(kind, duration_s=5.0), (32, seed)).T_parent_child
     scatter = 2.0 ** rng.uniform(-1.0, 1.0) * _SCATTER
-    results, own = {}, {}
+    results = {}
+    own = {}
     for number in range(_RECORDINGS):
         made = simulate(kind, (33, seed, number, sorted(CLASSES).index(name)), X)
         found = calibrate(made.parent, made.child, checks=False)
         moved = se3.exp(scatter * rng.standard_normal(6))
         found = dataclasses.replace(found, T_parent_child=found.T_parent_child @ moved)
-        results[str(number)], own[str(number)] = found.to_dict(), (X @ moved).tolist()
+        results[str(number)] = found.to_dict()
+        own[str(number)] = (X @ moved).tolist()
     return {"results": results, "truth": X.tolist(), "own": own}
 
 
@@ -101,10 +105,12 @@ def tables(rigs: Sequence[Recorded], seed: int) -> str:
             accused += said is not None and said.kind in ("one off", "moved")
             foreign = str(rng.choice([*some]))
             out = _left_out(dict(some) | {foreign: _knocked(some[foreign], rng)})
-            cases, named = cases + 1, named + (out == {foreign})
+            cases = cases + 1
+            named = named + (out == {foreign})
             wrong += bool(out - {foreign})
         for couple in combinations(each.results.values(), 2):
-            pairs, moved = pairs + 1, moved + (compare(couple).verdict == "moved")
+            pairs = pairs + 1
+            moved = moved + (compare(couple).verdict == "moved")
     return (
         f"{markdown_table(rows)}\n\nOf {cases} sets of three or six recordings, one of them with "
         f"the mount knocked by {100 * _KNOCK_M:g} cm and {np.degrees(_KNOCK_RAD):g} deg, that one "

@@ -27,13 +27,16 @@ from hand_eye_calib.formats.trajectory_files.table import write_trajectory
 FORMATS = ("mcap", "sqlite3", "rosbag1", "tum", "kitti", "euroc", "csv", "journal")
 N_INPUTS = int(os.environ.get("FUZZ_INPUTS", 24 * len(FORMATS))) // len(FORMATS)
 FIRST_SEED = 1 if N_INPUTS == 24 else 1000
-LONGEST_S, LARGEST_MB, LONGEST_LINE = 10.0, 1000.0, 20_000
+LONGEST_S = 10.0
+LARGEST_MB = 1000.0
+LONGEST_LINE = 20_000
 
 SOLVE = ("--method", "park", "--reference", "B3", "--scale", "1", "--time-offset", "0", "--json",
          "--parent-frame", "a", "--child-frame", "b")  # fmt: skip
 TOPICS = ("--parent-topic", "/a", "--child-topic", "/b")
 POSES = wandering_poses(60)
-PARENT, CHILD = as_trajectory(POSES), as_trajectory(disturbed(child_of(POSES), 1, 1e-3, 1e-3))
+PARENT = as_trajectory(POSES)
+CHILD = as_trajectory(disturbed(child_of(POSES), 1, 1e-3, 1e-3))
 ODD = ("", "nan", "inf", "-inf", "1e400", "1e154", "-1e300", "0x10", "1_0", "1e-400", "abc", "--",
        "9" * 400, "1e999999999", "-0", "1,5", '"', "\0", "\x1b[2J", "١", "5e-324", "#", "1" * 5000,
        "# t x y z", ",,,,,,,", "\t", " " * 1000, "\ufeff", '"1\n2"', "\x0c", "\x85")  # fmt: skip
@@ -46,7 +49,8 @@ def text_of(format):
     if format == "kitti":
         return "\n".join(" ".join(map(repr, T[:3].ravel().tolist())) for T in POSES), stamps
     if format == "euroc":
-        stamps, rows = PARENT.stamps_ns.tolist(), [[*row[:3], row[6], *row[3:6]] for row in rows]
+        stamps = PARENT.stamps_ns.tolist()
+        rows = [[*row[:3], row[6], *row[3:6]] for row in rows]
     separator = " " if format == "tum" else ","
     lines = [separator.join(map(str, row)) for row in np.c_[stamps, rows].tolist()]
     return "\n".join(["t,x,y,z,qx,qy,qz,qw"] * (format == "csv") + lines), stamps
@@ -82,8 +86,11 @@ def whole(format):
 def damaged(chance, data):
     """Bytes with some changed, left out or repeated."""
     for _ in range(chance.choice([1, 1, 3, 30])):
-        place, length = chance.randrange(len(data) + 1), chance.choice([1, 1, 8, 1000])
-        before, piece, after = data[:place], data[place : place + length], data[place + length :]
+        place = chance.randrange(len(data) + 1)
+        length = chance.choice([1, 1, 8, 1000])
+        before = data[:place]
+        piece = data[place : place + length]
+        after = data[place + length :]
         flipped = bytes(byte ^ 1 << chance.randrange(8) for byte in piece)
         data = before + chance.choice([flipped, flipped, b"", piece * 2, bytes(length)]) + after
     return data[: chance.randrange(len(data) + 1)] if chance.random() < 0.3 else data
@@ -91,7 +98,8 @@ def damaged(chance, data):
 
 def rewritten(chance, data):
     """Text with some words and lines exchanged for others."""
-    lines, rate = data.decode().splitlines(), chance.choice([0.0003, 0.004, 0.05])
+    lines = data.decode().splitlines()
+    rate = chance.choice([0.0003, 0.004, 0.05])
     for k, line in enumerate(lines):
         separator = "," if "," in line else " "
         words = [chance.choice(ODD) if chance.random() < rate else w for w in line.split(separator)]
@@ -103,7 +111,8 @@ def rewritten(chance, data):
 
 def exercise(run, format, seed, folder):
     """Exit code of a command on an input made from a seed."""
-    chance, files = random.Random(f"{format} {seed}"), {}
+    chance = random.Random(f"{format} {seed}")
+    files = {}
     is_text = format not in ("mcap", "sqlite3", "rosbag1")
     for name, data in whole(format).items():
         change = rewritten if is_text and chance.random() < 0.7 else damaged

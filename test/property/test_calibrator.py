@@ -20,7 +20,8 @@ def both(apart_ns):
     return messages("parent", parent) + messages("child", child)
 
 
-MESSAGES, TOGETHER = both(30_000_000), both(0)
+MESSAGES = both(30_000_000)
+TOGETHER = both(0)
 
 
 def estimate(sequence):

@@ -33,7 +33,8 @@ def test_exp_agrees_with_the_matrix_exponential(xi):
     from scipy.linalg import expm
 
     generator = np.zeros((4, 4))
-    generator[:3, :3], generator[:3, 3] = se3.skew(xi[3:]), xi[:3]
+    generator[:3, :3] = se3.skew(xi[3:])
+    generator[:3, 3] = xi[:3]
     assert se3.exp(xi) == pytest.approx(expm(generator), abs=1e-11 * (1 + np.abs(xi).max()))
 
 
@@ -79,10 +80,8 @@ def test_conversions_agree_with_scipy(direction, angle):
         rtol=0,
     )
     assert se3.rotation_exp(rotation.as_rotvec()) == pytest.approx(rotation.as_matrix(), abs=1e-14)
-    found, expected = (
-        se3.to_quat_xyzw(rotation.as_matrix()),
-        Rotation.from_matrix(rotation.as_matrix()).as_quat(),
-    )
+    found = se3.to_quat_xyzw(rotation.as_matrix())
+    expected = Rotation.from_matrix(rotation.as_matrix()).as_quat()
     assert found[3] >= 0.0
     np.testing.assert_allclose(found * np.sign(found @ expected), expected, atol=1e-14, rtol=0)
 

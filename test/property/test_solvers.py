@@ -160,7 +160,8 @@ def test_order_of_the_pairs_does_not_matter(method, seed, truth, order):
     pairs = motion_pairs(
         *trajectories(seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0), "B1"
     )
-    ours, reordered = Method(method).solve(pairs), Method(method).solve(pairs[np.array(order)])
+    ours = Method(method).solve(pairs)
+    reordered = Method(method).solve(pairs[np.array(order)])
     np.testing.assert_allclose(reordered.T_parent_child, ours.T_parent_child, atol=1e-6)
     assert reordered.objective == pytest.approx(ours.objective, rel=1e-6, abs=1e-12)
 

@@ -97,7 +97,8 @@ def few_levels(monkeypatch):
 @pytest.fixture
 def one_error_figure(monkeypatch):
     """Draw the first of the eight figures of errors only: they take as long as all the solves."""
-    drawn, draw = [], paper_figures.draw_errors
+    drawn = []
+    draw = paper_figures.draw_errors
 
     def draw_first(*arguments):
         if not drawn:

@@ -251,7 +251,8 @@ def fault_table(every=1):
     recordings = real_data.all_recordings()
     table = {}
     for index, recording in enumerate(recordings):
-        parent, child = recording.parent, recording.corrected()
+        parent = recording.parent
+        child = recording.corrected()
         other = recordings[(index + 5) % len(recordings)]
         expected = REALLY_THERE.get(recording.name, set()) | REALLY_THERE.get(other.name, set())
         cells = {CLEAN: found_codes(parent, child)}

@@ -86,7 +86,8 @@ def test_messages_carry_frames_stamp_and_transform():
 
 def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
     """A late subscriber gets what the page says, not an older pose."""
-    made, gone = [], []
+    made = []
+    gone = []
 
     def create(kind, name, qos):
         sent = []

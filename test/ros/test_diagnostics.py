@@ -59,13 +59,15 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
 def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     start_node("-r __ns:=/robot1", "-p target.translation:=0.03")
     start_node("-r __node:=other")
-    statuses, states = peer.diagnostics(), []
+    statuses = peer.diagnostics()
+    states = []
     topic = "/robot1/calibrator/progress"
     peer.node.create_subscription(String, topic, states.append, LATCHED)
     peer.spin_until(lambda: states and len(statuses) == 2 * len(PARTS), "both nodes")
     names = [f"{node}: {part}" for node in ("/robot1/calibrator", "/other") for part in PARTS]
     assert set(statuses) == set(names)
-    said, document = statuses["/robot1/calibrator: progress"], json.loads(states[-1].data)
+    said = statuses["/robot1/calibrator: progress"]
+    document = json.loads(states[-1].data)
     assert said.message == document["progress"]["text"]
     values = values_of(said)
     assert (said.level, said.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
@@ -110,7 +112,8 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     later_ns = itertools.count(int(stamps_ns[-1]), 10**8)
 
     def only_the_parent_goes_on(each):
-        stamp_ns, child = next(later_ns), each.inputs["child"]
+        stamp_ns = next(later_ns)
+        child = each.inputs["child"]
         publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[-1], "lidar"))
         return child.level is Level.WARN and "silent for" in child.text
 

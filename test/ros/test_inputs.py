@@ -103,7 +103,8 @@ def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(start_
 def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, peer):
     node = start_node(*QUIET, before="pass")
     peer.solve(peer.publishers(), *drive())
-    heard, statuses = peer.listen(TransformStamped, "extrinsic"), peer.diagnostics()
+    heard = peer.listen(TransformStamped, "extrinsic")
+    statuses = peer.diagnostics()
     peer.spin_until(lambda: heard, "the result of before")
 
     def wait_until(is_solving):
@@ -226,7 +227,8 @@ class TestLoss:
         topics = "/lidar/odom", "child_odom"
         publishers = [peer.node.create_publisher(Odometry, topic, qos) for topic in topics]
         made = [message(Odometry, START_NS, each[0], "lidar") for each in drive(1)[1:]]
-        n_sent, calls = 0, itertools.count()
+        n_sent = 0
+        calls = itertools.count()
 
         def send(count):
             """Quick: a node that is stopped for longer than 20 s is forgotten."""

@@ -130,7 +130,8 @@ LIDAR = se3.from_rotation_translation(se3.rotation_from_rpy([0.1, 0.0, 0.5]), [1
 def edge(parent, child, T):
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
-    place, rotation = message.transform.translation, message.transform.rotation
+    place = message.transform.translation
+    rotation = message.transform.rotation
     place.x, place.y, place.z = T[:3, 3].tolist()
     rotation.x, rotation.y, rotation.z, rotation.w = se3.to_quat_xyzw(T).tolist()
     return message
@@ -141,12 +142,14 @@ class Heard:
 
     def __init__(self, monkeypatch, **options):
         monkeypatch.setattr(module, "message_type", lambda: object)
-        self.lines, self._callbacks = [], []
+        self.lines = []
+        self._callbacks = []
         logger = SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), self.lines.append))
         log = NodeLog(logger)
         tree = RobotTree(self, log)
         tree.listen(STATIC_TOPIC)
-        self.own, self.robot = tree.own, Robot(log, NodeConfig(**options), tree)
+        self.own = tree.own
+        self.robot = Robot(log, NodeConfig(**options), tree)
 
     def create_subscription(self, kind, topic, callback, qos):
         assert topic == "/tf_static"

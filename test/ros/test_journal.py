@@ -129,7 +129,8 @@ def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
     node = start_node(*QUIET, *into(blocked / "out"))
     node.wait_for_log("cannot write the session journal in")
     assert peer.solve(peer.publishers(), *drive())[0].success
-    statuses, name = peer.diagnostics(), "/calibrator: journal"
+    statuses = peer.diagnostics()
+    name = "/calibrator: journal"
     error = "a crash would lose the session"
     peer.spin_until(lambda: name in statuses and error in statuses[name].message, "the status")
     assert statuses[name].level == DiagnosticStatus.ERROR

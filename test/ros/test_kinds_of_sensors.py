@@ -23,7 +23,8 @@ def fixes(stamps_ns, positions):
     rows = zip(stamps_ns.tolist(), *geodetic(positions, ORIGIN), strict=True)
     for index, (stamp_ns, *place) in enumerate(rows):
         fix = NavSatFix()
-        fix.header.stamp, fix.header.frame_id = conversions.to_time(stamp_ns), "antenna"
+        fix.header.stamp = conversions.to_time(stamp_ns)
+        fix.header.frame_id = "antenna"
         fix.latitude, fix.longitude, fix.altitude = place
         fix.status.status = -1 if index % 20 == 19 else 0
         yield fix
@@ -72,8 +73,11 @@ def imu_messages(stamps_ns, Ts_cw_c):
     rates = np.concatenate([rates[:1], 0.5 * (rates[1:] + rates[:-1]), rates[-1:]])
     for stamp_ns, (x, y, z) in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
         imu = Imu()
-        imu.header.stamp, imu.header.frame_id = conversions.to_time(stamp_ns), "imu_link"
-        imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = x, y, z
+        imu.header.stamp = conversions.to_time(stamp_ns)
+        imu.header.frame_id = "imu_link"
+        imu.angular_velocity.x = x
+        imu.angular_velocity.y = y
+        imu.angular_velocity.z = z
         yield imu
 
 

@@ -241,7 +241,8 @@ def installed_is_used(start_node, peer, tmp_path):
 def enabled_is_used(start_node, peer, tmp_path):
     node = start_node(*QUIET, "-p enabled:=false")
     node.wait_for_log("no poses are accepted before ~/set_enabled")
-    statuses, inputs = peer.diagnostics(), ("parent", "child")
+    statuses = peer.diagnostics()
+    inputs = ("parent", "child")
     peer.feed(peer.publishers(), *ros_harness.drive(10))
 
     def ignored():

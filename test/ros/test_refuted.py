@@ -41,7 +41,8 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_nod
         f"-p output_directory:={directory}",
         *RELIABLE_INPUTS,
     )
-    publishers, statuses = peer.publishers(), peer.diagnostics()
+    publishers = peer.publishers()
+    statuses = peer.diagnostics()
     states = peer.listen(String, "progress")
     stamps_ns, Ts_pw_p, Ts_cw_c = drive_over_ramps()
     _, early = peer.solve(publishers, stamps_ns[:100], Ts_pw_p[:100], Ts_cw_c[:100])
@@ -84,7 +85,8 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_nod
 
 def test_a_prior_that_is_removed_gives_the_result_of_the_same_poses_back(start_node, peer):
     start_node("-p solve_period:=0.2", f"-p prior.z:={WRONG_Z:.3f}+/-0.02", *RELIABLE_INPUTS)
-    publishers, statuses = peer.publishers(), peer.diagnostics()
+    publishers = peer.publishers()
+    statuses = peer.diagnostics()
     extrinsics = peer.listen(TransformStamped, "extrinsic")
     peer.feed(publishers, *drive_over_ramps())
     standing = lambda: values_of(statuses["/calibrator: extrinsic"]).get("standing")  # noqa: E731

@@ -19,7 +19,8 @@ FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
 
 def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     node = start_node("-p solve_period:=0.2", *RELIABLE_INPUTS)
-    extrinsics, told = peer.listen(TransformStamped, "extrinsic"), []
+    extrinsics = peer.listen(TransformStamped, "extrinsic")
+    told = []
     poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
     peer.node.create_subscription(String, "calibrator/progress", told.append, conversions.LISTENING)
     peer.feed(peer.publishers(), *drive())
@@ -96,7 +97,8 @@ def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, pee
 
 
 def test_two_nodes_of_one_name_are_told_and_one_topic_for_two_inputs_is_refused(start_node):
-    first, _ = start_node(), start_node()
+    first = start_node()
+    _ = start_node()
     first.wait_for_log("another node is called /calibrator, too")
     refused = start_node("-r parent_odom:=/odom", "-r child_odom:=/odom", "-r __node:=third")
     assert refused.wait() == 1

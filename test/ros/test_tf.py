@@ -88,8 +88,10 @@ class TestNode:
         self, start_node, peer, listen, robot, tmp_path
     ):
         robot(("base_link", "lidar"))
-        heard, extrinsics = listen(), peer.listen(TransformStamped, "extrinsic")
-        states, said = peer.listen(String, "progress"), peer.diagnostics()
+        heard = listen()
+        extrinsics = peer.listen(TransformStamped, "extrinsic")
+        states = peer.listen(String, "progress")
+        said = peer.diagnostics()
         start_node(
             "-p publish_tf:=true", "-p solve_period:=1000.0", f"-p output_directory:={tmp_path}",
             *RELIABLE_INPUTS,
@@ -106,7 +108,8 @@ class TestNode:
             is_faulty = newest is not None and values_of(newest)["is_faulty"] == "true"
             return newest.message if is_faulty else ""
 
-        publishers, poses = peer.publishers(), drive(450)
+        publishers = peer.publishers()
+        poses = drive(450)
         peer.solve(publishers, *(part[:400] for part in poses))
         early = "the goal is not reached"
         is_early = lambda: said and state(key="tf_static_reason") == early  # noqa: E731

@@ -31,7 +31,8 @@ def test_what_is_no_state_is_left_out_and_control_characters_are_escaped():
 def test_of_ten_thousand_names_on_the_network_a_few_are_kept():
     heard = []
     watcher = Watcher.__new__(Watcher)
-    watcher._board, watcher._heard = Board(), set()
+    watcher._board = Board()
+    watcher._heard = set()
     topics = [(f"/n{k}/progress", ["std_msgs/msg/String"]) for k in range(10_000)]
     watcher._node = SimpleNamespace(
         get_topic_names_and_types=lambda: topics,
@@ -45,7 +46,8 @@ class Watch:
     """``python -m hand_eye_calib watch`` with its lines and notes in files."""
 
     def __init__(self, domain, directory, *arguments):
-        self.seen, self.notes = directory / "seen.txt", directory / "notes.txt"
+        self.seen = directory / "seen.txt"
+        self.notes = directory / "notes.txt"
         with self.seen.open("w") as seen, self.notes.open("w") as notes:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "hand_eye_calib", "watch", *arguments],
@@ -86,7 +88,8 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     watch.wait_for("NO NODE: Nothing heard of a calibrator yet")
     node = start_node(*QUICK, f"-p output_directory:={tmp_path / 'out'}")
     watch.wait_for("CHECK INPUT: No message on /parent_odom yet")
-    publishers, poses = peer.publishers(), drive(180, 300_000_000, sigma_rad=7e-4)
+    publishers = peer.publishers()
+    poses = drive(180, 300_000_000, sigma_rad=7e-4)
     parts = [[part[start:end] for part in poses] for start, end in ((0, 90), (90, 130), (130, 180))]
     peer.solve(publishers, *parts[0])  # 27 s of motion are not enough
     watch.wait_for("▶ GO ON: ")

@@ -54,9 +54,11 @@ def biased(poses, bias):
 
 def systematic(parent, nuisance, parameters):
     """Poses of parent and child with systematic errors built in."""
-    child, (kind, _, time) = child_of(parent), nuisance.partition("+")
+    child = child_of(parent)
+    kind, _, time = nuisance.partition("+")
     if kind == "time" or time:
-        child, parameters = late(child, parameters[-1]), parameters[:-1]
+        child = late(child, parameters[-1])
+        parameters = parameters[:-1]
     if kind == "scale":
         child[:, :3, 3] /= 1 + parameters[0]
     elif kind == "bias":
@@ -146,7 +148,8 @@ def test_the_walk_of_a_long_recording_is_found_from_bursts_far_apart():
 
 def lasting(seed, n_poses, sigmas, tau_poses):
     """Gauss-Markov errors (N, 6) of these standard deviations and correlation time."""
-    random, phi = np.random.default_rng(seed), np.exp(-1.0 / tau_poses)
+    random = np.random.default_rng(seed)
+    phi = np.exp(-1.0 / tau_poses)
     errors = random.normal(size=(n_poses, 6)) * np.repeat(sigmas, 3)
     for i in range(1, n_poses):
         errors[i] = phi * errors[i - 1] + np.sqrt(1 - phi**2) * errors[i]
@@ -155,7 +158,8 @@ def lasting(seed, n_poses, sigmas, tau_poses):
 
 @pytest.mark.parametrize("kind", ["body", "world", "path"])
 def test_errors_that_last_are_found_and_told_apart(kind):
-    squared, kinds = [], []
+    squared = []
+    kinds = []
     part, sigma, tau = ("direction", 0.1, 4) if kind == "path" else ("translation", 0.02, 20)
     for seed in range(4):
         parent, child = noisy_drive(seed, n_poses=600, white=(0.001, 0.001))
@@ -165,7 +169,8 @@ def test_errors_that_last_are_found_and_told_apart(kind):
             of_parts = [se3.times(back, each) for each in np.split(errors, 2, axis=1)]
             parent = parent @ se3.exp(np.concatenate(of_parts, axis=1))
         elif kind == "path":
-            steps, turns = se3.inverse(child[:-1]) @ child[1:], np.roll(errors[1:], 3, axis=1)
+            steps = se3.inverse(child[:-1]) @ child[1:]
+            turns = np.roll(errors[1:], 3, axis=1)
             steps[:, :3, 3] = se3.times(se3.exp(turns)[:, :3, :3], steps[:, :3, 3])
             child = walked(steps, child[0])
         else:
@@ -232,7 +237,8 @@ def noisy_and_solved(nuisance, seed):
 
 @pytest.mark.parametrize("nuisance", VALUES)
 def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
-    chosen, parameters = [], []
+    chosen = []
+    parameters = []
     of = [index for name in nuisance.split("+") for index in increments.PARAMETERS.get(name, ())]
     for seed in range(4):
         _, solution = noisy_and_solved(nuisance, seed)
@@ -279,7 +285,8 @@ def test_poses_wrong_by_themselves_are_bridged():
 
 
 def test_heavy_tails_leave_the_answer_near():
-    random, errors = np.random.default_rng(3), []
+    random = np.random.default_rng(3)
+    errors = []
     for seed in range(6):
         parent = wandering_poses(200, seed)
         tails = np.sqrt(3 / random.chisquare(3, (2, 200, 1)))

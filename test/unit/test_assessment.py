@@ -42,7 +42,8 @@ def errors_and_covariances(n_runs, estimate):
     """Errors xi against the truth (R, 6) and covariances (R, 6, 6) over independent noise."""
     parent = motions.wandering_poses(120)
     child = motions.child_of(parent)
-    errors, covariances = [], []
+    errors = []
+    covariances = []
     for run in range(n_runs):
         solution, covariance = estimate(
             motions.disturbed(parent, 2 * run, 0.005, 0.005),

@@ -158,7 +158,8 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
         bag_making.write_compressed(path, LONG)
     else:
         write_bag(path, LONG, kind)
-    whole, file = bag_making.all_poses(path), bag_making.storage_file(path)
+    whole = bag_making.all_poses(path)
+    file = bag_making.storage_file(path)
     (path / "metadata.yaml").unlink()
     size = file.stat().st_size
     for share in (0.9, 0.5, 0.3, 0.04):  # the last in the first chunk
@@ -316,7 +317,8 @@ def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, kind):
 def test_readings_in_several_threads_leave_no_limit_behind(monkeypatch):
     monkeypatch.setattr(files, "_is_limited", True)
     before = resource.getrlimit(resource.RLIMIT_AS)
-    first, second = files.reading_memory(), files.reading_memory()
+    first = files.reading_memory()
+    second = files.reading_memory()
     with first:
         second.__enter__()
         assert resource.getrlimit(resource.RLIMIT_AS) != before

@@ -353,7 +353,8 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     """Recordings of rosbag, rosbag2 and others: split, converted, compressed, unsorted, empty, of
     wrong formats.
     """
-    folder, suffixes = data_folder() / "bags", (".bag", ".mcap", ".db3")
+    folder = data_folder() / "bags"
+    suffixes = (".bag", ".mcap", ".db3")
     paths = [p for p in folder.rglob("*") if p.suffix in suffixes or (p / "metadata.yaml").exists()]
     refused = {}
     for path in paths:

@@ -11,7 +11,8 @@ from hand_eye_calib.core.base.blocks import (
     solve,
 )
 
-N_ROWS, N_BLOCKS = 37, 5
+N_ROWS = 37
+N_BLOCKS = 5
 
 
 @pytest.fixture

@@ -38,7 +38,8 @@ from hand_eye_calib.offline.cli.present import as_lines
 pytestmark = pytest.mark.usefixtures("no_figures")
 
 ODOMETRY = "nav_msgs/msg/Odometry"
-PARENT_TOPIC, CHILD_TOPIC = "/lidar/odom", "/camera/odom"
+PARENT_TOPIC = "/lidar/odom"
+CHILD_TOPIC = "/camera/odom"
 TOPICS = ["--parent-topic", PARENT_TOPIC, "--child-topic", CHILD_TOPIC]
 START_NS = 1_700_000_000_000_000_000
 TRUTH = se3.exp(np.array([0.4, -0.1, 0.25, 0.3, -0.2, 1.1]))
@@ -52,9 +53,11 @@ def drive(count=120, planar=False, first_ns=START_NS):
     """
     time = 0.1 * np.arange(count)
     twists = np.zeros((count, 6))
-    twists[:, 0], twists[:, 5] = 0.1, 0.08 * np.sin(0.9 * time)
+    twists[:, 0] = 0.1
+    twists[:, 5] = 0.08 * np.sin(0.9 * time)
     if not planar:
-        twists[:, 3], twists[:, 4] = 0.05 * np.sin(1.7 * time), 0.06 * np.cos(1.3 * time)
+        twists[:, 3] = 0.05 * np.sin(1.7 * time)
+        twists[:, 4] = 0.06 * np.cos(1.3 * time)
     stamps_ns = first_ns + 100_000_000 * np.arange(count)
     parent = Trajectory(stamps_ns, walked(se3.exp(twists[1:])), "lidar", "map")
     child = disturbed(OTHER_WORLD @ parent.poses @ TRUTH, 1, *NOISE)

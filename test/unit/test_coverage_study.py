@@ -69,7 +69,8 @@ def test_information_of_heavy_tails():
     # Spikes far out are seen for what they are, and lost.
     assert sensor_errors.mixture_information(0.1, 100.0) == pytest.approx(0.9, abs=0.01)
     assert sensor_errors.Tail("student", factor=1e6).information() == pytest.approx(1.0, abs=1e-5)
-    tail, rng = sensor_errors.Tail("student", factor=3.0), np.random.default_rng(0)
+    tail = sensor_errors.Tail("student", factor=3.0)
+    rng = np.random.default_rng(0)
     draws = np.array(tail.draw(rng, 20_000, 0.1))
     x = draws.reshape(-1, 1) * rng.standard_normal((20_000, 6))
     scores = 9.0 * x[:, 0] / (3.0 + np.sum(x**2, axis=1))
@@ -83,7 +84,9 @@ def test_recordings_of_a_class_repeat_and_differ():
     none = sensor_errors.SensorErrors(white=sensor_errors.sigmas(1e-9, 1e-9))
     exact = dataclasses.replace(SMALL, parent=none, child=none)
     recording = classes.simulate(exact, 0)
-    X, parent, child = recording.T_parent_child, recording.parent.poses, recording.child.poses
+    X = recording.T_parent_child
+    parent = recording.parent.poses
+    child = recording.child.poses
     A, B = (se3.inverse(poses[0]) @ poses[-1] for poses in (parent, child))
     np.testing.assert_allclose(A @ X, X @ B, atol=1e-6)
 

@@ -150,7 +150,8 @@ def test_a_straight_start_is_no_mount_that_turned_about_the_direction_of_travel(
 def gentle_ramps(degrees):
     """Streams of a vehicle that pitches, and rolls half as much, by so many degrees."""
     k = np.arange(500)
-    rolled, pitched = np.radians(degrees / 2) * np.sin(k / 31), np.radians(degrees) * np.sin(k / 40)
+    rolled = np.radians(degrees / 2) * np.sin(k / 31)
+    pitched = np.radians(degrees) * np.sin(k / 40)
     turned = 1.2 * np.sin(k / 25 + 1.0) + 0.01 * k
     rotation = se3.rotation_from_rpy(np.c_[rolled, pitched, turned])
     position = np.cumsum(0.5 * rotation[:, :, 0], axis=0)

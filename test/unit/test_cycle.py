@@ -99,13 +99,15 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines
 def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minute(cycle):
     for is_asked in (False, False, True):
         cycle._session.calibrator.add_pose("parent", len(cycle.jobs), [0, 0, 0], [0, 0, 0, 1])
-        cycle.is_solving, cycle._asked = False, {}
+        cycle.is_solving = False
+        cycle._asked = {}
         cycle.ask(lambda good, text: None) if is_asked else cycle.start_if_due()
     assert [job.check for job in cycle.jobs] == [False, True, False, True]
 
 
 def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypatch):
-    told, start_s = [], module.time.monotonic()
+    told = []
+    start_s = module.time.monotonic()
     cycle.ask(lambda *answer: told.append(answer))
     cycle.tell_who_waits()
     assert not told

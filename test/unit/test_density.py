@@ -63,7 +63,9 @@ def n_constants(statement):
 
 
 def measured(folder):
-    nodes, lines, constants = 0, 0, 0
+    nodes = 0
+    lines = 0
+    constants = 0
     for path in folder.rglob("*.py"):
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)

@@ -228,7 +228,8 @@ def test_a_file_that_does_not_say_it_is_refused_in_one_line(text, message, tmp_p
 
 
 def test_of_several_cameras_the_named_one_is_read(tmp_path):
-    identity, moved = np.eye(4).tolist(), se3.from_rotation_translation(np.eye(3), [1, 2, 3])
+    identity = np.eye(4).tolist()
+    moved = se3.from_rotation_translation(np.eye(3), [1, 2, 3])
     path = tmp_path / "camchain.yaml"
     path.write_text(
         yaml.safe_dump({"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}})

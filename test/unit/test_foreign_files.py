@@ -26,7 +26,8 @@ from hand_eye_calib.offline.cli.main import main
 N = 40
 TRUTH = as_trajectory(wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000)
 SECONDS = TRUTH.stamps_ns / 1e9
-P, Q = TRUTH.poses[:, :3, 3], se3.to_quat_xyzw(TRUTH.poses)
+P = TRUTH.poses[:, :3, 3]
+Q = se3.to_quat_xyzw(TRUTH.poses)
 VECTORS = se3.rotation_log(TRUTH.poses[:, :3, :3])
 LAT, LON, HEIGHT = geodetic(P - P[0], (48.1, 11.5, 550.0))
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -109,7 +110,8 @@ def of_motive():
 
 def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad", bodies=("drone:drone",)):
     """The second body has twice the positions of the first."""
-    names, n = ("," * (turn.count(",") + 4)).join(bodies), len(bodies)
+    names = ("," * (turn.count(",") + 4)).join(bodies)
+    n = len(bodies)
     head = f"Objects\n10\n,,{names}\nFrame,Sub Frame{f',{turn},TX,TY,TZ' * n}\n"
     poses = [each for k in range(n) for each in (Q if "RW" in turn else VECTORS, P * 1e3 * (k + 1))]
     return of_rows(f"{head},{f',{units},mm,mm,mm' * n}\n", range(N), [0] * N, *poses)
@@ -117,7 +119,9 @@ def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad", bodies=("drone:drone",)):
 
 def of_novatel(short=False):
     """INSPVAX with a long header, or INSPVA with a short one, among other logs."""
-    head, body, log = "%INSPVASA,{0},{1:.3f};{0},{1:.3f},", "{:.12f},{:.12f},{:.9f},1,2,3,", ""
+    head = "%INSPVASA,{0},{1:.3f};{0},{1:.3f},"
+    body = "{:.12f},{:.12f},{:.9f},1,2,3,"
+    log = ""
     if not short:
         head = "#INSPVAXA,COM1,0,7.5,FINESTEERING,{0},{1:.3f},0,4e77,4;INS_SOLUTION_GOOD,INS_PSRSP,"
         body = "{:.12f},{:.12f},{:.9f},45.0,1,2,3,"
@@ -132,7 +136,8 @@ def of_novatel(short=False):
 def of_lio_sam():
     names = "x y z intensity roll pitch yaw time"
     head = f"# .PCD v0.7\nFIELDS {names}\nSIZE 4 4 4 4 4 4 4 8\nTYPE{' F' * 8}\nPOINTS {N}\n"
-    angles, zeros = Rotation.from_quat(Q).as_euler("xyz"), np.zeros(N)
+    angles = Rotation.from_quat(Q).as_euler("xyz")
+    zeros = np.zeros(N)
     return of_rows(f"{head}DATA ascii\n", P, zeros, angles, SECONDS, separator=" ")
 
 
@@ -155,7 +160,8 @@ def of_nuscenes():
     return json.dumps([dict(zip(keys, each, strict=True)) for each in values][::-1], indent=1)
 
 
-STAMPS, WXYZ = TRUTH.stamps_ns, Q[:, [3, 0, 1, 2]]
+STAMPS = TRUTH.stamps_ns
+WXYZ = Q[:, [3, 0, 1, 2]]
 POSE = "tx,ty,tz,qx,qy,qz,qw\n"
 DATES = [f"{each}Z" for each in dates("%Y-%m-%dT%H:%M:%S.%f")]
 MATRICES = TRUTH.poses.reshape(N, 16)
@@ -236,7 +242,8 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
     np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
     expected = TRUTH.poses.copy()
     if trajectory.measures == "positions":
-        expected[:, :3, :3], expected[:, :3, 3] = np.eye(3), P - P[0]
+        expected[:, :3, :3] = np.eye(3)
+        expected[:, :3, 3] = P - P[0]
     np.testing.assert_allclose(trajectory.poses, expected, atol=2e-6)
     assert note in " ".join(found.guesses)
     assert trajectory.measures == ("positions" if name in [*FORMATS][-5:] else "poses")
@@ -299,14 +306,16 @@ def of_ulog(*topics):
         return struct.pack("<HB", len(data), ord(kind)) + data
 
     flip = np.diag([1.0, -1, -1])
-    places, turns = P @ flip, Rotation.from_matrix(flip @ TRUTH.poses[:, :3, :3] @ flip).as_quat()
+    places = P @ flip
+    turns = Rotation.from_matrix(flip @ TRUTH.poses[:, :3, :3] @ flip).as_quat()
     log = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))
     log += b"".join(message("F", f"{name}:{PX4[name]}".encode()) for name in topics)
     for number, name in enumerate(topics):
         log += message("A", struct.pack("<BH", 0, number) + name.encode())
     for k, stamp in enumerate((TRUTH.stamps_ns // 1000).tolist()):
         for number, name in enumerate(topics):
-            place, turn = tuple(places[k]), tuple(np.roll(turns[k], 1))
+            place = tuple(places[k])
+            turn = tuple(np.roll(turns[k], 1))
             form, values = {
                 "vehicle_odometry": ("B7f", (1, *place, *turn)),
                 "vehicle_local_position": ("??3f", (k > 0, True, *place)),

@@ -109,7 +109,8 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
 
 
 def test_the_time_left_only_shrinks_by_one_step_at_a_result():
-    goal, found = Goal(TARGETS), []
+    goal = Goal(TARGETS)
+    found = []
     for motion_s, sigma_m in enumerate((0.03, 0.0142, 0.025, 0.025, 0.02, 0.004, 0.02), 40):
         progress = goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s))
         found.append(seconds_left(progress)[1])
@@ -168,7 +169,8 @@ def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
 
 
 def test_an_axis_that_stays_unobservable():
-    goal, flat = Goal(TARGETS), (0.5, 1.0, 90.0)
+    goal = Goal(TARGETS)
+    flat = (0.5, 1.0, 90.0)
     hidden = result(sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE)
     assert not goal.add(hidden, seen(20.0, flat)).will_not_get_there
     stuck = goal.add(hidden, seen(40.0, flat))

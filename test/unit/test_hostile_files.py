@@ -67,7 +67,8 @@ def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, kind):
     assert len(line) < 1000
 
 
-INF, NAN = float("inf"), float("nan")
+INF = float("inf")
+NAN = float("nan")
 AXES = calibration().to_dict()["observability"]
 SCATTER = {"sigma": 0.1, "of_methods": 0.1, "of_halves": 0.1}
 
@@ -198,7 +199,8 @@ def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     of_one = {True: "1", False: "0.7071067811865476"}["{x}" in row or format == "kitti"]
     for t in range(1, 9):
         lines.append(row.format(t=t, x=value if t == 3 else t, w=value if t == 3 else of_one))
-    path, times = tmp_path / "parent", tmp_path / "times"
+    path = tmp_path / "parent"
+    times = tmp_path / "times"
     path.write_text("\n".join(lines))
     times.write_text("\n".join(map(str, range(1, 9))))
     options = {"times": times} if format == "kitti" else {}

@@ -27,7 +27,8 @@ BOTH = {"parent": {}, "child": {}}
 
 def messages(n_poses=60):
     poses = wandering_poses(n_poses)
-    parent, child = as_trajectory(poses), as_trajectory(child_of(poses))
+    parent = as_trajectory(poses)
+    child = as_trajectory(child_of(poses))
     both = zip(messages_of("parent", parent), messages_of("child", child), strict=True)
     return list(itertools.chain.from_iterable(both))
 
@@ -41,7 +42,8 @@ def record(writer, calibrator, sequence, flush_every=25):
 
 
 def resumed(directory, limits=None):
-    calibrator, journal = Calibrator(CONFIG, limits), read_journal(directory)
+    calibrator = Calibrator(CONFIG, limits)
+    journal = read_journal(directory)
     replay_journal(journal, directory, Calibrators(child=calibrator))
     return calibrator, journal
 
@@ -94,7 +96,8 @@ def test_poses_are_read_in_the_order_in_which_they_came_whatever_their_clocks(tm
 
 
 def test_a_session_goes_on_after_the_last_whole_line(tmp_path):
-    calibrator, sequence = Calibrator(CONFIG), messages()
+    calibrator = Calibrator(CONFIG)
+    sequence = messages()
     writer = JournalWriter(tmp_path, BOTH)
     record(writer, calibrator, sequence[:60])
     writer.close()

@@ -81,7 +81,8 @@ def png(width, height):
             struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         )
 
-    packer, rows = zlib.compressobj(), io.BytesIO()
+    packer = zlib.compressobj()
+    rows = io.BytesIO()
     for _ in range(height):
         rows.write(packer.compress(bytes(width + 1)))
     rows.write(packer.flush())

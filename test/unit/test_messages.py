@@ -31,7 +31,9 @@ def message_of(typestore, message_type, stamp_ns, world, sensor, values):
     def make(name, *parts):
         return typestore.types[f"geometry_msgs/msg/{name}"](*parts)
 
-    head, zero, covariance = header(typestore, stamp_ns, world), [0.0] * 3, np.ones(36)
+    head = header(typestore, stamp_ns, world)
+    zero = [0.0] * 3
+    covariance = np.ones(36)
     quaternion = make("Quaternion", *values[3:])
     pose = make("Pose", make("Point", *values[:3]), quaternion)
     with_covariance = make("PoseWithCovariance", pose, covariance)
@@ -90,7 +92,8 @@ def test_poses_at_once_whether_their_frames_are_alike_or_not(encoding, message_t
 def test_a_damaged_one_of_many_poses_is_refused(encoding):
     pose = (5_000_000_007, "odom", "lidar", [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
     good, is_ros1 = encoded(encoding, ODOMETRY, pose)
-    stamp, frame = bytearray(good), bytearray(good)
+    stamp = bytearray(good)
+    frame = bytearray(good)
     stamp[8:12] = b"\xff\xff\xff\xff"  # four seconds of nanoseconds
     frame[12:16] = b"\xff\xff\xff\xff"  # a frame's name of four gigabytes
     for damaged in (bytes(stamp), bytes(frame), good[:40], b""):

@@ -49,7 +49,8 @@ def test_a_mount_that_stays_raises_no_alarm():
 
 def test_the_size_of_the_chunks_changes_nothing():
     pairs = shifted(motion(300.0), 200.0, 5, np.radians(0.5))
-    (one,), (other,) = fed(pairs, chunk=7)[1], fed(pairs, chunk=600)[1]
+    (one,) = fed(pairs, chunk=7)[1]
+    (other,) = fed(pairs, chunk=600)[1]
     assert one.shift == other.shift
     assert one.raised_ns == other.raised_ns
 

@@ -37,7 +37,8 @@ def test_the_numbers_are_those_of_scipy():
     ],
 )
 def test_a_weight_is_the_slope_of_its_loss_over_the_residual(kind, loss):
-    lengths, step = np.array([0.1, 0.5, 0.9, 1.1, 3.0, 20.0]), 1e-6
+    lengths = np.array([0.1, 0.5, 0.9, 1.1, 3.0, 20.0])
+    step = 1e-6
     slopes = [(loss(length + step) - loss(length - step)) / (2 * step) for length in lengths]
     assert stats.robust_weights(kind, lengths**2) == pytest.approx(slopes / lengths, rel=1e-6)
 
@@ -45,7 +46,8 @@ def test_a_weight_is_the_slope_of_its_loss_over_the_residual(kind, loss):
 @pytest.mark.parametrize(("kind", "within"), [("huber", 1e-3), ("cauchy", 1e-3)])
 def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
     random = np.random.default_rng(1)
-    rows, values = random.normal(size=(200, 3, 2)), np.array([2.0, -0.5])
+    rows = random.normal(size=(200, 3, 2))
+    values = np.array([2.0, -0.5])
     targets = rows @ values + 1e-3 * random.normal(size=(200, 3))
     targets[:40] += 5.0
     plain = np.linalg.lstsq(rows.reshape(-1, 2), targets.ravel(), rcond=None)[0]

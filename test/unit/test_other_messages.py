@@ -20,18 +20,23 @@ from hand_eye_calib.offline.cli.main import main
 
 TIMES = np.arange(0, 30, 0.05)
 TRUTH = as_trajectory(smooth_poses(TIMES), rate_hz=20.0)
-P, Q = TRUTH.poses[:, :3, 3], se3.to_quat_xyzw(TRUTH.poses)
+P = TRUTH.poses[:, :3, 3]
+Q = se3.to_quat_xyzw(TRUTH.poses)
 GEODETIC = geodetic(P - P[0], (48.1, 11.5, 550.0))
 TWIST = "geometry_msgs/msg/TwistStamped"
-FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
-PX4, ARRAY = "px4_msgs/msg/VehicleOdometry", "geometry_msgs/msg/PoseArray"
-GEO, INS = "geographic_msgs/msg/GeoPoseStamped", "novatel_oem7_msgs/msg/INSPVA"
+FIX = "sensor_msgs/msg/NavSatFix"
+IMU = "sensor_msgs/msg/Imu"
+PX4 = "px4_msgs/msg/VehicleOdometry"
+ARRAY = "geometry_msgs/msg/PoseArray"
+GEO = "geographic_msgs/msg/GeoPoseStamped"
+INS = "novatel_oem7_msgs/msg/INSPVA"
 GPS = "gps_msgs/msg/GPSFix"
 MARKER, BODY, BODIES = (f"mocap4r2_msgs/msg/{x}" for x in ("Marker", "RigidBody", "RigidBodies"))
 NAMED, NAMED_ARRAY = (
     f"motion_capture_tracking_interfaces/msg/{x}" for x in ("NamedPose", "NamedPoseArray")
 )
-POINT, POSE = "geographic_msgs/msg/GeoPoint", "geographic_msgs/msg/GeoPose"
+POINT = "geographic_msgs/msg/GeoPoint"
+POSE = "geographic_msgs/msg/GeoPose"
 for name, fields in {
     PX4: "uint64 timestamp\nuint64 timestamp_sample\nuint8 pose_frame\nfloat32[3] position\n"
     "float32[4] q\nuint8 velocity_frame\nfloat32[3] velocity\nfloat32[3] angular_velocity\n"
@@ -70,9 +75,12 @@ def messages():
     types |= {"/ins": INS, "/twists": f"{TWIST[:-7]}WithCovarianceStamped"}
     types |= {"/bodies": BODIES, "/named": NAMED_ARRAY, "/gps": GPS}
     found = {key: [] for key in types.items()}
-    zero, nine, nothing = made("Vector3", 0.0, 0.0, 0.0), np.zeros(9), np.zeros(3, "f4")
+    zero = made("Vector3", 0.0, 0.0, 0.0)
+    nine = np.zeros(9)
+    nothing = np.zeros(3, "f4")
     for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
-        head, quaternion = header(JAZZY, stamp_ns, "sensor"), made("Quaternion", *Q[k])
+        head = header(JAZZY, stamp_ns, "sensor")
+        quaternion = made("Quaternion", *Q[k])
         twist = made("Twist", made("Vector3", *twists[k, :3]), made("Vector3", *twists[k, 3:]))
         pose = made("Pose", made("Point", *P[k]), quaternion)
         point = made(POINT, lat[k], lon[k], height[k])

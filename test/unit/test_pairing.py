@@ -63,10 +63,8 @@ def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
 
 
 def test_the_slower_stream_gives_the_stamps():
-    slow, fast = (
-        as_trajectory(wandering_poses(20), rate_hz=10),
-        as_trajectory(wandering_poses(100), rate_hz=50),
-    )
+    slow = as_trajectory(wandering_poses(20), rate_hz=10)
+    fast = as_trajectory(wandering_poses(100), rate_hz=50)
     assert slower_stream(slow.stamps_ns, fast.stamps_ns) == "parent"
     assert slower_stream(fast.stamps_ns, slow.stamps_ns) == "child"
     assert slower_stream(slow.stamps_ns, slow.stamps_ns) == "child"

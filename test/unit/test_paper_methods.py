@@ -39,7 +39,8 @@ def split(T):
 def squared_translation_residual(pairs, rotation, translation):
     total = 0.0
     for A, B in zip(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj, strict=True):
-        (R_A, t_A), (_, t_B) = split(A), split(B)
+        R_A, t_A = split(A)
+        _, t_B = split(B)
         total += np.sum((R_A @ translation + t_A - rotation @ t_B - translation) ** 2)
     return total
 
@@ -92,7 +93,8 @@ def test_rotation_is_never_a_reflection():
 
 def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
     """Eqs 14-16, with z the rotation's axis times the tangent of half its angle."""
-    axes, turns = [], []
+    axes = []
+    turns = []
     for Ts in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj):
         rotvecs = se3.rotation_log(Ts[:, :3, :3])
         axes.append(rotvecs / np.linalg.norm(rotvecs, axis=1, keepdims=True))
@@ -100,7 +102,8 @@ def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
 
     def cost(parameters):
         z, t = np.split(parameters, 2)
-        minus, plus = np.eye(3) - se3.skew(z), np.eye(3) + se3.skew(z)
+        minus = np.eye(3) - se3.skew(z)
+        plus = np.eye(3) + se3.skew(z)
         f = axes[0] @ minus.T - axes[1] @ plus.T
         ahead = turns @ t + noisy.Ts_parenti_parentj[:, :3, 3]
         g = ahead @ minus.T - noisy.Ts_childi_childj[:, :3, 3] @ plus.T

@@ -87,7 +87,8 @@ def test_a_stream_that_stops_pauses_the_session_and_is_named(node):
     run(node, 4.5, senders=["parent"])
     assert view_of(state_of(node)).word == "GO ON"
     run(node, 2.5, senders=["parent"])
-    state, view = state_of(node), view_of(state_of(node))
+    state = state_of(node)
+    view = view_of(state_of(node))
     assert (state.inputs["child"].level, state.inputs["parent"].level) == (Level.WARN, Level.OK)
     assert state.inputs["child"].text == "/child_odom has been silent for 7 s"
     assert (state.progress.level, state.progress.is_paused) == (Level.WARN, True)

@@ -50,7 +50,8 @@ def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
 
 def test_near_gimbal_lock_roll_and_yaw_are_printed_without_a_sigma():
     rotation = se3.rotation_from_rpy(np.radians([20.0, 89.5, 70.0]))
-    T, covariance = transform(rotation), covariance_about_parent(rotation, (0.3, 0.2, 0.1))
+    T = transform(rotation)
+    covariance = covariance_about_parent(rotation, (0.3, 0.2, 0.1))
     roll, pitch, yaw = sigmas_rpy(T, covariance)
     assert (roll, yaw) == (np.inf, np.inf)
     assert pitch < np.radians(0.4)
@@ -68,7 +69,8 @@ def test_an_unknown_rotation_has_no_sigma():
 
 
 def calibration(rotation, sigmas_deg):
-    T, covariance = transform(rotation), covariance_about_parent(rotation, sigmas_deg)
+    T = transform(rotation)
+    covariance = covariance_about_parent(rotation, sigmas_deg)
     sigmas = np.r_[0.01, 0.02, 0.03, np.radians(sigmas_deg)]
     return made(
         T_parent_child=T,
@@ -81,7 +83,8 @@ def calibration(rotation, sigmas_deg):
 def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
     result = calibration(LIDAR_CAMERA, (0.57, 0.028, 0.1))
     document = result.to_dict()
-    there, back = document["T_parent_child"], document["T_child_parent"]
+    there = document["T_parent_child"]
+    back = document["T_child_parent"]
     np.testing.assert_allclose(there["sigma_rpy_deg"], np.degrees(result.sigmas_rpy))
     assert there["sigma_rpy_deg"][1] == pytest.approx(0.57)
     np.testing.assert_allclose(there["sigma_translation"], [0.01, 0.02, 0.03])
@@ -90,11 +93,10 @@ def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
 
 
 def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
-    measured_m, allowance_m = 0.0043, 0.008
-    T, covariance = (
-        transform(np.eye(3)),
-        np.diag(np.r_[np.full(3, measured_m**2), np.full(3, 1e-6)]),
-    )
+    measured_m = 0.0043
+    allowance_m = 0.008
+    T = transform(np.eye(3))
+    covariance = np.diag(np.r_[np.full(3, measured_m**2), np.full(3, 1e-6)])
     allowance = np.diag(np.r_[np.full(3, allowance_m**2), np.full(3, 1e-6)])
     result = made(
         T_parent_child=T,

@@ -40,7 +40,8 @@ class TestOptionsOfCalibrate:
         assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress", "checks"}
         assert {each.default for each in keywords.values()} == {None}
         for name in fields.keys() - PRIOR_FIELDS:
-            meta, told = fields[name].metadata, keywords[name].annotation
+            meta = fields[name].metadata
+            told = keywords[name].annotation
             words = meta["choices"] or meta["words"]
             expected = Literal[words] if words else fields[name].type
             expected = float | expected if meta["words"] else expected

@@ -21,12 +21,14 @@ def names(tmp_path_factory):
     """What the examples use: a simulated drive of three sensors, its files, a result."""
     folder = tmp_path_factory.mktemp("examples")
     drive = hec.simulate(1, outliers=0.0)
-    parent, child = drive.parent, drive.child
+    parent = drive.parent
+    child = drive.child
     noise = np.random.default_rng(1).normal(0.0, 1e-3, (len(child), 6))
     other = hec.Trajectory(child.stamps_ns, child.poses @ T_CAMERA_REAR @ se3.exp(noise), "rear")
     hec.write_trajectory(folder / "lidar.tum", parent)
     hec.write_trajectory(folder / "camera.tum", child)
-    hand, camera = parent.at(child.stamps_ns[10:810:20]), child[10:810:20]
+    hand = parent.at(child.stamps_ns[10:810:20])
+    camera = child[10:810:20]
     pairs = zip(hand.tolist(), se3.inverse(camera.poses).tolist(), strict=True)
     (folder / "samples.yaml").write_text(json.dumps(list(pairs)), encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:

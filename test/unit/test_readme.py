@@ -15,13 +15,15 @@ from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.formats import files
 from hand_eye_calib.offline.cli.main import main
 
-NODE_PAGE, LIMITS_PAGE = ROOT / "docs" / "node.md", ROOT / "docs" / "limits.md"
+NODE_PAGE = ROOT / "docs" / "node.md"
+LIMITS_PAGE = ROOT / "docs" / "limits.md"
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
     for page in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")))
 }
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
-FEWEST_WORDS, MOST_WORDS = 700, 900
+FEWEST_WORDS = 700
+MOST_WORDS = 900
 LIMITS = ROOT / "hand_eye_calib" / "formats/files.py"
 HINT = "PYTHONPATH=. python test/unit/test_readme.py writes it"
 
@@ -30,7 +32,8 @@ def parameter_table(config):
     """The Markdown table of an option dataclass; parameters that differ by a word share a row."""
     rows = {}
     for field in dataclasses.fields(config):
-        meta, name = field.metadata, option_name(field)
+        meta = field.metadata
+        name = option_name(field)
         word = re.match(r"prior\.(.*)|(parent|child)_|", name)
         word = word[1] or word[2] or "nothing"
         cells = [f"`{default(field)}`", meta["unit"], allowed(field), meaning(meta)]
@@ -97,7 +100,9 @@ def test_parameter_tables_have_no_other_rows():
 
 def limits_table():
     """The Markdown table of ``formats/files.py``: its sections, comments and values."""
-    lines, section, text = ["| Of | What | Limit |", "| --- | --- | ---: |"], "", []
+    lines = ["| Of | What | Limit |", "| --- | --- | ---: |"]
+    section = ""
+    text = []
     for line in LIMITS.read_text(encoding="utf-8").splitlines():
         if line.startswith("# ---- "):
             section = line.removeprefix("# ---- ")

@@ -44,7 +44,11 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.ids, self.elements, self.text, self.errors = [], [], [], "", []
+        self.open = []
+        self.ids = []
+        self.elements = []
+        self.text = ""
+        self.errors = []
         self.feed(text)
         self.close()
         self.text = " ".join(self.text.split())

@@ -16,7 +16,9 @@ from hand_eye_calib.offline.cli.main import main
 pytest.importorskip("small_gicp", reason="needs small_gicp")
 
 POINTS = "sensor_msgs/msg/PointCloud2"
-RATE, COLUMNS, ELEVATIONS = 10.0, 180, np.radians(np.linspace(-25.0, 25.0, 16))
+RATE = 10.0
+COLUMNS = 180
+ELEVATIONS = np.radians(np.linspace(-25.0, 25.0, 16))
 START_NS = 1_700_000_000_000_000_000
 
 # Lower and upper corners: of the room, seen from inside, and of what stands in it.
@@ -37,8 +39,10 @@ def ranges(origins, directions):
         inverse = 1.0 / directions
     found = np.maximum(*((corner - origins) * inverse for corner in ROOM)).min(axis=1)
     for lower, upper in BOXES:
-        first, second = (lower - origins) * inverse, (upper - origins) * inverse
-        near, far = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+        first = (lower - origins) * inverse
+        second = (upper - origins) * inverse
+        near = np.minimum(first, second).max(axis=1)
+        far = np.maximum(first, second).min(axis=1)
         found = np.where((near < far) & (near > 0.0), np.minimum(found, near), found)
     return found
 
@@ -63,7 +67,8 @@ def scans(body, T_body_lidar, too_far, count, rng):
     """Per scan: points (N, 3) and times (N,) since its first ray."""
     azimuth = -2.0 * np.pi * np.arange(COLUMNS) / COLUMNS
     level = np.cos(ELEVATIONS)
-    x, y = np.outer(np.cos(azimuth), level), np.outer(np.sin(azimuth), level)
+    x = np.outer(np.cos(azimuth), level)
+    y = np.outer(np.sin(azimuth), level)
     rays = np.stack([x, y, np.tile(np.sin(ELEVATIONS), (COLUMNS, 1))], axis=-1)
     since = np.arange(COLUMNS) / COLUMNS / RATE
     for number in range(count):
@@ -77,7 +82,8 @@ def scans(body, T_body_lidar, too_far, count, rng):
 def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
     """As drivers write it: rings of points with their times, ``time`` in s or ``t`` in ns."""
     kind = {"time": (7, "<f4", 1.0), "t": (6, "<u4", 1e9)}[of_time]
-    formats, offsets = ["<f4", "<f4", "<f4", kind[1]], [0, 4, 8, 18]
+    formats = ["<f4", "<f4", "<f4", kind[1]]
+    offsets = [0, 4, 8, 18]
     named = {"names": ["x", "y", "z", of_time], "formats": formats, "offsets": offsets}
     layout = np.dtype({**named, "itemsize": 24})
     rows = np.zeros(len(points), layout)
@@ -104,8 +110,10 @@ def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
 
 def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     rng = np.random.default_rng(11)
-    count, body = 70, Body(7.0, rng)
-    X, messages = se3.exp([0.6, -0.3, 0.2, 0.1, -0.2, 0.9]), []
+    count = 70
+    body = Body(7.0, rng)
+    X = se3.exp([0.6, -0.3, 0.2, 0.1, -0.2, 0.9])
+    messages = []
     too_far = 0.005 * rng.standard_normal((2, len(ELEVATIONS)))
     for k, (topic, T, of_time) in enumerate((("/front", np.eye(4), "time"), ("/rear", X, "t"))):
         for number, scan in enumerate(scans(body, T, too_far[k], count, rng)):
@@ -126,7 +134,8 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     rings = np.round(180.0 + 2.0 * np.degrees(ELEVATIONS)).astype(int)
     for name, T_body_lidar, k in (("front", np.eye(4), 0), ("rear", X, 1)):
         kept = tmp_path / f"drive.{name}.odometry.npz"
-        found, truth = np.load(kept), body.poses(middle_s) @ T_body_lidar
+        found = np.load(kept)
+        truth = body.poses(middle_s) @ T_body_lidar
         np.testing.assert_allclose(found["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
         poses = se3.from_quat_xyzw(found["poses"][:, :3], found["poses"][:, 3:])
         turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]

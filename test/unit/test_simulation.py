@@ -87,7 +87,8 @@ def published_runs(folder, level):
 
 def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder):
     for parent, _ in published_runs(published_folder, "noise/noise_0.000000"):
-        x, y = parent[:, 0, 3], parent[:, 1, 3]
+        x = parent[:, 0, 3]
+        y = parent[:, 1, 3]
         z, slope_x, slope_y = surface(options.DriveConfig(), x, y)
         np.testing.assert_allclose(parent[:, 2, 3], z, atol=1e-12)
         normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)

@@ -97,7 +97,8 @@ def test_gives_the_same_bits_as_here_job_after_job_whatever_libraries_print(star
     for session, options in enumerate(OPTIONS, start=5):
         work = poses(**options)
         process.submit(Job(session, work, check=True))
-        there, here = process.next(), answer(Job(session, poses(**options), check=True))
+        there = process.next()
+        here = answer(Job(session, poses(**options), check=True))
         assert there.session == session
         for name in ("T_parent_child", "covariance", "objective", "sigmas"):
             values = [getattr(each.calibration, name) for each in (there, here)]

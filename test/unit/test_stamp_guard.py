@@ -18,7 +18,9 @@ def stamps(n, start_ns=START_NS, step_ns=STEP_NS):
 
 def run(guard, sequence, now_s=0.0, step_s=0.1):
     """Whether each message began a session, stamps taken and stamps dropped."""
-    jumps, taken, dropped = [], [], []
+    jumps = []
+    taken = []
+    dropped = []
 
     def use(judgement):
         assert all(message == str(stamp) for stamp, message in judgement.taken)

@@ -9,8 +9,11 @@ from hand_eye_calib.core.noise.normal import Factor, NormalEquations
 from hand_eye_calib.core.noise.outliers import innovations
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 
-N_POSES, N_STATES, N_PARAMETERS = 15, 16, 7
-N_LEVELS, SIZES = 5 + 2 * 4, (3, 3, 3, 1)
+N_POSES = 15
+N_STATES = 16
+N_PARAMETERS = 7
+N_LEVELS = 5 + 2 * 4
+SIZES = (3, 3, 3, 1)
 
 
 def space_of(seed=1, cut=(4,)):
@@ -21,9 +24,11 @@ def space_of(seed=1, cut=(4,)):
     adjoints = np.eye(6) + 0.2 * random.standard_normal((n, 6, 6))
     directions = random.standard_normal((N_POSES, 6, 9))
     directions[:, :, :3] = np.eye(6)[:, :3]
-    ahead, behind = np.zeros((n, 6, N_STATES - 6)), np.zeros((n, 6, N_STATES))
+    ahead = np.zeros((n, 6, N_STATES - 6))
+    behind = np.zeros((n, 6, N_STATES))
     behind[:, :, :6] = adjoints
-    ahead[:, :, :9], behind[:, :, 6:15] = directions[1:], adjoints @ directions[:-1]
+    ahead[:, :, :9] = directions[1:]
+    behind[:, :, 6:15] = adjoints @ directions[:-1]
     behind[:, :, 15] = random.standard_normal((n, 6))
     lever = random.standard_normal((3, 6))
     twists = random.standard_normal((N_POSES, 6))
@@ -59,7 +64,8 @@ LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
 
 def dense_covariance(space, levels):
     """V (6 n, 6 n) by its definition, increments that are no evidence included."""
-    variances, (n, _, d) = np.exp(levels), space.behind.shape
+    variances = np.exp(levels)
+    n, _, d = space.behind.shape
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white]
@@ -113,7 +119,8 @@ def test_the_likelihood_stays_exact_where_there_is_hardly_any_walk_or_white_nois
 
 
 def test_derivatives_of_the_likelihood_are_the_numerical_ones():
-    space, step = space_of(), 1e-5
+    space = space_of()
+    step = 1e-5
     gradient, information = reml.derivatives(Posterior(space, LEVELS))
     numerical = [
         (dense_loss(space, LEVELS + change)[0] - dense_loss(space, LEVELS - change)[0]) / (2 * step)
@@ -176,7 +183,8 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
 
 @pytest.mark.parametrize("n", [1, 2, 5, 90])
 def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
-    random, d = np.random.default_rng(0), 4
+    random = np.random.default_rng(0)
+    d = 4
     diagonal = random.normal(size=(n, d, d))
     diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 20 * np.eye(d)
     below = random.normal(size=(n - 1, d, d))
@@ -187,8 +195,10 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
         matrix[k + 1, :, k], matrix[k, :, k + 1] = below[k], below[k].T
     matrix = matrix.reshape(n * d, n * d)
 
-    factor, right = Factor(diagonal, below), random.normal(size=(n, d, 3))
-    flat, inverse = right.reshape(n * d, 3), np.linalg.inv(matrix)
+    factor = Factor(diagonal, below)
+    right = random.normal(size=(n, d, 3))
+    flat = right.reshape(n * d, 3)
+    inverse = np.linalg.inv(matrix)
     whitened = factor.whiten(right)
     solved = factor.restore(whitened).reshape(n * d, 3)
     np.testing.assert_allclose(solved, inverse @ flat, atol=1e-12)

@@ -252,7 +252,8 @@ def test_exact_stops_are_solved_exactly(random, n):
 # Shares of outliers, sizes of the target, stops.
 @pytest.mark.parametrize("given", [(0, 1, 20), (0.15, 1, 20), (0, 0.98, 20), (0, 1, 4)])
 def test_covariance_is_that_of_the_errors(random, given):
-    squared, (outliers, size, n) = [], given
+    squared = []
+    outliers, size, n = given
     for _ in range(40):
         X, Z, stops = recorded(random, n, outliers=outliers)
         stops.Ts_world_child[:, :3, 3] *= size
@@ -264,7 +265,8 @@ def test_covariance_is_that_of_the_errors(random, given):
 
 
 def test_covariance_is_that_of_errors_that_last(random):
-    squared, n = [], 40
+    squared = []
+    n = 40
     lasting = np.linalg.cholesky(0.7 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))))
     for _ in range(30):
         waves = np.sin(np.linspace(0.0, 6.0, n)[:, None] * random.uniform(0.5, 2.0, 6))
@@ -286,7 +288,8 @@ def test_an_arm_that_rests_makes_no_outliers_of_the_other_stops(random):
 
 def test_order_does_not_matter(random):
     _, _, stops = recorded(random, 30)
-    first, second = solve(stops), solve(stops[random.permutation(30)])
+    first = solve(stops)
+    second = solve(stops[random.permutation(30)])
     assert np.abs(off(first.Ts_parent_child[0], second.Ts_parent_child[0])).max() < 2e-4
 
 
@@ -300,8 +303,10 @@ def test_outliers_have_no_weight(random):
 
 
 def test_several_cameras_and_targets_are_one_solve(random):
-    Xs, Zs = poses(random, 2, turn_rad=1.5), poses(random, 3, turn_rad=1.5)
-    child, world = np.array([0, 0, 1, 1, 1]).repeat(20), np.array([0, 1, 1, 2, 0]).repeat(20)
+    Xs = poses(random, 2, turn_rad=1.5)
+    Zs = poses(random, 3, turn_rad=1.5)
+    child = np.array([0, 0, 1, 1, 1]).repeat(20)
+    world = np.array([0, 1, 1, 2, 0]).repeat(20)
     A = poses(random, 100)
     B = se3.inverse(Zs[world]) @ A @ Xs[child] @ se3.exp(LEVELS * random.normal(size=(100, 6)))
     fit = solve(Stops(A, B, child, world))
@@ -315,7 +320,8 @@ def test_two_stops_are_too_few_and_sensors_need_a_common_target(random):
     for n in (0, 1, 2):
         with pytest.raises(NotEnoughDataError, match="at least 3"):
             solve(recorded(random, n)[2])
-    stops, side = recorded(random, 20)[2], np.arange(20) % 2
+    stops = recorded(random, 20)[2]
+    side = np.arange(20) % 2
     with pytest.raises(NotEnoughDataError, match="tied to no others"):
         solve(Stops(stops.Ts_world_parent, stops.Ts_world_child, side, side))
 

@@ -120,7 +120,8 @@ def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     places = np.sin(places) * [20.0, 20.0, 0.5]
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     noisy = motions.disturbed(motions.child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-3, 1e-3)
-    parent, child = motions.as_trajectory(poses, 20), motions.as_trajectory(noisy, 20)
+    parent = motions.as_trajectory(poses, 20)
+    child = motions.as_trajectory(noisy, 20)
     assert grave(check_streams(parent, child)) == []
     assert grave(check_streams(inverted(parent), inverted(child))) == [("inverse_both", "both")]
 

@@ -133,7 +133,8 @@ def straight_at(stream, stamps_ns):
     after = np.clip(np.searchsorted(stream.stamps_ns, stamps_ns), 1, len(stream) - 1)
     spans = np.diff(stream.stamps_ns)[after - 1]
     share = ((stamps_ns - stream.stamps_ns[after - 1]) / spans)[:, None]
-    start, end = stream.poses[after - 1], stream.poses[after]
+    start = stream.poses[after - 1]
+    end = stream.poses[after]
     turns = se3.rotation_log(np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3])
     return se3.from_rotation_translation(
         start[:, :3, :3] @ se3.rotation_exp(share * turns),

@@ -24,7 +24,8 @@ from hand_eye_calib.offline.cli.main import main
 cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")
 
 MATRIX = np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 480.0], [0.0, 0.0, 1.0]])
-SIZE, SUPER = (1280, 960), 3
+SIZE = (1280, 960)
+SUPER = 3
 BOARD = (7, 5, 0.05, 0.037)
 PIXELS_PER_M = 4000
 CAMERA_INFO = """\
@@ -46,7 +47,8 @@ def rendered(picture, T_camera_picture, rng):
     left, top = np.clip(seen.min(axis=1) - 2, 0, SIZE).astype(int)
     columns, rows = np.clip(seen.max(axis=1) + 3, 0, SIZE).astype(int) - [left, top]
     homography[:2] -= SUPER * np.outer([left, top], homography[2])
-    size, look = (int(SUPER * columns), int(SUPER * rows)), cv2.INTER_AREA
+    size = (int(SUPER * columns), int(SUPER * rows))
+    look = cv2.INTER_AREA
     fine = cv2.warpPerspective(picture, homography, size, flags=look, borderValue=200)
     image = np.full(SIZE[::-1], 200, np.uint8)  # beside the picture
     image[top : top + rows, left : left + columns] = cv2.resize(
@@ -67,7 +69,8 @@ def charuco_picture():
 def aprilgrid_picture(columns, rows, size, gap):
     """As Kalibr prints it: from the lower left tag on, upright, with a border of two bits."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    side, step = round(size * PIXELS_PER_M), round((size + gap) * PIXELS_PER_M)
+    side = round(size * PIXELS_PER_M)
+    step = round((size + gap) * PIXELS_PER_M)
     picture = np.full((rows * step, columns * step), 255, dtype=np.uint8)
     for number in range(columns * rows):
         # OpenCV draws the tags of this family upside down.
@@ -121,7 +124,10 @@ def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
 def test_aprilgrid_has_the_frame_of_kalibr():
     """Origin at the lower left corner of the first tag, x to the right and y up."""
     rng = np.random.default_rng(5)
-    columns, rows, size, gap = 6, 4, 0.03, 0.009
+    columns = 6
+    rows = 4
+    size = 0.03
+    gap = 0.009
     picture = aprilgrid_picture(columns, rows, size, gap)
     height_m = picture.shape[0] / PIXELS_PER_M
     T_picture_target = se3.from_rotation_translation(np.diag([1.0, -1.0, -1.0]), [0, height_m, 0])
@@ -137,8 +143,10 @@ def test_aprilgrid_has_the_frame_of_kalibr():
 
 def image_messages(stamp_ns, image):
     """The same image on two topics, and the intrinsics."""
-    types, head = JAZZY.types, header(JAZZY, stamp_ns, "eye")
-    coded, color = cv2.imencode(".png", image)[1].ravel(), np.repeat(image[:, :, None], 3, axis=2)
+    types = JAZZY.types
+    head = header(JAZZY, stamp_ns, "eye")
+    coded = cv2.imencode(".png", image)[1].ravel()
+    color = np.repeat(image[:, :, None], 3, axis=2)
     height, width = image.shape
     about = "rgb8", 0, 3 * width, color.ravel()
     raw = types["sensor_msgs/msg/Image"](head, height, width, *about)
@@ -153,11 +161,13 @@ def image_messages(stamp_ns, image):
 
 
 def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figures):
-    rng, count = np.random.default_rng(7), 16
+    rng = np.random.default_rng(7)
+    count = 16
     times = np.arange(count) / 6
     stamps_ns = 1_700_000_000_000_000_000 + np.int64(1e9 / 6 * np.arange(count))
     turns = 0.45 * np.stack([np.sin(1.3 * times), np.sin(1.9 * times + 1), np.sin(times)], axis=1)
-    Rs, far = Rotation.from_rotvec(turns).as_matrix(), [0.0, 0.0, 0.62]
+    Rs = Rotation.from_rotvec(turns).as_matrix()
+    far = [0.0, 0.0, 0.62]
     Ts = se3.from_rotation_translation(Rs, far - Rs @ [0.175, 0.125, 0.0])
     X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
     hand = Trajectory(stamps_ns, se3.inverse(Ts) @ se3.inverse(X), "hand", "base")

@@ -58,7 +58,8 @@ def test_a_moving_edge_and_a_mount(events, expected):
 
 
 def test_two_moving_edges_at_the_stamps_of_the_slower():
-    slow, fast = moving("map", "odom", 100, 30, 3), moving("odom", "base", 10, 300)
+    slow = moving("map", "odom", 100, 30, 3)
+    fast = moving("odom", "base", 10, 300)
     _, poses = live(STATIC + in_order(slow, fast), "map:lidar")
     # The tree is complete with the first slow one, and the last one still waits.
     stamps_ns = np.array([pose.stamp_ns for pose in poses])

@@ -140,7 +140,8 @@ def results_of(seed, count, unknown_z=False, apart=(), factor=1.0):
     """Extrinsics and their covariances along the parent's axes, some rotated by 0.06 rad."""
     Ts, covariances = recordings_of(seed, count, unknown_z)
     to_parent = np.kron(np.eye(2), Ts[:, :3, :3])
-    Ts, apart = Ts.copy(), list(apart)
+    Ts = Ts.copy()
+    apart = list(apart)
     Ts[apart] = se3.exp(np.array([0, 0, 0, 0, 0, 0.06])) @ Ts[apart]
     return Ts, factor * to_parent @ covariances @ np.swapaxes(to_parent, 1, 2)
 
@@ -242,10 +243,8 @@ def test_an_unknown_axis_is_neither_the_same_nor_moved():
 
 def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
     floor = np.diag(np.r_[np.zeros(3), np.full(3, np.radians(0.2) ** 2)])
-    first, second = (
-        result(covariance_allowance=floor),
-        result(shift("yaw", np.radians(0.6)), covariance_allowance=floor),
-    )
+    first = result(covariance_allowance=floor)
+    second = result(shift("yaw", np.radians(0.6)), covariance_allowance=floor)
     assert compare([second], Extrinsic(X, "drawing")).verdict == "same"
     assert compare([first, second]).verdict == "moved"
     known = Extrinsic(X, "earlier result", first.covariance_measured, is_calibration=True)
@@ -268,17 +267,16 @@ def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
     moved = shift(AXES[axis], 0.03) + shift(AXES[axis + 3], np.radians(1.0))
     floor = np.diag(np.r_[np.full(3, 0.005**2), np.full(3, np.radians(0.15) ** 2)])
     for seed in range(5):
-        first, second = (
-            result(sigmas=sigmas, seed=seed, covariance_allowance=floor),
-            result(moved, sigmas=sigmas, seed=100 + seed, covariance_allowance=floor),
-        )
+        first = result(sigmas=sigmas, seed=seed, covariance_allowance=floor)
+        second = result(moved, sigmas=sigmas, seed=100 + seed, covariance_allowance=floor)
         assert AXES[axis + 3] in axes(compare([first, second]).differences[0], "moved")
         against = compare([second], Extrinsic(X, "drawing")).differences[0]
         assert AXES[axis + 3] in axes(against, "moved")
 
 
 def test_an_axis_is_the_same_by_its_own_target():
-    rough, drawing = result(), Extrinsic(X, "drawing")
+    rough = result()
+    drawing = Extrinsic(X, "drawing")
     assert compare([rough], drawing).verdict == "same"
     strict = dataclasses.replace(rough, target_axes={"y": 0.001})
     assert axes(compare([strict], drawing).differences[0], "cannot tell") == ["y"]

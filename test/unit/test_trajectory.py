@@ -61,7 +61,8 @@ def test_unusable_input_names_the_first_offender(stamps, poses, message):
 
 def test_shift_and_scale_keep_everything_else():
     trajectory = Trajectory(STAMPS, POSES, "lidar", "odom")
-    shifted, scaled = trajectory.shifted(-0.000000003), trajectory.scaled(2.0)
+    shifted = trajectory.shifted(-0.000000003)
+    scaled = trajectory.scaled(2.0)
     assert shifted.stamps_ns.tolist() == [-3, 7, 17]
     assert (shifted.sensor_frame, scaled.world_frame) == ("lidar", "odom")
     np.testing.assert_array_equal(scaled.poses[:, :3, :3], POSES[:, :3, :3])

@@ -22,7 +22,8 @@ TRAJECTORY = as_trajectory(wandering_poses(30), start_ns=START_NS)
 POSITIONS = TRAJECTORY.poses[:, :3, 3].tolist()
 QUATS_XYZW = se3.to_quat_xyzw(TRAJECTORY.poses).tolist()
 NO_QUATERNION = "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for turns"
-XYZW, WXYZ = "t,x,y,z,qx,qy,qz,qw", "t,x,y,z,qw,qx,qy,qz"
+XYZW = "t,x,y,z,qx,qy,qz,qw"
+WXYZ = "t,x,y,z,qw,qx,qy,qz"
 
 
 @pytest.fixture
@@ -132,7 +133,8 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
     said = r"poses\.txt: the poses have no stamps; name their column t, give `times`, or pair"
     with pytest.raises(InputError, match=said):
         hec.read_trajectory(poses, "kitti")
-    one, short = file(["0.0"], "one.txt"), file(["0.0", "0.1"], "short.txt")
+    one = file(["0.0"], "one.txt")
+    short = file(["0.0", "0.1"], "short.txt")
     for path, beside, message in (
         (poses, short, r"30 poses, but .*short\.txt has 2 stamps"),
         (poses, file(["x"], "odd.txt"), r"odd\.txt, line 1: .* found 'x' for the timestamp"),

@@ -14,7 +14,8 @@ from hand_eye_calib.formats.geodetic import LocalOrigin
 from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
 from hand_eye_calib.offline.cli.main import main
 
-SCALAR_FIRST, SCALAR_LAST = [3, 0, 1, 2], [0, 1, 2, 3]
+SCALAR_FIRST = [3, 0, 1, 2]
+SCALAR_LAST = [0, 1, 2, 3]
 
 
 def write_unnamed(path, trajectory, order, separator=" "):
@@ -156,7 +157,8 @@ def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):
     positions, (_, _, yaw) = angles()
     upright = se3.rotation_from_rpy(np.c_[np.zeros((len(yaw), 2)), yaw])
     X = se3.from_rotation_translation(se3.rotation_from_rpy([np.pi, 0.0, 0.8]), np.zeros(3))
-    header, files = "easting,northing,altitude,roll_rad,pitch_rad,heading_rad", []
+    header = "easting,northing,altitude,roll_rad,pitch_rad,heading_rad"
+    files = []
     for name, rotation in (("a.csv", upright), ("b.csv", upright @ X[:3, :3])):
         rpy = se3.rotation_to_rpy(np.swapaxes(rotation, 1, 2))
         files.append(table(tmp_path / name, header, *positions, *rpy.T))

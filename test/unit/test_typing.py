@@ -55,7 +55,8 @@ part = parent[:10].shifted(0.5).scaled(2.0).at(np.array([5]))
 
 def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
     """Only what the signatures name is followed: a lint run checks the rest."""
-    program, config = tmp_path / "program.py", tmp_path / "mypy.ini"
+    program = tmp_path / "program.py"
+    config = tmp_path / "mypy.ini"
     program.write_text(PROGRAM, encoding="utf-8")
     public = {getattr(hec, name).__module__ for name in hec.__all__}
     of_arguments = {"hand_eye_calib.core.base.arrays", "hand_eye_calib.core.results.result"}

@@ -323,7 +323,8 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
 
 
 def test_of_several_nodes_the_first_that_speaks_is_shown_or_the_one_that_is_wanted():
-    first, wanted = Board(), Board("/b")
+    first = Board()
+    wanted = Board("/b")
     for board in (first, wanted):
         for name in ("/a", "/b"):
             board.take(state(name), 0.0)
@@ -399,7 +400,9 @@ def test_a_line_is_printed_when_something_else_is_said(capsys):
 @pytest.fixture
 def typed():
     """A session at a terminal: function that types keys and returns the view."""
-    board, requests, keys = Board(), queue.SimpleQueue(), []
+    board = Board()
+    requests = queue.SimpleQueue()
+    keys = []
     board.take(state(), time.monotonic())
     session = Session(board, requests, lambda: keys.pop() if keys else "")
 
@@ -407,7 +410,9 @@ def typed():
         keys.append(text)
         return session.view()
 
-    type_keys.session, type_keys.requests, type_keys.board = session, requests, board
+    type_keys.session = session
+    type_keys.requests = requests
+    type_keys.board = board
     return type_keys
 
 
@@ -448,10 +453,12 @@ def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
 @pytest.fixture
 def server(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    board, requests = Board(), queue.SimpleQueue()
+    board = Board()
+    requests = queue.SimpleQueue()
     board.take(state(), time.monotonic())
     made = WebServer(board, requests.put, ("127.0.0.1", 0))
-    made.kept, made.key = made.key, "word"
+    made.kept = made.key
+    made.key = "word"
     made.requests = requests
     yield made
     made.stop()

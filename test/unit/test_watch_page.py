@@ -77,7 +77,9 @@ class Found(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.ids, self.tags, self.data = set(), [], {}
+        self.ids = set()
+        self.tags = []
+        self.data = {}
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):

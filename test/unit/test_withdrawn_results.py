@@ -155,7 +155,8 @@ def test_every_surface_says_that_the_newest_solve_has_failed(with_result, failur
     answer, standing, word, sentence = FAILURES[failure]
     before = session.cycle.result
     good, _ = conclude(session, 50.0, **answer)
-    state, view = state_of(session), view_of(session)
+    state = state_of(session)
+    view = view_of(session)
     saved, line = session.saver.save(NodeConfig(output_directory=str(tmp_path), report=False))
     file = load_result(tmp_path)
     # topics
@@ -248,7 +249,8 @@ class TestOptions:
         assert not session.cycle.goal.progress.done
         assert session.cycle.result.verdict is Verdict.USE_WITH_CARE
         self.follow(session, target_translation=0.1)
-        state, view = state_of(session), view_of(session)
+        state = state_of(session)
+        view = view_of(session)
         assert state.progress.progress.done
         assert state.progress.progress.axes["x"].target == pytest.approx(0.1)
         assert (state.extrinsic.result.verdict, view.word) == ("USE", "DONE")

@@ -29,9 +29,13 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pai
 from hand_eye_calib.core.solvers import all_pairs, quadratic_form
 
 # Starts: so many random subsets of each size, of so many pairs; and how many are refined.
-_SUBSETS, _SUBSET_SIZES, _MAX_RANKED_PAIRS, _REFINED_STARTS = 32, (12, 24, 48), 300, 3
+_SUBSETS = 32
+_SUBSET_SIZES = (12, 24, 48)
+_MAX_RANKED_PAIRS = 300
+_REFINED_STARTS = 3
 # Steps end below this share of a standard deviation in every direction that is determined.
-_MAX_STEPS, _STEP_TOLERANCE = 30, 1e-2
+_MAX_STEPS = 30
+_STEP_TOLERANCE = 1e-2
 
 # Residuals of this many standard deviations have a quarter of the weight.
 _TUNING = 3.0
@@ -48,15 +52,19 @@ _MAX_UNEXPLAINED_TRANSLATION = 0.3
 
 # Smallest standard deviations: of rotations (rad), and of translations as a share of the motion.
 # Smaller ones are rounding.
-_MIN_SIGMA_ROTATION, _MIN_SIGMA_TRANSLATION = 1e-7, 1e-9
+_MIN_SIGMA_ROTATION = 1e-7
+_MIN_SIGMA_TRANSLATION = 1e-9
 
 # Fewer motions are not compared. For the scale they are over these times (s); that of the smallest
 # relative standard deviation wins. Long motions show the scale best.
-MIN_PAIRS, _SCALE_LAGS_S = 20, (3.0, 1.0, 8.0)
+MIN_PAIRS = 20
+_SCALE_LAGS_S = (3.0, 1.0, 8.0)
 
 # A scale differs from 1 if it is off by more than this and by so many standard deviations, and if
 # the fit leaves less than this of the motion unexplained: many jumps could imitate a scale.
-_MIN_DIFFERENCE, _MIN_SIGMAS, _MAX_UNEXPLAINED_TO_DIFFER = 0.01, 5.0, 0.1
+_MIN_DIFFERENCE = 0.01
+_MIN_SIGMAS = 5.0
+_MAX_UNEXPLAINED_TO_DIFFER = 0.1
 
 # Unknowns: (rho, phi), the logarithm of the scale, and the offset.
 _UNKNOWNS = [*"xyz", "roll", "pitch", "yaw", "scale", "offset"]
@@ -260,7 +268,8 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     outliers suffices, and of all pairs with the start rotations of dnl.
     """
     ranked = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
-    parent, child = ranked.Ts_parenti_parentj.copy(), ranked.Ts_childi_childj.copy()
+    parent = ranked.Ts_parenti_parentj.copy()
+    child = ranked.Ts_childi_childj.copy()
     rms = [np.linalg.norm(Ts[:, :3, 3]) / len(Ts) ** 0.5 for Ts in (parent, child)]
     units = np.maximum(rms, 1e-12)
     parent[:, :3, 3] /= units[0]
@@ -300,11 +309,16 @@ class _Problem:
     def __init__(
         self, pairs: MotionPairs, twists: tuple[FloatArray, FloatArray] | None, same_unit: bool
     ) -> None:
-        A, B = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
-        rotation_a, self.translation_a = A[:, :3, :3], A[:, :3, 3]
-        rotation_b, self.translation_b = B[:, :3, :3], B[:, :3, 3]
-        self.chord_a, self.chord_b = rotation_a - np.eye(3), rotation_b - np.eye(3)
-        self.quats_a, self.quats_b = se3.to_quat_xyzw(rotation_a), se3.to_quat_xyzw(rotation_b)
+        A = pairs.Ts_parenti_parentj
+        B = pairs.Ts_childi_childj
+        rotation_a = A[:, :3, :3]
+        self.translation_a = A[:, :3, 3]
+        rotation_b = B[:, :3, :3]
+        self.translation_b = B[:, :3, 3]
+        self.chord_a = rotation_a - np.eye(3)
+        self.chord_b = rotation_b - np.eye(3)
+        self.quats_a = se3.to_quat_xyzw(rotation_a)
+        self.quats_b = se3.to_quat_xyzw(rotation_b)
         self.skew_b = se3.skew(self.translation_b)
         lengths = (np.linalg.norm(Ts[:, :3, 3]) / len(pairs) ** 0.5 for Ts in (A, B))
         self.rms_a, self.rms_b = map(float, lengths)
@@ -329,7 +343,8 @@ class _Problem:
         column. Two (K, 3, 9) arrays in standard deviations and times their robust weights, these
         deviations per axis (m, rad), and these weights (K,).
         """
-        rotation, back = T[:3, :3], T[:3, :3].T
+        rotation = T[:3, :3]
+        back = T[:3, :3].T
         of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, len(_UNKNOWNS) + 1))
         of_translation[:, :, :3] = _times(self.chord_a, rotation)
         of_translation[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
@@ -338,8 +353,10 @@ class _Problem:
         of_rotation[:, :, 3:6] = np.swapaxes(_times(self.chord_b, back), 1, 2)
         of_rotation[:, :, _OFFSET] = self.rotation_by_offset @ back
         # R_A^T R R_B R^T, by quaternions.
-        va, wa = self.quats_a[:, :3], self.quats_a[:, 3:]
-        vb, wb = self.quats_b[:, :3] @ back, self.quats_b[:, 3:]
+        va = self.quats_a[:, :3]
+        wa = self.quats_a[:, 3:]
+        vb = self.quats_b[:, :3] @ back
+        wb = self.quats_b[:, 3:]
         vector = wa * vb - wb * va + se3.cross(vb, va)
         scalar = wa * wb + (va * vb).sum(axis=1, keepdims=True)
         moved_b = self.translation_b + self.translation_by_offset * offset_s
@@ -371,7 +388,8 @@ class _Problem:
             step[self.free] = -solve(moments, self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             T = se3.retracted(T, step[:6])
-            scale, offset_s = scale * float(np.exp(step[_SCALE])), offset_s + step[_OFFSET]
+            scale = scale * float(np.exp(step[_SCALE]))
+            offset_s = offset_s + step[_OFFSET]
             if step @ moments[:-1, :-1] @ step < _STEP_TOLERANCE**2:
                 break
         return T, scale, offset_s
@@ -400,7 +418,8 @@ class _Problem:
         held = float(np.clip(1.0 - fall, 0.5, 1.0))
         offsets = -blocks.sums[:, _OFFSET, -1] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
-        scale_sigma, off = scale * float(sigmas[_SCALE]), abs(scale - 1.0)
+        scale_sigma = scale * float(sigmas[_SCALE])
+        off = abs(scale - 1.0)
         is_off = off > max(_MIN_DIFFERENCE, _MIN_SIGMAS * scale_sigma)
         return SimilarityFit(
             T_parent_child=T,

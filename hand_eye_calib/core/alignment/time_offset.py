@@ -23,23 +23,29 @@ from hand_eye_calib.core.results.records import ClockRate
 
 # Angles are taken over windows of this many sampling steps, and at least so long, so that the noise
 # of single poses does not hide the motion. Sampling steps are within bounds, and at most so many.
-_WINDOW_STEPS, _MIN_WINDOW_S = 3, 0.2
-_MIN_STEP_S, _MAX_STEP_S, _MAX_SAMPLES = 0.02, 1.0, 200_000
+_WINDOW_STEPS = 3
+_MIN_WINDOW_S = 0.2
+_MIN_STEP_S = 0.02
+_MAX_STEP_S = 1.0
+_MAX_SAMPLES = 200_000
 
 # Angular rates above those of all but this share of the windows are clipped: jumps of a stream are
 # not motion.
 _CLIPPED_SHARE = 0.03
 
 # Offsets are considered if at least this share of the shorter stream, and this long, overlaps.
-_MIN_OVERLAP_SHARE, _MIN_OVERLAP_S = 0.25, 5.0
+_MIN_OVERLAP_SHARE = 0.25
+_MIN_OVERLAP_S = 5.0
 
 # Another offset is a rival only beyond this distance: close to the peak the correlation is high
 # anyway.
-_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS = 2.0, 5.0
+_PEAK_WIDTH_S = 2.0
+_PEAK_WIDTH_WINDOWS = 5.0
 
 # Streams of one body are 5 to 12 times better correlated at their offset than at any other,
 # unrelated streams at most 1.3 times (measured on sixteen real recordings).
-_DISTINCT, _CORRELATED = 2.0, 0.5
+_DISTINCT = 2.0
+_CORRELATED = 0.5
 
 # Poses that are repeated for so long (s) may be those of a stream that froze.
 _REPEATS_S = 1.0
@@ -57,17 +63,23 @@ _PAIRS_OF_RATE = 5 * MAX_PAIRS
 # intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
 # standard deviations of rotations by the angular rate, so that noise is little of the velocity.
 # Noise in both, or much of it, draws the offset, and its standard deviation is too small.
-_LEAST_SPAN_S, _MOST_SPAN_S, _SPAN_INTERVALS, _SPAN_OF_NOISE = 0.05, 0.3, 2.0, 1.4
+_LEAST_SPAN_S = 0.05
+_MOST_SPAN_S = 0.3
+_SPAN_INTERVALS = 2.0
+_SPAN_OF_NOISE = 1.4
 
-_MAX_ROUNDS, _SETTLED_S = 8, 2e-5
+_MAX_ROUNDS = 8
+_SETTLED_S = 2e-5
 
 # A rate of the clock is known to this beforehand (75 ppm are usual for USB devices); one beyond so
 # many standard deviations is there.
-_RATE_PRIOR, _PLAIN_RATE = 1e-4, 4.0
+_RATE_PRIOR = 1e-4
+_PLAIN_RATE = 4.0
 
 # Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
 # stream if those are longer.
-_FINE_RANGE_S, _FINE_RANGE_INTERVALS = 0.25, 2.0
+_FINE_RANGE_S = 0.25
+_FINE_RANGE_INTERVALS = 2.0
 
 
 @dataclass(frozen=True)
@@ -178,7 +190,8 @@ def _best_correlation(
     # About one independent sample a second; three degrees of freedom go into the coefficient.
     fisher_z = np.arctanh(np.clip(coefficients, -1 + 1e-9, 1 - 1e-9))
     significance = np.where(enough, fisher_z * np.sqrt(np.maximum(durations - 3, 0)), -np.inf)
-    best, lags_s = int(np.argmax(significance)), np.multiply(lags, step_s, dtype=float)
+    best = int(np.argmax(significance))
+    lags_s = np.multiply(lags, step_s, dtype=float)
     apart_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
     rivals = significance[np.abs(lags_s - lags_s[best]) > apart_s]
     # The vertex of the parabola through the best lag and its neighbours.
@@ -227,7 +240,8 @@ def _masked_correlation(
     spectra = []
     for rates in (first, second):
         # Jumps are clipped and large values compressed.
-        mask, roots = np.isfinite(rates), np.sqrt(rates)
+        mask = np.isfinite(rates)
+        roots = np.sqrt(rates)
         roots = np.minimum(roots, quantile(roots[mask], 1 - _CLIPPED_SHARE))
         filled = np.where(mask, roots - np.nanmean(roots), 0.0)
         spectra += [np.fft.rfft(part, size) for part in (mask.astype(float), filled, filled**2)]
@@ -235,10 +249,13 @@ def _masked_correlation(
     one_b, b, bb = np.conj(spectra[3:])
     count = np.round(np.fft.irfft(one_a * one_b, size))
     divisor = np.maximum(count, 1.0)
-    sum_a, sum_b = np.fft.irfft(a * one_b, size), np.fft.irfft(one_a * b, size)
+    sum_a = np.fft.irfft(a * one_b, size)
+    sum_b = np.fft.irfft(one_a * b, size)
     covariance = np.fft.irfft(a * b, size) - sum_a * sum_b / divisor
-    square_a, square_b = np.fft.irfft(aa * one_b, size), np.fft.irfft(one_a * bb, size)
-    variance_a, variance_b = square_a - sum_a**2 / divisor, square_b - sum_b**2 / divisor
+    square_a = np.fft.irfft(aa * one_b, size)
+    square_b = np.fft.irfft(one_a * bb, size)
+    variance_a = square_a - sum_a**2 / divisor
+    variance_b = square_b - sum_b**2 / divisor
     varied = variance_a > 1e-9 * square_a.max(initial=0.0)
     varied &= variance_b > 1e-9 * square_b.max(initial=0.0)
     scale = np.sqrt(np.where(varied, variance_a * variance_b, 1.0))
@@ -337,7 +354,8 @@ def refine_time_offset(
     """
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
     coarse_s = at.correlation.offset_s
-    best, held = TimeOffset(coarse_s, reach_s / 5, at.correlation), list[float]()
+    best = TimeOffset(coarse_s, reach_s / 5, at.correlation)
+    held = list[float]()
     for lag_s in _LAGS_S:
         found = offset_over(lag_s, parent, child, at, max_gap_s, least_s)
         at = replace(at, fit=found.fit)
@@ -372,7 +390,9 @@ def offset_over(
     """
     span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
-    offset_s, start, settled_s = at.seconds, at.fit or start, max(_SETTLED_S, least_s / 20)
+    offset_s = at.seconds
+    start = at.fit or start
+    settled_s = max(_SETTLED_S, least_s / 20)
     rate = at.rate or ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
     for _ in range(_MAX_ROUNDS):
         most_pairs = _PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
@@ -383,10 +403,12 @@ def offset_over(
             return TimeOffset(offset_s, np.inf, at.correlation)
         # Velocities of the child in its own frame, over less at the ends of the trajectory.
         ends, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
-        stamps_ns, span_ns = pose_pairs.stamps_ns[ends], round(span_s * 1e9)
+        stamps_ns = pose_pairs.stamps_ns[ends]
+        span_ns = round(span_s * 1e9)
         ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*shifted.stamps_ns[[0, -1]])
         before, after = np.split(shifted.at(ends_ns.ravel()), 2)
-        steps, spans_s = se3.log(se3.inverse(before) @ after), np.diff(ends_ns, axis=0)[0] * 1e-9
+        steps = se3.log(se3.inverse(before) @ after)
+        spans_s = np.diff(ends_ns, axis=0)[0] * 1e-9
         twists = (steps / spans_s[:, None])[where]
         of_child = twists[: len(pairs)], twists[len(pairs) :]
         start = fit = fit_similarity(pairs, of_child, start=start, most=most)
@@ -400,7 +422,8 @@ def offset_over(
         offset_s = float(offset_s + fit.offset_s)
         is_small = abs(offset_s) + abs(fit.offset_s) < least_s / 2
         if abs(fit.offset_s) < settled_s or is_small:
-            earlier, rate = rate, _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
+            earlier = rate
+            rate = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
             is_settled = abs(rate.used - earlier.used) * child.duration_s < settled_s
             if is_settled and (most_pairs > MAX_PAIRS or not rate.is_used):
                 break

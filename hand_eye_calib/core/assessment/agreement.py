@@ -31,7 +31,8 @@ from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.results.records import AXES
 
 # A direction with a larger standard deviation (m, rad) is unknown; its variance then.
-_UNKNOWN, _UNKNOWN_VARIANCE = 0.3, 1e4
+_UNKNOWN = 0.3
+_UNKNOWN_VARIANCE = 1e4
 _ROUNDS = 2
 # Probability of a false alarm.
 _LEVEL = 0.01
@@ -113,7 +114,8 @@ class Agreement:
         order = [axis for axis in np.argsort(-ratios) if ratios[axis] >= min(2.0, ratios.max())]
         told = []
         for axis, name in ((axis, AXES[axis]) for axis in order):
-            size, sigma = amount(name, values[axis]), amount(name, float(np.sqrt(variances[axis])))
+            size = amount(name, values[axis])
+            sigma = amount(name, float(np.sqrt(variances[axis])))
             told.append(f"{axes_in_words([name])} by {size} +/- {sigma}")
         return listing(told)
 
@@ -138,7 +140,8 @@ def agreement_of(
     level : float
         Probability to accuse one of results that belong together.
     """
-    Ts, tau = Ts_parent_child, np.zeros(6) if usual is None else usual
+    Ts = Ts_parent_child
+    tau = np.zeros(6) if usual is None else usual
     stated = np.array([_without_unknown(each) for each in covariances])
     weights = np.linalg.inv(stated + np.diag(tau**2))
     best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
@@ -226,7 +229,8 @@ def _explanation(
     ranks = Blocks(_ranks(weights))
     all_chi2, all_dof = _left(products.total, ranks.total)
     p_value = float(chdtrc(all_dof, all_chi2)) if all_dof else 1.0
-    kind, apart = "differ" if p_value < _LEVEL else "agree", number < 0
+    kind = "differ" if p_value < _LEVEL else "agree"
+    apart = number < 0
     if len(number) < 3:
         kind = kind if len(number) == 2 else "single"
         return kind, apart, float(all_chi2), int(all_dof), p_value
@@ -235,7 +239,8 @@ def _explanation(
     ranks_of_group = np.concatenate([ranks.sums, ranks.since(since)])
     others = products.total - group, ranks.total - ranks_of_group
     chi2, dof = np.add(_left(group, ranks_of_group), _left(*others))
-    gained, spent = all_chi2 - chi2, all_dof - dof
+    gained = all_chi2 - chi2
+    spent = all_dof - dof
     p_values = chdtrc(spent, gained)
     with np.errstate(divide="ignore", invalid="ignore"):
         by_others = fdtrc(spent, dof, gained / spent / (chi2 / dof))
@@ -255,7 +260,8 @@ def _left(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, FloatArr
     """Chi-square and degrees of freedom that are left of groups of errors after the common part of
     each, from sums of ``(1 e)' W (1 e)`` (..., 7, 7) and of the ranks of W.
     """
-    weights, weighted = information(products), score(products)
+    weights = information(products)
+    weighted = score(products)
     common = np.linalg.solve(weights, weighted[..., None])[..., 0]
     chi2 = products[..., -1, -1] - (weighted * common).sum(axis=-1)
     return np.maximum(chi2, 0.0), np.asarray(ranks - _ranks(weights), dtype=float)

@@ -51,7 +51,8 @@ class Moved:
         """The verdict in one line, with what it rests on."""
         if self.verdict is Change.MOVED:
             return f"moved: {self.what}"
-        same, unknown = self._those(Change.SAME), self._those(Change.CANNOT_TELL)
+        same = self._those(Change.SAME)
+        unknown = self._those(Change.CANNOT_TELL)
         if not unknown:
             return f"same: {self._power(same)}"
         told = f"cannot tell about {listing(unknown)}"

@@ -99,7 +99,8 @@ def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> 
 
 
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
-    (first_name, one), (second_name, two) = first, second
+    first_name, one = first
+    second_name, two = second
     covariance, scatter, allowance = _spread(one) + _spread(two)
     if not (_is_found(one) and _is_found(two)):
         # What is the same in all recordings is in one of both only: the larger of both, by axis.
@@ -126,7 +127,8 @@ def _spread(given: Calibration | Extrinsic) -> FloatArray:
     its allowance, stacked.
     """
     rotation = given.T_parent_child[:3, :3]
-    covariance, allowance = np.diag(UNKNOWN**2), np.zeros((6, 6))
+    covariance = np.diag(UNKNOWN**2)
+    allowance = np.zeros((6, 6))
     measured = given.covariance_measured if isinstance(given, Calibration) else given.covariance
     if np.isfinite(measured).all():
         covariance = turned(rotation, measured)

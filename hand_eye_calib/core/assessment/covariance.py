@@ -46,7 +46,8 @@ from hand_eye_calib.core.solvers.all_pairs import Solution
 SolveWithout: TypeAlias = Callable[[BoolArray], FloatArray]
 
 # Blocks of the jackknife; fewest of them, and of the pairs in each.
-BLOCKS, _FEWEST = 10, (4, 3)
+BLOCKS = 10
+_FEWEST = (4, 3)
 
 # An unseen direction with at least this length in its rotation is not one of translation alone.
 _SHARE_OF_ROTATION = 0.5
@@ -80,7 +81,8 @@ _HIDDEN_SHARE = 0.1
 
 # Standard deviations (m, rad) above which an axis is weak, and above which it is unobservable: so
 # little is known that nobody can use the value.
-WEAK, UNOBSERVABLE = (0.05, float(np.radians(1.0))), 0.3
+WEAK = (0.05, float(np.radians(1.0)))
+UNOBSERVABLE = 0.3
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,8 @@ def assess(pairs: MotionPairs, solution: Solution, solve_without: SolveWithout) 
     ``solve_without(left_out)`` gives the answers (B, 4, 4) without the pairs in each row of
     ``left_out`` (B, K): blocks for a jackknife, if there are pairs enough.
     """
-    T_parent_child, resampled = solution.T_parent_child, None
+    T_parent_child = solution.T_parent_child
+    resampled = None
     model, unknown = model_covariance(pairs, solution)
     n_blocks = min(BLOCKS, len(pairs) // _FEWEST[1])
     if n_blocks >= _FEWEST[0]:
@@ -153,7 +156,8 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     The translation is unknown. So is a rotation about the only axis that the sensors rotate about:
     it is the axis along which they do not reveal a lever arm either.
     """
-    part, unseen = slice(3, 6), solution.unseen[3:]
+    part = slice(3, 6)
+    unseen = solution.unseen[3:]
     whole = np.zeros((6, 6))
     of_model = solution.cov_parent_child_in_child[part, part]
     whole[part, part] = widened_by_blocks(of_model, solution, part)
@@ -180,7 +184,8 @@ def assess_lever_arm(
     steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
     # Differences of steps have six times the variance of white noise.
     variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / CHI2[0.5][1] / 6.0
-    white, walk = float(np.sort(variances)[:2].mean()), np.exp(solution.levels[WALK_ROTATION])
+    white = float(np.sort(variances)[:2].mean())
+    walk = np.exp(solution.levels[WALK_ROTATION])
     hidden = noise_driven(
         Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
     )
@@ -229,7 +234,8 @@ def noise_driven(
         See :func:`hidden_directions`.
     """
     longest = max(len(Ts_pw_p) // BLOCKS, 1)
-    rotations, jumps_before = Ts_pw_p[:, :3, :3], np.concatenate([[0], np.cumsum(jumps)])
+    rotations = Ts_pw_p[:, :3, :3]
+    jumps_before = np.concatenate([[0], np.cumsum(jumps)])
     found: list[FloatArray] = []
     for baseline in sorted({*np.geomspace(1, longest, 4).astype(int).tolist()}, reverse=True):
         motions = np.swapaxes(rotations[:-baseline], 1, 2) @ rotations[baseline:]
@@ -250,7 +256,8 @@ def combined(
     """Covariance and verdicts from a model's covariance (6, 6) in the child's frame, that of
     resampling if there is one, and directions (6, U) that the motion does not reveal.
     """
-    known, scaled = np.eye(6) - unknown @ unknown.T, UNKNOWN_SIGMAS[:, None] * unknown
+    known = np.eye(6) - unknown @ unknown.T
+    scaled = UNKNOWN_SIGMAS[:, None] * unknown
     if resampled is not None:  # the larger one, direction by direction
         # In the coordinates where the model's is the identity, the eigenvalues are the ratios.
         variances, axes = np.linalg.eigh(model)
@@ -258,7 +265,8 @@ def combined(
         ratios, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, resampled).T))
         raised = root @ vectors
         model = (raised * np.maximum(ratios, 1.0)) @ raised.T
-    covariance, rotation = known @ model @ known + scaled @ scaled.T, T_parent_child[:3, :3]
+    covariance = known @ model @ known + scaled @ scaled.T
+    rotation = T_parent_child[:3, :3]
     sigmas = sigmas_in_parent(rotation, covariance)
     shares = ((np.kron(np.eye(2), rotation) @ unknown) ** 2).sum(axis=1)
     sigmas = np.where(shares > _HIDDEN_SHARE, np.inf, sigmas)
@@ -471,7 +479,8 @@ def floor_of_pairs(
     jacobian = np.concatenate([by_xi, push, residuals], axis=2)
     each = weights[:, None, None]
     products = multiplied(each * jacobian, jacobian)
-    information, pushed = products[:6, :6].copy(), products[:6, 6]
+    information = products[:6, :6].copy()
+    pushed = products[:6, 6]
     information[3:, 3:] += 2 * multiplied(each * turned, turned)
     by_scale = np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ pushed
     of_scale = max(float(products[6, 6] - pushed @ by_scale), 1e-30)

@@ -34,7 +34,8 @@ _STEP_NS = 1_000_000_000
 # directions; it is x from this cosine on. Directions of the shorter steps, below this share of the
 # median, are noise. (Road vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to
 # 0.85.)
-_ALONG_ONE_AXIS, _LONG_STEP = 0.9, 0.3
+_ALONG_ONE_AXIS = 0.9
+_LONG_STEP = 0.3
 # What turns a vehicle about its x, y and z.
 _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
 
@@ -87,7 +88,8 @@ class Excitation:
 def excitation(pose_pairs: PosePairs) -> Excitation:
     """The Excitation in synchronised poses."""
     n_poses = len(pose_pairs)
-    rotation, lever_arms = np.zeros(3), np.zeros((3, 3))
+    rotation = np.zeros(3)
+    lever_arms = np.zeros((3, 3))
     if n_poses < 2:
         return Excitation(n_poses, rotation, lever_arms, 0.0)
     rows = np.linspace(0, n_poses - 1, min(n_poses, _MAX_POSES)).astype(int)
@@ -104,7 +106,8 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
     distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
     found = [_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
     share, forward = max(found, key=lambda each: each[0])
-    motion_s, drives = seconds_of_motion(pose_pairs), share >= _ALONG_ONE_AXIS
+    motion_s = seconds_of_motion(pose_pairs)
+    drives = share >= _ALONG_ONE_AXIS
     return Excitation(n_poses, rotation, lever_arms, distance, motion_s, drives, forward)
 
 
@@ -149,11 +152,13 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     str
         Empty if nothing is missing.
     """
-    axes, what = [*seen.hidden_axes()], "cannot be determined from"
+    axes = [*seen.hidden_axes()]
+    what = "cannot be determined from"
     if calibration:
         axes = calibration.hidden
         if not axes:
-            known, what = calibration.observability, "still uncertain after"
+            known = calibration.observability
+            what = "still uncertain after"
             axes = [dof.name for dof in known if dof.verdict is DofVerdict.WEAK]
     if not axes:
         return ""

@@ -41,7 +41,8 @@ from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 
 # Shifts that are looked for: one standard deviation per axis (m, rad).
-SHIFT_M, SHIFT_RAD = 0.03, float(np.radians(1.0))
+SHIFT_M = 0.03
+SHIFT_RAD = float(np.radians(1.0))
 
 # Scatter between recordings of one rig, per axis (m, rad): of flights and hand-held recordings, and
 # of vehicles. A vehicle turns about one axis, and knows the translation along it so many times
@@ -51,14 +52,16 @@ _VEHICLE = 4.0
 
 # Motions over this time (ns) are compared, so many of them in it at most, and what they show is
 # added up over it.
-_BLOCK_NS, _MOTIONS_PER_BLOCK = 1_000_000_000, 20
+_BLOCK_NS = 1_000_000_000
+_MOTIONS_PER_BLOCK = 20
 
 _ROUNDS = 4
 _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
 
 # The recording is cut into so many windows of equal duration, whose answers show the long-run
 # variance; a shift separates at least so many of them on either side.
-_WINDOWS, _LEAST_WINDOWS = (8, 16), 2
+_WINDOWS = (8, 16)
+_LEAST_WINDOWS = 2
 _LEAST_WINDOW_S = 3.0
 
 # Log likelihood ratio from which on a shift is significant.
@@ -66,7 +69,9 @@ SIGNIFICANT = 12.0
 
 # Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
 # recording before and after that. A smaller probability is none.
-_MOVES, _LEAST_PARTS, _LEAST_PROBABILITY = 0.02, 4, 1e-3
+_MOVES = 0.02
+_LEAST_PARTS = 4
+_LEAST_PROBABILITY = 1e-3
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
@@ -101,7 +106,8 @@ def log_ratio(tables: FloatArray, shift: FloatArray | None = None) -> FloatArray
         L; :func:`shift_covariance` if left out.
     """
     L = shift_covariance() if shift is None else shift
-    H, S = information(tables), score(tables)
+    H = information(tables)
+    S = score(tables)
     _, log_volume = np.linalg.slogdet(np.eye(6) + L @ H)
     squared = (S * solve(H + np.linalg.inv(L), S)).sum(axis=-1)
     return 0.5 * squared - 0.5 * log_volume

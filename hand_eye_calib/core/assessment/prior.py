@@ -31,7 +31,8 @@ Prior: TypeAlias = Mapping[str, tuple[float, float]]
 # unknown.
 _UNKNOWN_SHARE = 0.25
 
-_MAX_STEPS, _STEP_TOLERANCE = 20, 1e-12
+_MAX_STEPS = 20
+_STEP_TOLERANCE = 1e-12
 
 # Step of differences, and smallest standard deviation of a prior (m or rad): nobody measures
 # better, and smaller ones make the equations singular.
@@ -56,7 +57,8 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
         Axis name (x, y, z, roll, pitch, yaw; of the child sensor's pose in the parent sensor's
         frame, angles about fixed axes) to (value, sigma), in m and rad. May be empty.
     """
-    T_parent_child, covariance = assessment.T_parent_child, assessment.cov_parent_child_in_child
+    T_parent_child = assessment.T_parent_child
+    covariance = assessment.cov_parent_child_in_child
     shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
     unknown = np.linalg.qr(UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE])[0]
     contradictions = _contradictions(assessment, prior) if prior else {}
@@ -65,7 +67,8 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     if not prior and not unknown.shape[1]:
         return found
     root, inverse_root, targets = _whitened(T_parent_child, covariance, unknown)
-    T, back = T_parent_child, T_parent_child[:3, :3].T
+    T = T_parent_child
+    back = T_parent_child[:3, :3].T
     none = np.zeros(0), np.zeros((0, 6))
     for _ in range(_MAX_STEPS):
         residuals, jacobian = _prior_residuals(T, prior) if prior else none
@@ -130,7 +133,8 @@ def _whitened(
 
 def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
     """Weighted residuals (P,) of the prior and their derivatives (P, 6) by (rho, phi)."""
-    residuals, jacobian = _weighted(T, prior), np.zeros((len(prior), 6))
+    residuals = _weighted(T, prior)
+    jacobian = np.zeros((len(prior), 6))
     for column, step in enumerate(_SMALL * np.eye(6)):
         for sign in (-1, 1):
             weighted = _weighted(se3.retracted(T, sign * step), prior)
@@ -159,7 +163,8 @@ def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
 
 def _contradictions(assessment: Assessment, prior: Prior) -> dict[str, float]:
     """Axis name to the distance of the prior in standard deviations, if it is too large."""
-    T, covariance = assessment.T_parent_child, assessment.cov_parent_child_in_child
+    T = assessment.T_parent_child
+    covariance = assessment.cov_parent_child_in_child
     _, jacobian = _prior_residuals(T, prior)
     distances = np.abs(_weighted(T, prior)) / np.sqrt(
         1.0 + np.einsum("pi,ij,pj->p", jacobian, covariance, jacobian)

@@ -14,7 +14,8 @@ from hand_eye_calib.core.solvers.registry import Method
 _CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
 # Fewest poses from which the noise can be estimated; fewest pairs that say something.
-MIN_POSES, _MIN_PAIRS = 13, 6
+MIN_POSES = 13
+_MIN_PAIRS = 6
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ def select_reference(
     poses = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     solution = solution or estimator.solve(pose_pairs.stamps_ns, *poses, quick=True)
     information = np.linalg.pinv(solution.cov_parent_child_in_child, hermitian=True)
-    to_answer, distances = se3.inverse(solution.T_parent_child), {}
+    to_answer = se3.inverse(solution.T_parent_child)
+    distances = {}
     for reference in _CANDIDATES:
         pairs = motion_pairs(*poses, reference)
         if len(pairs) >= _MIN_PAIRS:

@@ -90,7 +90,8 @@ def _explained(stamps_ns: IntArray, Ts: FloatArray, axis: FloatArray) -> float:
     """Share of the change of tilt that the change of acceleration explains, least squares."""
     step_s = median(np.diff(stamps_ns)) * 1e-9
     span = max(round(_SPRING_S / step_s), 1)
-    rotations, positions = Ts[:, :3, :3], Ts[:, :3, 3]
+    rotations = Ts[:, :3, :3]
+    positions = Ts[:, :3, 3]
     bends = positions[2 * span :] - 2.0 * positions[span:-span] + positions[: -2 * span]
     in_body = np.einsum("nji,nj->ni", rotations[span:-span], bends / (span * step_s) ** 2)
     pushed = in_body[span:] - in_body[:-span]

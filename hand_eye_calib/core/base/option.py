@@ -89,7 +89,9 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         If the value has the wrong type, is out of range or is not among the choices; one line that
         says what is allowed.
     """
-    meta, name, words = field.metadata, option_name(field), field.metadata["words"]
+    meta = field.metadata
+    name = option_name(field)
+    words = field.metadata["words"]
     value = _of_python(value)
     if type(value) is int and not -_LARGEST_INT < value < _LARGEST_INT:
         raise ConfigError(f"{name}: the number is too large")

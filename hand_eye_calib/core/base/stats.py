@@ -13,7 +13,8 @@ from hand_eye_calib.core.base.arrays import FloatArray
 
 # Medians of the absolute value of a normal variable, and of the length of a normal vector in three
 # dimensions.
-MEDIAN_NORMAL, MEDIAN_LENGTH = 0.6745, 1.538
+MEDIAN_NORMAL = 0.6745
+MEDIAN_LENGTH = 1.538
 
 # What chi-square exceeds with a probability, by its degrees of freedom; and what any of six normal
 # variables exceeds once in 200 times.
@@ -51,7 +52,8 @@ def median(values: ArrayLike) -> float:
 
 def medians(values: FloatArray) -> FloatArray:
     """Medians (...) of finite values (..., K), K at least 1."""
-    half, is_odd = values.shape[-1] // 2, values.shape[-1] % 2
+    half = values.shape[-1] // 2
+    is_odd = values.shape[-1] % 2
     parted = np.partition(values, half if is_odd else (half - 1, half), axis=-1)
     return np.asarray(
         parted[..., half] if is_odd else 0.5 * (parted[..., half - 1] + parted[..., half])

@@ -37,19 +37,24 @@ _DRIFT = 0.02
 
 # Two frames are one if they are this close (m, rad), within so many standard deviations; that of
 # the rotation must not be larger than the third.
-_SAME_M, SAME_RAD, MAX_SIGMA_RAD = 0.005, float(np.radians(0.3)), float(np.radians(0.5))
+_SAME_M = 0.005
+SAME_RAD = float(np.radians(0.3))
+MAX_SIGMA_RAD = float(np.radians(0.5))
 _WITHIN = 3.0
 
 # Upper bounds of the lever arm (m; two standard deviations above its length). Hardly two sensors
 # fit closer than the second, or, with axes that are parallel by no accident, than the third; of
 # other orientations, none are closer than the first.
-_SAME_POSITION_M, _NEARLY_M, _PARALLEL_M = 0.002, 0.012, 0.03
+_SAME_POSITION_M = 0.002
+_NEARLY_M = 0.012
+_PARALLEL_M = 0.03
 
 # A recording is split at these shares of its poses. A part is sound if its own rotation leaves
 # less than the first share of its rotations. It has other axes if the rotation of the other part
 # leaves more than the second.
 _SPLITS = (0.5, 0.25, 0.75)
-_SOUND_PART, _OTHER_PART = 0.25, 0.5
+_SOUND_PART = 0.25
+_OTHER_PART = 0.5
 
 # An axis whose root mean square rotation is below this share of the main axis's has no gain.
 _LITTLE = 0.1
@@ -59,23 +64,30 @@ _LEAST_FACTOR = 1e-3
 
 # A coordinate explains why streams disagree if it takes away this share of the squared residuals;
 # with less than the second it may be jumps of a clean recording, and is no error.
-_MOST, _SOME = 0.3, 0.1
+_MOST = 0.3
+_SOME = 0.1
 
 # Delays and smoothing are looked for in motions over this time (s), so many at most. Vehicles whose
 # streams are as they should be are off by some milliseconds: a delay counts from the second line on
 # (s), and is an error from so many times that; the offset of the clocks is shown by so much of the
 # evidence. Smallest smoothing (s^2); that of interpolation is a share of the squared interval.
-SHORT_S, MOST_SHORT = 1.0, 6000
-_DELAY_S, _GRAVE, _EXPECTED = 2.5 * FLOOR_TRAVEL_S, 2.0, 2.0 / 3.0
+SHORT_S = 1.0
+MOST_SHORT = 6000
+_DELAY_S = 2.5 * FLOOR_TRAVEL_S
+_GRAVE = 2.0
+_EXPECTED = 2.0 / 3.0
 # A delay above this time (s) and so many standard deviations is an error whatever explains it, if
 # its shift is; or with this shift (m) and this share of the evidence. The largest delays in 81
 # clean recordings are 33 ms, 38 mm and a share of 0.06 (EuRoC).
-_PLAIN_S, _PLAIN_SIGMAS = 0.04, 8.0
-_PLAIN_SHIFT_M, _PLAIN_SHARE = 0.02, 0.35
+_PLAIN_S = 0.04
+_PLAIN_SIGMAS = 8.0
+_PLAIN_SHIFT_M = 0.02
+_PLAIN_SHARE = 0.35
 # Of the size from which on a finding is an error: just above.
 _ERROR = 1.001
 
-_SMOOTHING_S2, _OF_INTERVAL = {"positions": 0.003, "orientations": 0.002}, 0.25
+_SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
+_OF_INTERVAL = 0.25
 
 
 def check_agreement(
@@ -174,7 +186,8 @@ def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     """Finding about an extrinsic, or a translation, of zero."""
-    distance_m, sigma_m = float(np.linalg.norm(T_parent_child[:3, 3])), float(sigmas[:3].max())
+    distance_m = float(np.linalg.norm(T_parent_child[:3, 3]))
+    sigma_m = float(sigmas[:3].max())
     upper_m = distance_m + 2 * sigma_m
     angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
     is_parallel = angle_rad < max(SAME_RAD, _WITHIN * sigmas[3:].max())
@@ -183,10 +196,12 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     if upper_m > near_m or sigmas[3:].max() > MAX_SIGMA_RAD:
         return []
     if is_parallel:
-        key, size = "same_frame", f"{length(distance_m)} and {angle(angle_rad)}"
+        key = "same_frame"
+        size = f"{length(distance_m)} and {angle(angle_rad)}"
         is_same = distance_m < _SAME_M or may_be_zero
     else:
-        key, size = "same_position", f"{length(distance_m)} +/- {length(sigma_m)}"
+        key = "same_position"
+        size = f"{length(distance_m)} +/- {length(sigma_m)}"
         is_same = upper_m < _SAME_POSITION_M or may_be_zero
     severity = Severity.ERROR if is_same else Severity.WARNING
     return [finding(key, "both", severity, size=size, translation_m=distance_m)]
@@ -194,7 +209,8 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
 
 def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> Finding | None:
     """A gain of the child's rotations about an axis; ``inverse`` if the parent's are fitted."""
-    (gains, sigmas), biases = slow.fit("gain"), slow.biases("gain")
+    gains, sigmas = slow.fit("gain")
+    biases = slow.biases("gain")
     most_sigmas, least, *_ = LIMITS["rotation_gain"]
     limits = np.maximum(most_sigmas * sigmas, BIASES * biases)
     ratios = np.abs(gains) / np.maximum(limits, least)
@@ -211,7 +227,8 @@ def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> 
 def _turned(slow: Regression, stream: str) -> Finding | None:
     """Positions of a stream that are turned against its orientations."""
     turns, sigmas = slow.fit(f"turned_{stream}")
-    sizes, (most_sigmas, least, *_) = np.abs(turns), LIMITS["worlds_turned"]
+    sizes = np.abs(turns)
+    most_sigmas, least, *_ = LIMITS["worlds_turned"]
     limits = np.hypot(most_sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}"))
     if (sizes < limits).all() or sizes.max() < least:
         return None
@@ -270,7 +287,8 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
 
 def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Finding | None:
     """A world that moves against the other."""
-    (drift, sigmas), positions = slow.fit("drift"), pose_pairs.Ts_cw_c[:, :3, 3]
+    drift, sigmas = slow.fit("drift")
+    positions = pose_pairs.Ts_cw_c[:, :3, 3]
     turning = np.cross(drift[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(usual, 1e-9)
@@ -292,7 +310,8 @@ def delay_suspects(
         groups = f"late_{stream}", f"late_axes_{stream}"
         delays_s, sigmas_s = fast.fit(groups[0], *beside)
         k, off_s, off_sigma_s = _odd_one(*fast.fit(groups[1], *beside))
-        delay_s, along = float(delays_s[0]), usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
+        delay_s = float(delays_s[0])
+        along = usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
         parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
         of_axis = (f"{'xyz'[k]} coordinates", "others")
         for group, late_s, sigma_s, speed_m_s, code, (part, others) in (
@@ -302,7 +321,8 @@ def delay_suspects(
         ):
             if late_s > _DELAY_S:
                 share = fast.share(group, *beside)
-                shift_m, sigma_m = late_s * speed_m_s, sigma_s * speed_m_s
+                shift_m = late_s * speed_m_s
+                sigma_m = sigma_s * speed_m_s
                 values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
                 if is_expected := abs(late_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED:
                     sigma_m *= _EXPECTED
@@ -314,7 +334,8 @@ def delay_suspects(
                     shift_m = max(shift_m, _ERROR * LIMITS["late"][-1])
                 elif is_expected or late_s < _GRAVE * _DELAY_S or share < _SOME:
                     least = min(1.0, LIMITS["late"][-1] / max(shift_m, 1e-9))
-                    shift_m, sigma_m = least * shift_m, least * sigma_m
+                    shift_m = least * shift_m
+                    sigma_m = least * sigma_m
                 values |= {"part": part, "others": others}
                 yield share, graded("late", stream, shift_m, sigma_m, **values)
 

@@ -43,12 +43,14 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pai
 
 # Of the interval of slow streams: accuracy of the coarse offset between them, and the gap that they
 # are interpolated across if their clocks differ by more.
-_COARSE, _SLOW_GAP = 0.5, 1.5
+_COARSE = 0.5
+_SLOW_GAP = 1.5
 
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
 
 # A scale is that of a unit within so many of its standard deviations, or to rounding (share).
-UNIT_SIGMAS, _UNIT_ROUNDING = 3.0, 1e-6
+UNIT_SIGMAS = 3.0
+_UNIT_ROUNDING = 1e-6
 # Distance of a scale from a parent's unit that is still that unit (share). Noise of the child
 # biases the scale: by 0.2 % for simulated arms, several standard deviations.
 _PARENT_UNIT_SHARE = 0.005
@@ -65,7 +67,8 @@ _ROUNDED = "coarse_positions"
 _MAX_MOTIONS = 1500
 
 # Shortest duration and smallest rotation with which the checks of a live session mean something.
-MIN_DURATION_S, MIN_ROTATION_RAD = 20.0, float(np.radians(30.0))
+MIN_DURATION_S = 20.0
+MIN_ROTATION_RAD = float(np.radians(30.0))
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,8 @@ def check_streams(
     if any(found.makes_unusable for found in findings if found.code != _ROUNDED):
         return CheckResult(gravest_first(findings))
     streams = given.shifted(time_offset_s)
-    explanation, at = None, TimeOffset()
+    explanation = None
+    at = TimeOffset()
     if known and not streams.is_slow:
         explanation, at = _as_they_are(streams, known[0])
     if not explanation:
@@ -257,11 +261,13 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
     """The fit from a known extrinsic X, and the clock offset with it, of streams that clearly agree
     as they are, in one unit and on about one clock; no explanation of others.
     """
-    (_, least_s, _, grave_s), lag_s = LIMITS["time_offset"], hypotheses.LAGS_S[1]
+    _, least_s, _, grave_s = LIMITS["time_offset"]
+    lag_s = hypotheses.LAGS_S[1]
     # In one step if it is below half of what is told.
     given = streams.parent, streams.child, TimeOffset(), streams.max_gap_s, 2.0 * least_s
     offset = time_offset.offset_over(lag_s, *given, X, hypotheses.HOLDS)
-    fit, left_s = offset.fit, offset.largest_s(streams.child.duration_s)
+    fit = offset.fit
+    left_s = offset.largest_s(streams.child.duration_s)
     explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
     if fit and explains and left_s < grave_s:
         shifted = streams.shifted(offset.seconds)
@@ -351,7 +357,8 @@ def _check_sizes(
     that agree, and the fit with the scale. ``timed`` is the fit with the time offset.
     """
     pose_pairs = streams.synchronised
-    motions, fit = _motions(pose_pairs, hypotheses.MAX_PAIRS), explanation.fit
+    motions = _motions(pose_pairs, hypotheses.MAX_PAIRS)
+    fit = explanation.fit
     chords = motions.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
     hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
@@ -360,7 +367,8 @@ def _check_sizes(
             of_both = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
             fit = similarity.estimate_scale(pose_pairs, of_both)
             if fit.has_own_unit:
-                total, sigma = known * fit.scale, known * fit.scale_sigma
+                total = known * fit.scale
+                sigma = known * fit.scale_sigma
                 values: dict[str, Any] = {"scale": total, "sigma": sigma}
                 values["options"] = {"scale": float(f"{total:.4g}")}
                 differs = graded("scale", "child", fit.scale - 1.0, **values)
@@ -402,7 +410,8 @@ def check_parts(
     distance of the sensors, if a solve has shown it.
     """
     if not (parent.has_positions and child.has_positions):
-        parent, child = parent.scaled(0.0), child.scaled(0.0)
+        parent = parent.scaled(0.0)
+        child = child.scaled(0.0)
     findings = check_positions(parent, "parent", max_gap_s)
     findings += check_positions(child, "child", max_gap_s)
     # Rounded positions stay the same while the sensor moves.

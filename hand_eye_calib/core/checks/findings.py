@@ -12,7 +12,8 @@ from hand_eye_calib.core.results.records import Finding, Severity, gravest_first
 
 __all__ = ["Finding", "Severity", "answered", "finding", "graded", "gravest_first"]
 
-_NOTE, _WARNING = Severity.NOTE, Severity.WARNING
+_NOTE = Severity.NOTE
+_WARNING = Severity.WARNING
 
 # Jumps up to this share hardly matter to the methods that reject outliers.
 _FEW_JUMPS = 0.02
@@ -516,7 +517,8 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
     """Grade findings by the options that are set. A finding that an option answers becomes a note,
     and so do a few jumps if the method rejects outliers.
     """
-    given, told = config.to_options(), []
+    given = config.to_options()
+    told = []
     for each in findings:
         options = dict(each.options)
         if each.code in CONVENTIONS:

@@ -40,7 +40,8 @@ from hand_eye_calib.core.pairing import motion_pairs
 # Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
 # so many at most, and to see which mistake it is.
 LAGS_S = (3.0, 1.0, 0.4)
-MAX_PAIRS, _MAX_ROUGH = 400, 120
+MAX_PAIRS = 400
+_MAX_ROUGH = 120
 MIN_PAIRS = 12
 
 # Largest angle (rad) of a rotation vector: near half a turn its sign is ambiguous.
@@ -48,20 +49,23 @@ MAX_ROTATION_RAD = 2.8
 
 # A hypothesis holds if it leaves at most this share of the motion unexplained. If the plain one
 # does not hold, another replaces it that leaves this many times less.
-HOLDS, _DECISIVE = 0.12, 2.0
+HOLDS = 0.12
+_DECISIVE = 2.0
 
 # Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
 _NOISY = 0.3
 
 # Among hypotheses that are about equally good the simpler one is taken, and the child's rather than
 # the parent's. A scale farther from 1 than this (logarithm) makes one less simple.
-_ABOUT_EQUAL, _ODD_SCALE = 1.5, 0.05
+_ABOUT_EQUAL = 1.5
+_ODD_SCALE = 0.05
 
 # Shape of the motion: the sum of the logarithms of paths and of lever arms. In 190 right recordings
 # (KinHEC, real, simulated) it was -0.25 at most, and below -0.4 in all but six; inverted, it has
 # the other sign. Another reading is considered above the first; the second decides where the noise
 # does not.
-_SUSPICIOUS, CLEAR_SHAPE = -0.2, 0.4
+_SUSPICIOUS = -0.2
+CLEAR_SHAPE = 0.4
 # Paths say less by this much if the sensors look at a point. A camera around its target had 0.4.
 _OF_TARGET = 0.5
 # What counts as the shape where a steady direction of travel decides.
@@ -375,7 +379,8 @@ def _below(
 ) -> list[Explanation]:
     """The best of the rivals, and those about as good, that leave less than this unexplained."""
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
-    few, first = streams.synchronised[np.concatenate([pairs.i, pairs.j])], np.arange(len(pairs))
+    few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
+    first = np.arange(len(pairs))
     tried: list[Explanation] = []
     for rival in rivals:
         poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
@@ -411,7 +416,8 @@ def _or_axes(
     best = min(rivals, key=lambda each: each.complexity)
     if _ABOUT_EQUAL**0.5 * min(each.fit.unexplained for each in rivals) < unexplained:
         return _fitted(best.hypothesis, streams, lag_s), []
-    detail, (_, stream) = best.hypothesis.detail, best.hypothesis.mistakes[0]
+    detail = best.hypothesis.detail
+    _, stream = best.hypothesis.mistakes[0]
     return chosen, [finding("ambiguous", stream, detail=detail)]
 
 
@@ -426,7 +432,8 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
     right = [[Hypothesis(way).corrected("parent", each) for way in _WAYS] for each in few]
     scatters = [[*map(trajectory.scatter_of_direction, each)] for each in right]
     scatter = dict(zip(_ALL_WAYS, np.maximum.outer(*scatters).flat, strict=True))
-    of_chosen, least = scatter[chosen.hypothesis], min(scatter.values())
+    of_chosen = scatter[chosen.hypothesis]
+    least = min(scatter.values())
     if least < min(trajectory.STEADY, of_chosen / trajectory.CLEARLY):
         best = [each for each in _ALL_WAYS if scatter[each] <= _ABOUT_EQUAL * least]
         steady = _fitted(min(best, key=lambda each: each.complexity), streams, lag_s)
@@ -540,12 +547,14 @@ def _least(poses: FloatArray, order: int) -> tuple[float, float]:
     fixed to a body with these poses and has the least, and of its origin.
     """
     changes = np.diff(poses[:, :3], order, axis=0)
-    steps, chords = changes[:, :, 3], changes[:, :, :3]
+    steps = changes[:, :, 3]
+    chords = changes[:, :, :3]
     lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
     for _ in range(_ROUNDS):
         least = 0.01 * median(lengths[-1])
         roots = np.sqrt(robust_weights("huber", (lengths[-1] / least) ** 2))
-        rows, target = (roots[:, None, None] * chords).reshape(-1, 3), roots[:, None] * steps
+        rows = (roots[:, None, None] * chords).reshape(-1, 3)
+        target = roots[:, None] * steps
         point = np.linalg.lstsq(rows, target.ravel(), rcond=1e-6)[0]
         lengths.append(np.linalg.norm(steps - chords @ point, axis=1) + 1e-9)
     sums = [float(each.sum()) for each in lengths]

@@ -37,7 +37,9 @@ _NEAREST = (40, 300)
 # does, more steeply than errors that add up. Times when both accelerate so many times more than
 # usual are left out: an impulse is white as well. So is motion that intervals are too long for:
 # noise of orientations is a small share of the squared rotation.
-_FLAT, _ABRUPT, _LITTLE_NOISE = 1.75, 4.0, 1e-3
+_FLAT = 1.75
+_ABRUPT = 4.0
+_LITTLE_NOISE = 1e-3
 _SHARED = np.array([3.0, 30.0])
 
 # A filter that corrects one stream by the other through an assumed mount shows the true mount in
@@ -164,7 +166,8 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
     steps = (se3.log(se3.inverse(Ts[:-1]) @ Ts[1:]) for Ts in both)
     a, b = (np.diff(each, 2, axis=0).reshape(-1, 2, 3) for each in steps)
     b = b @ se3.nearest_rotation(b[:, 1].T @ a[:, 1])
-    left, arms = b - a, se3.skew(a[:, 1])
+    left = b - a
+    arms = se3.skew(a[:, 1])
     left[:, 0] -= arms @ np.linalg.lstsq(arms.reshape(-1, 3), left[:, 0].ravel(), rcond=None)[0]
     sizes = np.linalg.norm([a, b], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)

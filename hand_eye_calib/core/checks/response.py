@@ -32,10 +32,12 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs
 
 # Step (s) of the differences that velocities and accelerations come from; an interval of the poses
 # if that is longer. Stamps may be off by this share of a step.
-_STEP_S, TOLERANCE = 0.05, 0.3
+_STEP_S = 0.05
+TOLERANCE = 0.3
 
 # Residuals of this many standard deviations have a quarter of the weight.
-_TUNING, _ROUNDS = 3.0, 4
+_TUNING = 3.0
+_ROUNDS = 4
 
 # Scales by axis stand in place of the scale.
 _INSTEAD = {"axes_child": "scale", "axes_parent": "scale"}
@@ -54,9 +56,11 @@ class Regression:
     def __init__(
         self, rows: FloatArray, probes: FloatArray, units: FloatArray, where: _Where, *base: str
     ) -> None:
-        self._where, self._base = where, base
+        self._where = where
+        self._base = base
         self._displaced = np.sqrt((rows[:, :3] ** 2).sum(axis=1).mean(axis=0))
-        rows, probes = rows / units, probes / units
+        rows = rows / units
+        probes = probes / units
         n_rows, size, n_columns = rows.shape
         flat = rows.reshape(-1, n_columns)
         known = flat[:, [*self._columns(), n_columns - 1]]
@@ -92,9 +96,11 @@ class Regression:
 
     def share(self, group: str, *beside: str) -> float:
         """The share of the squared residuals that a group takes away."""
-        before, costs = self._columns(group, *beside), []
+        before = self._columns(group, *beside)
+        costs = []
         for columns in (before, [*before, *self._where[group]]):
-            x, at = np.append(-self._blocks.solve(columns), 1.0), [*columns, -1]
+            x = np.append(-self._blocks.solve(columns), 1.0)
+            at = [*columns, -1]
             costs.append(float(x @ self._squares[np.ix_(at, at)] @ x))
         return 1.0 - costs[1] / max(costs[0], 1e-300)
 
@@ -118,7 +124,8 @@ class _Stream:
     """
 
     def __init__(self, poses: FloatArray, pairs: MotionPairs, turned: FloatArray) -> None:
-        self._poses, self._turned = poses, turned
+        self._poses = poses
+        self._turned = turned
         self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
         start, middle, end = (poses[rows] for rows in self.rows)
         self.from_world = turned @ np.swapaxes(middle[:, :3, :3], 1, 2)
@@ -137,7 +144,8 @@ class _Stream:
         """Velocity and acceleration (N, 3) of all poses in their world, angular velocity and
         acceleration in the parent's axes, by differences over steps of ``h`` seconds.
         """
-        p, n = self._poses[:, :3, 3], len(self._poses)
+        p = self._poses[:, :3, 3]
+        n = len(self._poses)
         rows = {k: np.clip(np.arange(n) + k * step, 0, n - 1) for k in (-2, -1, 1, 2)}
         turned = [
             se3.rotation_log(
@@ -219,13 +227,16 @@ def delays(
     step = max(round(_STEP_S / interval_s), 1)
     h = step * interval_s
     follow = np.zeros(len(stamps_ns), dtype=bool)
-    inner, around = np.arange(2 * step, len(stamps_ns) - 2 * step), np.array([-2, -1, 1, 2])
+    inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
+    around = np.array([-2, -1, 1, 2])
     elapsed_s = (stamps_ns[inner[:, None] + step * around] - stamps_ns[inner, None]) * 1e-9
     follow[inner] = (np.abs(elapsed_s - h * around) < TOLERANCE * h).all(axis=1)
     motions = motions[follow[motions.i] & follow[motions.j] & follow[(motions.i + motions.j) // 2]]
     if len(motions) < BLOCKS**2:
         return None
-    X, Ts_parent, Ts_child = T_parent_child, pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
+    X = T_parent_child
+    Ts_parent = pose_pairs.Ts_pw_p
+    Ts_child = pose_pairs.Ts_cw_c
     as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X  # by the other stream
     own, seen = (
         (_Stream(of_parent, motions, np.eye(3)), _Stream(of_child, motions, X[:3, :3]))
@@ -246,7 +257,8 @@ def _of_filters(
         start, middle, end = stream.rows
         faster = sign * (velocity[end] - velocity[start])
         bent = sign * (acceleration[start] - acceleration[end])
-        late, positions = se3.times(stream.from_world, faster), se3.times(stream.from_world, bent)
+        late = se3.times(stream.from_world, faster)
+        positions = se3.times(stream.from_world, bent)
         orientations = sign * se3.cross(bend[middle], stream.moved)
         if name == "child":
             groups["late"] = _rows(late + se3.cross(rate[middle], stream.moved), stream.back(rate))
@@ -284,7 +296,8 @@ def _regression(
     unexplained = displaced - se3.times(parent.chords, X[:3, 3])
     of_both = ((unexplained, 1e-7), (turned, 1e-8))
     sizes = [max(float(robust_sigma(v)), least) for v, least in of_both]
-    units, of_mount = np.repeat(sizes, 3)[:, None], _of_mount(parent, child)
+    units = np.repeat(sizes, 3)[:, None]
+    of_mount = _of_mount(parent, child)
     columns = of_mount | dict(groups) | {"target": _rows(displaced, turned)}
     ends = np.cumsum([each.shape[2] for each in columns.values()]).tolist()
     starts = zip(columns, [0, *ends], ends, strict=False)

@@ -18,7 +18,8 @@ _GAP_INTERVALS = 5.0
 
 # A step is a jump if it differs from the steps around it by this many times the median difference,
 # and by this many times a fast step.
-_JUMP_SIGMAS, _JUMP_STEPS = 12.0, 3.0
+_JUMP_SIGMAS = 12.0
+_JUMP_STEPS = 3.0
 
 # Poses, heights and verticals (m, rad) this close are the same, to rounding.
 _SAME = 1e-6
@@ -44,30 +45,42 @@ _MOVES_NOISES = 2.5
 
 # Two sensors take turns if a stream is this many times rougher from pose to pose than over some
 # longer lag (in poses), by at least so many metres. Repeated poses are another matter.
-_ALTERNATES, _MAX_PERIOD, _LEAST_LEVELS_M, _MAX_REPEATS = 2.0, 6, 0.01, 0.1
+_ALTERNATES = 2.0
+_MAX_PERIOD = 6
+_LEAST_LEVELS_M = 0.01
+_MAX_REPEATS = 0.1
 # Their levels are steady over so many turns, in the world or in the sensor's axes, and make up this
 # share of the roughness: a body that shakes, or walks, in step with the poses soon falls out of it.
-_TURNS, _STEADY_SHARE = 40, 0.6
+_TURNS = 40
+_STEADY_SHARE = 0.6
 
 # Positions are on a grid if this share of so many differences, those of a few steps, are multiples
 # of the smallest, to this share of a step.
-_MIN_GRID, _ON_GRID, _GRID_TOLERANCE, _MAX_MULTIPLE = 30, 0.98, 0.06, 200.0
-_MIN_DIFFERENT, _MAX_MOVING = 5, 0.9
+_MIN_GRID = 30
+_ON_GRID = 0.98
+_GRID_TOLERANCE = 0.06
+_MAX_MULTIPLE = 200.0
+_MIN_DIFFERENT = 5
+_MAX_MOVING = 0.9
 
 # No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears five times
 # gravity in a tenth of all seconds (m/s^2). Recordings have 6 at most; arms, which move least, 0.1,
 # and so exceed that in millimetres; what hand-held sensors have exceeds it in centimetres.
-_FASTEST, _HARDEST = 340.0, 49.0
+_FASTEST = 340.0
+_HARDEST = 49.0
 # A sensor more than 3 m from the other is on a car or a larger machine. Tyres and rails hold about
 # 8 m/s^2; simulated cars change their velocity by up to 7.2 m/s within a second.
-_LONG_LEVER_M, _HARDEST_OF_LARGE = 3.0, 9.8
+_LONG_LEVER_M = 3.0
+_HARDEST_OF_LARGE = 9.8
 # Usual changes of velocity within a second (m/s): cars have the largest, arms the smallest, 0.1.
-_MOST_USUAL, _LEAST_USUAL = 8.0, 0.1
+_MOST_USUAL = 8.0
+_LEAST_USUAL = 0.1
 # Slowest usual speed (m/s) of a sensor while it is calibrated. Arms have 0.05.
 _SLOWEST = 0.01
 
 # Velocities are over so long (s), so that noise adds little. A tenth of them may be of jumps.
-_STEP_S, USUAL = 1.0, 0.9
+_STEP_S = 1.0
+USUAL = 0.9
 
 
 def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:
@@ -91,7 +104,8 @@ def check_stream(
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(finding.code != "gaps" for finding in findings):
         return findings
-    interval_s, poses = np.diff(trajectory.stamps_ns) * 1e-9, trajectory.poses
+    interval_s = np.diff(trajectory.stamps_ns) * 1e-9
+    poses = trajectory.poses
     translations = np.einsum("kji,kj->ki", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
     rotations = se3.rotation_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     are_jumps = np.zeros(len(interval_s), dtype=bool)
@@ -116,10 +130,12 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         return [finding("too_short", stream, text=text)]
     if leap := find_leap(trajectory.stamps_ns):
         return [finding("leap", stream, text=leap[0], remedy=leap[1])]
-    intervals_s, findings = np.diff(trajectory.stamps_ns) * 1e-9, []
+    intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
+    findings = []
     if (gaps := are_gaps(intervals_s, max_gap_s)).any():
         share = float(intervals_s[gaps].sum() / intervals_s.sum())
-        longest_s, n_gaps = float(intervals_s.max()), int(gaps.sum())
+        longest_s = float(intervals_s.max())
+        n_gaps = int(gaps.sum())
         findings = [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
@@ -134,13 +150,15 @@ def _interleaved(trajectory: Trajectory) -> float:
     """Distance of the two levels (m), if two sensors take turns in a stream: positions that are
     rougher from one pose to the next than over several; otherwise 0.
     """
-    positions, stamps_ns = trajectory.poses[:, :3, 3], trajectory.stamps_ns
+    positions = trajectory.poses[:, :3, 3]
+    stamps_ns = trajectory.stamps_ns
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME
     if len(positions) < (_TURNS + 2) * _MAX_PERIOD or repeats.mean() > _MAX_REPEATS:
         return 0.0
     off = []  # the line between the poses so many before and after
     for lag in range(1, _MAX_PERIOD + 1):
-        before, after = positions[: -2 * lag], positions[2 * lag :]
+        before = positions[: -2 * lag]
+        after = positions[2 * lag :]
         elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
         share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
         off.append(positions[lag:-lag] - before - share[:, None] * (after - before))
@@ -180,7 +198,8 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
     """Finding about a stream that has only x, y and yaw while the other tilts, or none."""
     both = ("parent", parent), ("child", child)
     for (name, flat), (other, whole) in (both, both[::-1]):
-        vertical, heights = flat.poses[:, 2, 2], flat.poses[:, 2, 3]
+        vertical = flat.poses[:, 2, 2]
+        heights = flat.poses[:, 2, 3]
         if np.abs(vertical - vertical[0]).max() > _SAME or np.ptp(heights) > _SAME:
             continue
         # The direction in the other sensor whose image in the world scatters least: its axis of

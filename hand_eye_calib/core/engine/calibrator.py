@@ -94,7 +94,8 @@ class _PoseBuffer:
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> bool:
         """Take a pose; False if the stamp is a duplicate or too late."""
-        counts, index = self.statistics, bisect_left(self.stamps_ns, stamp_ns)
+        counts = self.statistics
+        index = bisect_left(self.stamps_ns, stamp_ns)
         if stamp_ns <= self._dropped_until_ns:
             counts.refused_late += 1
             return False
@@ -104,7 +105,8 @@ class _PoseBuffer:
         self.stamps_ns.insert(index, stamp_ns)
         self._poses[_WIDTH * index : _WIDTH * index] = array("d", pose)
         counts.received += 1
-        first_ns, last_ns = counts.first_stamp_ns, counts.last_stamp_ns
+        first_ns = counts.first_stamp_ns
+        last_ns = counts.last_stamp_ns
         counts.first_stamp_ns = stamp_ns if first_ns is None else min(first_ns, stamp_ns)
         counts.last_stamp_ns = stamp_ns if last_ns is None else max(last_ns, stamp_ns)
         return True
@@ -260,7 +262,8 @@ class Calibrator:
         is_unit = abs(math.hypot(*quat_xyzw) - 1.0) <= trajectory.QUATERNION_NORM_TOLERANCE
         if not (is_unit and math.hypot(*position) <= trajectory.FARTHEST_M):
             check_pose(*position, *quat_xyzw)  # says what is wrong, if anything is
-        buffer, limits = self._buffers[stream], self._limits
+        buffer = self._buffers[stream]
+        limits = self._limits
         is_full = len(buffer) >= limits.capacity
         is_due = buffer.statistics.received % limits.batch_every == 0
         if is_full or (is_due and len(buffer) > limits.pairing_starts):
@@ -272,7 +275,8 @@ class Calibrator:
 
     def snapshot(self) -> Snapshot:
         """All that is known now, for an estimate in this or another thread."""
-        parent, child = self._buffers["parent"], self._buffers["child"]
+        parent = self._buffers["parent"]
+        child = self._buffers["child"]
         config = self.config
         return Snapshot(
             config=config,
@@ -308,7 +312,9 @@ class Calibrator:
         poses so old that no late arrivals are expected among them. A time offset is estimated when
         a buffer is full.
         """
-        parent, child, limits = self._buffers["parent"], self._buffers["child"], self._limits
+        parent = self._buffers["parent"]
+        child = self._buffers["child"]
+        limits = self._limits
         if not len(parent) or not len(child):
             return
         config = self.config

@@ -86,20 +86,26 @@ class Solved:
         """The result without frame names; ``unseen`` axes count as unobservable whatever the method
         says.
         """
-        assessment, config = self.assessment, self.config
+        assessment = self.assessment
+        config = self.config
         if unseen:
             assessment = covariance.without_axes(assessment, unseen)
         fused = fuse(assessment, config.prior())
-        offset_s, offset_sigma_s = float(config.time_offset), 0.0
+        offset_s = float(config.time_offset)
+        offset_sigma_s = 0.0
         if offset := self.time_offset:
-            offset_s, offset_sigma_s = offset.seconds, offset.sigma_s
-        scale, scale_sigma, warnings = self.scale, 0.0, self.warnings
+            offset_s = offset.seconds
+            offset_sigma_s = offset.sigma_s
+        scale = self.scale
+        scale_sigma = 0.0
+        warnings = self.warnings
         if self.scale_fit:
             scale_sigma = self.scale_fit.scale_sigma
             times = f"{scale:.4f} +/- {scale_sigma:.4f}, as estimated from the motion"
             if config.scale == "auto":
                 warnings = (f"the child's lengths are multiplied by {times}", *warnings)
-        found, noise = self.solution, None
+        found = self.solution
+        noise = None
         if isinstance(found, AdaptiveSolution):
             noise = found.describe(self.stamps_ns)
             offset_s += found.time_offset_s
@@ -107,7 +113,8 @@ class Solved:
             scale_sigma = scale * found.scale_sigma or scale_sigma
             scale *= found.scale
         left = self.pairs.residuals(fused.T_parent_child)
-        start_ns, end_ns = self.stamps_ns[self.pairs.i], self.stamps_ns[self.pairs.j]
+        start_ns = self.stamps_ns[self.pairs.i]
+        end_ns = self.stamps_ns[self.pairs.j]
         return calibration_of(
             found,
             fused,
@@ -146,7 +153,8 @@ def calibration_of(
     the residuals, the stamps of the poses, and further fields. Axes that are mostly from the prior
     are named before the other warnings.
     """
-    dofs, silent = fused.observability, OUT_OF_REACH[fields.get("measured", "poses")]
+    dofs = fused.observability
+    silent = OUT_OF_REACH[fields.get("measured", "poses")]
     open_axes = {dof.name for dof in dofs if dof.verdict is DofVerdict.UNOBSERVABLE}
     status = SolveStatus.UNOBSERVABLE if open_axes.difference(silent) else SolveStatus.OK
     if not solution.converged:
@@ -208,7 +216,9 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config, is_beside=is_beside)
-    found, assessment, spread = solved.solution, solved.assessment, np.zeros((6, 6))
+    found = solved.solution
+    assessment = solved.assessment
+    spread = np.zeros((6, 6))
     if scale_fit:
         by_log_scale = scale_fit.sensitivity[:, 0]
         share = scale_fit.scale_sigma / scale_fit.scale
@@ -249,7 +259,8 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
     """The adaptive estimator; with method auto DNLO if its noise model cannot work on these poses,
     or if a reference is given, which only the paper's methods have.
     """
-    is_auto, with_dnlo = config.method == "auto", replace(config, method="dnlo")
+    is_auto = config.method == "auto"
+    with_dnlo = replace(config, method="dnlo")
     if is_auto and config.reference != "auto":
         dnlo = _solve_pairs(pose_pairs, with_dnlo)
         reason = f"auto: dnlo, because the user set reference {config.reference}"
@@ -317,13 +328,17 @@ def _solve_pairs(
     adaptive estimator's, if it is known. Beside another result there is no proof.
     """
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
-    reference, reason, spread = config.reference, "", np.zeros((6, 6))
+    reference = config.reference
+    reason = ""
+    spread = np.zeros((6, 6))
     warnings: tuple[str, ...] = ()
     if reference == "auto":
         from hand_eye_calib.core.assessment.reference_selection import select_reference
 
         choice = select_reference(pose_pairs, replace(method, backend="fast"), solution=solution)
-        reference, reason, model = choice.reference, choice.reason(), choice.model
+        reference = choice.reference
+        reason = choice.reason()
+        model = choice.model
         if model.converged and not model.unseen.size:
             spread, warnings = possible_shift(model.part_products, model.misfit)
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
@@ -351,14 +366,17 @@ def _solve_pairs(
 # A result is compared with the method that takes least time, at these baselines, from at most and
 # at least so many poses; the halves of a result without a baseline are solved at the last but one.
 _METHOD = "dnlo"
-_BASELINES, _MOST_POSES, _MIN_POSES = (1, 3, 8, 20), 3_000, 20
+_BASELINES = (1, 3, 8, 20)
+_MOST_POSES = 3_000
+_MIN_POSES = 20
 
 # Fewest other answers that have a scatter.
 _MIN_OTHERS = 3
 
 # Answers whose standard deviation is below so many of the result's are about as certain. Fewest of
 # them that say something.
-_AS_CERTAIN, _MIN_AS_CERTAIN = 3.0, 2
+_AS_CERTAIN = 3.0
+_MIN_AS_CERTAIN = 2
 
 # An answer from a smaller share of the motion pairs says nothing about others: DNLO keeps half of
 # them at least, however noisy they are.
@@ -413,10 +431,12 @@ def other_answers(
     """
     free = replace(config, prior_x="", prior_y="", prior_z="")
     free = replace(free, prior_roll="", prior_pitch="", prior_yaw="")
-    offset_s, scale = calibration.time_offset_s, calibration.scale
+    offset_s = calibration.time_offset_s
+    scale = calibration.scale
     settled = replace(free, method=_METHOD, backend="fast", time_offset=offset_s, scale=scale)
 
-    n_poses, own = len(pose_pairs), calibration.reference
+    n_poses = len(pose_pairs)
+    own = calibration.reference
     stride = max(-(-n_poses // _MOST_POSES), 1)
     others = [
         (f"B{n}", slice(None, None, stride))
@@ -448,7 +468,8 @@ def compare_answers(
     those count that do not reject half of the motion pairs, and from the first and the second half
     of the recording, or fewer.
     """
-    sigmas, allowance = calibration.sigmas_measured, calibration.allowance
+    sigmas = calibration.sigmas_measured
+    allowance = calibration.allowance
     sound = _sound(others)
     pairs = [_apart(calibration, other) for other in sound]
     apart, joint = np.reshape(pairs, (-1, 2, 6)).swapaxes(0, 1)

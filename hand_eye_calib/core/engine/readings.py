@@ -142,13 +142,15 @@ def _difference(first: PosePairs, second: PosePairs) -> float:
     _, of_first, of_second = np.intersect1d(
         first.stamps_ns, second.stamps_ns, assume_unique=True, return_indices=True
     )
-    first, second = first[of_first], second[of_second]
+    first = first[of_first]
+    second = second[of_second]
     try:
         fit = estimate_scale(first)
     except NotEnoughDataError:
         return 0.0
     scale = fit.scale if fit.has_own_unit else 1.0
-    first, second = first.child_scaled(scale), second.child_scaled(scale)
+    first = first.child_scaled(scale)
+    second = second.child_scaled(scale)
     try:
         return loss_difference(
             first.stamps_ns, (first.Ts_pw_p, first.Ts_cw_c), (second.Ts_pw_p, second.Ts_cw_c)

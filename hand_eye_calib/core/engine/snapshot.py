@@ -206,7 +206,8 @@ class Snapshot:
         self._check_frames()
         kind = kind_of(self.config)
         kind.require_allowed(self.config)
-        resolved, pairs = self.resolved, self.pose_pairs
+        resolved = self.resolved
+        pairs = self.pose_pairs
         if len(pairs) < resolved.config.min_pairs:
             raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
         result = kind.solve(resolved, cross_check)
@@ -224,7 +225,8 @@ class Snapshot:
         """
         streams = [*self.unpaired]
         if len(self.kept):
-            pairs, offset_s = self.pose_pairs, float(self.resolved.config.time_offset)
+            pairs = self.pose_pairs
+            offset_s = float(self.resolved.config.time_offset)
             streams = [Trajectory(pairs.stamps_ns, Ts) for Ts in (pairs.Ts_pw_p, pairs.Ts_cw_c)]
             streams[1] = streams[1].shifted(-offset_s)
         for k, stream in enumerate(STREAMS):
@@ -257,7 +259,8 @@ class Snapshot:
 
 def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
     """The trajectory of a stream in the usual convention, from that of the options."""
-    invert, order = getattr(config, f"{stream}_invert"), getattr(config, f"{stream}_quaternion")
+    invert = getattr(config, f"{stream}_invert")
+    order = getattr(config, f"{stream}_quaternion")
     if (invert, order) != ("none", "xyzw"):
         kind = trajectory.measures
         if kind not in ("poses", "rotations") or (invert, kind) == ("poses", "rotations"):

@@ -74,7 +74,8 @@ def check_pose(*values: float) -> None:
 
 def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
     """Pose (4, 4) of a transform as it comes from outside. Raises as :func:`check_pose`."""
-    t, quat_xyzw = np.asarray(position, dtype=float), np.asarray(quat_xyzw, dtype=float)
+    t = np.asarray(position, dtype=float)
+    quat_xyzw = np.asarray(quat_xyzw, dtype=float)
     check_pose(*t.tolist(), *quat_xyzw.tolist())
     return se3.from_quat_xyzw(t, quat_xyzw)
 
@@ -102,7 +103,8 @@ def pose_of(*values: Any) -> FloatArray:
     elif sizes == (3, 4):
         T = checked_pose(flat[:3], np.roll(flat[3:], -1))
     elif sizes == (3, 9):
-        T[:3, 3], T[:3, :3] = flat[:3], flat[3:].reshape(3, 3)
+        T[:3, 3] = flat[:3]
+        T[:3, :3] = flat[3:].reshape(3, 3)
     elif sizes == (3, 3):
         rotation = se3.rotation_from_rpy(np.radians(flat[3:]))
         T = se3.from_rotation_translation(rotation, flat[:3])

@@ -24,9 +24,15 @@ def skew(vectors: ArrayLike) -> FloatArray:
     """Matrices S (..., 3, 3) of vectors (..., 3), with ``S @ v == cross(vector, v)``."""
     vectors = np.asarray(vectors, dtype=float)
     matrices: FloatArray = np.zeros((*vectors.shape, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
-    matrices[..., 1, 0], matrices[..., 2, 0], matrices[..., 2, 1] = z, -y, x
+    x = vectors[..., 0]
+    y = vectors[..., 1]
+    z = vectors[..., 2]
+    matrices[..., 0, 1] = -z
+    matrices[..., 0, 2] = y
+    matrices[..., 1, 2] = -x
+    matrices[..., 1, 0] = z
+    matrices[..., 2, 0] = -y
+    matrices[..., 2, 1] = x
     return matrices
 
 
@@ -45,13 +51,16 @@ def cross(left: FloatArray, right: FloatArray) -> FloatArray:
     """
     (x, y, z), (u, v, w) = (vectors.T for vectors in (left, right))
     products = np.empty(left.shape)
-    products.T[0], products.T[1], products.T[2] = y * w - z * v, z * u - x * w, x * v - y * u
+    products.T[0] = y * w - z * v
+    products.T[1] = z * u - x * w
+    products.T[2] = x * v - y * u
     return products
 
 
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
     """Transforms (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3), m."""
-    rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
+    rotation = np.asarray(rotation, dtype=float)
+    translation = np.asarray(translation, dtype=float)
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     transforms = np.zeros((*shape, 4, 4))
     transforms[..., :3, :3] = rotation
@@ -165,9 +174,11 @@ def _scaled_quats(rotations: FloatArray) -> FloatArray:
     quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
     large = np.flatnonzero(trace < 0.0)
     if large.size:
-        R, row = rotations[large], np.arange(len(large))
+        R = rotations[large]
+        row = np.arange(len(large))
         i = np.argmax(np.diagonal(R, axis1=1, axis2=2), axis=1)
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         far = np.empty((len(R), 4))
         far[row, i] = 1.0 - trace[large] + 2.0 * R[row, i, i]
         far[row, j], far[row, k] = R[row, j, i] + R[row, i, j], R[row, k, i] + R[row, i, k]
@@ -187,10 +198,18 @@ def rotation_exp(rotation_vector: ArrayLike) -> FloatArray:
 
 def _matrices(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> FloatArray:
     """Rotation matrices (..., 3, 3) of unit quaternions, given by coefficient, each (...)."""
-    twice_x, twice_y, twice_z = 2.0 * x, 2.0 * y, 2.0 * z
-    xx, yy, zz = twice_x * x, twice_y * y, twice_z * z
-    xy, xz, yz = twice_x * y, twice_x * z, twice_y * z
-    xw, yw, zw = twice_x * w, twice_y * w, twice_z * w
+    twice_x = 2.0 * x
+    twice_y = 2.0 * y
+    twice_z = 2.0 * z
+    xx = twice_x * x
+    yy = twice_y * y
+    zz = twice_z * z
+    xy = twice_x * y
+    xz = twice_x * z
+    yz = twice_y * z
+    xw = twice_x * w
+    yw = twice_y * w
+    zw = twice_z * w
     entries = [1.0 - (yy + zz), xy - zw, xz + yw]
     entries += [xy + zw, 1.0 - (xx + zz), yz - xw]
     entries += [xz - yw, yz + xw, 1.0 - (xx + yy)]
@@ -235,9 +254,11 @@ def exp(xi: ArrayLike) -> FloatArray:
     eqs 172-174.
     """
     xi = np.asarray(xi, dtype=float)
-    rho, phi = xi[..., :3], xi[..., 3:]
+    rho = xi[..., :3]
+    phi = xi[..., 3:]
     angle = np.linalg.norm(phi, axis=-1)
-    small, squared = angle < _SERIES_ANGLE, angle**2
+    small = angle < _SERIES_ANGLE
+    squared = angle**2
     safe = np.where(small, 1.0, angle)
     first = np.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - np.cos(safe)) / safe**2)
     series = 1 / 6 - squared / 120 + squared**2 / 5040
@@ -269,7 +290,8 @@ def log(transforms: ArrayLike) -> FloatArray:
     phi = rotation_log(transforms[..., :3, :3])
     translation = transforms[..., :3, 3]
     angle = np.linalg.norm(phi, axis=-1)
-    small, squared = angle < _SERIES_ANGLE, angle**2
+    small = angle < _SERIES_ANGLE
+    squared = angle**2
     safe = np.where(small, 1.0, angle)
     series = 1 / 12 + squared / 720 + squared**2 / 30240
     coefficient = np.where(small, series, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
@@ -413,7 +435,9 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     if not np.isfinite(covariance).all():
         return np.full(3, np.inf)
     roll, pitch, _ = rotation_to_rpy(rotation)
-    sine, cosine, tangent = np.sin(roll), np.cos(roll), np.tan(pitch)
+    sine = np.sin(roll)
+    cosine = np.cos(roll)
+    tangent = np.tan(pitch)
     # Derivative of roll, pitch and yaw with respect to phi in R exp(phi).
     jacobian = np.array(
         [

@@ -36,18 +36,21 @@ _STEPS_IN_EXTENT = 50
 
 # In a wrong convention the direction scatters at least so much, and so many times as much as in the
 # right one.
-STEADY, CLEARLY = 0.05, 4.0
+STEADY = 0.05
+CLEARLY = 4.0
 
 # Of white noise: covariance of neighbouring changes over their variance, and variance of the mean
 # of two of them over theirs.
-_CORRELATION, _LEFT_IN_THE_MEAN = -2.0 / 3.0, 1.0 / 6.0
+_CORRELATION = -2.0 / 3.0
+_LEFT_IN_THE_MEAN = 1.0 / 6.0
 
 
 def scatter_of_direction(poses: FloatArray) -> float:
     """How much the direction of a sensor's motion scatters in its own axes: 0 if it is always the
     same, as on vehicles, 1 if it goes everywhere, or if there are too few steps.
     """
-    positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
+    positions = poses[:, :3, 3]
+    rotations = poses[:, :3, :3]
     step = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
     travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
     rows = np.flatnonzero(np.diff(np.floor(travelled / (step or np.inf)), prepend=-1.0))
@@ -363,7 +366,8 @@ class Trajectory(Columns):
         between = (fraction != 0.0) & (fraction != 1.0)
         if between.any():
             steps, changes, motion = self._steps
-            shares, bent = fraction[between, None], between & ~outside
+            shares = fraction[between, None]
+            bent = between & ~outside
             poses[between] = poses[between] @ se3.exp(shares * steps[before[between]])
             if bent.any() and not straight:
                 bends = self.stamps_ns, changes, motion, before[bent], fraction[bent]
@@ -436,7 +440,8 @@ def corners(
     ``start`` (M,) are the indices of those before each wanted one, ``fraction`` (M,) is of the
     interval to the next. Returns xi (M, 6) in ``T_world_sensor exp(xi)``.
     """
-    at_start, at_end = changes[start], changes[start + 1]
+    at_start = changes[start]
+    at_end = changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
     missing = 0.5 * fraction * (1.0 - fraction) * (np.diff(stamps_ns)[start] * 1e-9) ** 2
     return -missing[:, None] * shares[start] * bend

@@ -120,11 +120,16 @@ def select_keyframes(
     n_poses = len(pose_pairs)
     if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
         return np.arange(n_poses)
-    stamps_ns, poses, kept = pose_pairs.stamps_ns, pose_pairs.Ts_pw_p, []
+    stamps_ns = pose_pairs.stamps_ns
+    poses = pose_pairs.Ts_pw_p
+    kept = []
     if previous is not None and len(previous):
-        last_ns, T_last = previous.stamps_ns[-1], previous.Ts_pw_p[-1]
+        last_ns = previous.stamps_ns[-1]
+        T_last = previous.Ts_pw_p[-1]
     else:
-        kept, last_ns, T_last = [0], stamps_ns[0], poses[0]
+        kept = [0]
+        last_ns = stamps_ns[0]
+        T_last = poses[0]
     index = len(kept)
     while index < n_poses:
         window = slice(index, index + _WINDOW)
@@ -139,7 +144,8 @@ def select_keyframes(
         hits = index + np.flatnonzero(wanted & has_moved)
         if hits.size:
             kept.append(int(hits[0]))
-            last_ns, T_last = stamps_ns[hits[0]], poses[hits[0]]
+            last_ns = stamps_ns[hits[0]]
+            T_last = poses[hits[0]]
         index = kept[-1] + 1 if hits.size else index + _WINDOW
     return np.array(kept, dtype=int)
 
@@ -150,7 +156,8 @@ def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
     """
     if len(stamps_ns) < 2:
         return None
-    intervals_s, count = np.diff(stamps_ns) * 1e-9, len(stamps_ns)
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    count = len(stamps_ns)
     before = int(np.argmax(intervals_s)) + 1
     days = float(intervals_s[before - 1]) / _LEAP_S
     if days <= 1.0:
@@ -187,7 +194,8 @@ class MotionPairs(Columns):
         results have this one. Rotation vectors, in rad, in the axes of the child sensor at instant
         j, of the rotation from ``R_A R`` to ``R R_B``; their lengths are the angles of eq. (7).
         """
-        rotation, translation = T_parent_child[:3, :3], T_parent_child[:3, 3]
+        rotation = T_parent_child[:3, :3]
+        translation = T_parent_child[:3, 3]
         chord = self.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
         moved_child = self.Ts_childi_childj[:, :3, 3] @ rotation.T
         apart = chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
@@ -222,7 +230,8 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
     n_poses = len(Ts_pw_p)
     if kind == "C":
         keyframes = np.arange(0, max(n_poses - step, 0), step)
-        i, j = np.repeat(keyframes, step - 1), keyframes[:, None] + np.arange(1, step)
+        i = np.repeat(keyframes, step - 1)
+        j = keyframes[:, None] + np.arange(1, step)
     else:
         j = np.arange(step, n_poses)
         i = np.zeros_like(j) if kind == "A" else j - step

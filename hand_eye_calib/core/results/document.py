@@ -67,7 +67,8 @@ class Notation:
 
 def document_of(result: Judged) -> Document:
     """The document of a result; see ``Calibration.to_dict``."""
-    parent, child = result.parent_frame, result.child_frame
+    parent = result.parent_frame
+    child = result.child_frame
     document: Document = {
         "verdict": result.verdict,
         "headline": result.headline,
@@ -96,7 +97,8 @@ def document_of(result: Judged) -> Document:
 
 def _covariances_of(result: Result) -> Document:
     """The covariance of a document, and its two parts."""
-    of, child = "error xi in T_parent_child @ exp(xi)", result.child_frame
+    of = "error xi in T_parent_child @ exp(xi)"
+    child = result.child_frame
     order = ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]
     measured = f"{of}: the part that the recording shows"
     allowance = f"{of}: the allowance for constant errors, which no recording shows"
@@ -119,10 +121,13 @@ def _observability_of(result: Result) -> list[Document]:
 
 def transforms_of(result: Result) -> dict[str, Notation]:
     """The transforms of a result by their names."""
-    T, parent, child = result.T_parent_child, result.parent_frame, result.child_frame
+    T = result.T_parent_child
+    parent = result.parent_frame
+    child = result.child_frame
     own = result.covariance_measured, result.covariance_allowance
     exchanged = [inverse_covariance(T, each) for each in own]
-    known_m, hidden = result.sigmas_measured[:3], {*result.unobservable()}
+    known_m = result.sigmas_measured[:3]
+    hidden = {*result.unobservable()}
     # Where the rotation is out of reach, the axes of both sensors are the same by convention.
     of_inverse_m = known_m if {*ROTATIONS} <= {*result.out_of_reach} else None
     rows: list[tuple[str, FloatArray, str, str, Sequence[FloatArray], FloatArray | None]] = [
@@ -177,8 +182,10 @@ def matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
 
 def summary(result: Result) -> dict[str, str]:
     """How a result was solved, as names and values."""
-    rate, proof = result.clock_rate, {"yes": "", "no": "not "}
-    offset, method = result.time_offset_s, [f"{result.method} ({result.backend})"]
+    rate = result.clock_rate
+    proof = {"yes": "", "no": "not "}
+    offset = result.time_offset_s
+    method = [f"{result.method} ({result.backend})"]
     rows = {
         "Method": "; ".join(filter(None, [*method, result.method_reason])),
         "Reference": result.reference_reason or result.reference,
@@ -271,7 +278,8 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
     """
     if result.verdict is Verdict.DO_NOT_USE:
         return {}
-    T, unknown = result.mounting[1], {*result.unobservable()}
+    T = result.mounting[1]
+    unknown = {*result.unobservable()}
     hidden = np.array([axis in unknown for axis in TRANSLATIONS])
     if result.T_base_parent is not None:  # axes that share a direction that the motion hides
         of_base = np.abs(result.T_base_parent[:3, :3][:, hidden])

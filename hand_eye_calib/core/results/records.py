@@ -19,7 +19,8 @@ from hand_eye_calib.core.geometry.trajectory import Columns
 INLIER_WEIGHT = 0.5
 
 
-TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("roll", "pitch", "yaw")
+TRANSLATIONS = ("x", "y", "z")
+ROTATIONS = ("roll", "pitch", "yaw")
 AXES = (*TRANSLATIONS, *ROTATIONS)
 
 # Axes that streams say nothing about, by what they measure together.

@@ -304,5 +304,6 @@ class Result:
     @property
     def out_of_reach(self) -> tuple[str, ...]:
         """Axes that streams of this kind say nothing about, and no prior either."""
-        silent, unknown = records.OUT_OF_REACH.get(self.measured, ()), self.unobservable()
+        silent = records.OUT_OF_REACH.get(self.measured, ())
+        unknown = self.unobservable()
         return tuple(axis for axis in silent if axis in unknown)

@@ -100,11 +100,14 @@ class Rule(NamedTuple):
 # by so many of its own standard deviations and so many targets: that they are uncertain themselves
 # does not excuse a large scatter. However far, they never forbid a result: they know less of the
 # noise than the method that gave it, and state no time-correlated errors.
-CONTRADICTED_SIGMAS, CONTRADICTED_SHARE, CONTRADICTED_TARGETS = 3.0, 0.25, 2.0
+CONTRADICTED_SIGMAS = 3.0
+CONTRADICTED_SHARE = 0.25
+CONTRADICTED_TARGETS = 2.0
 
 # Smallest share of the motion pairs that are inliers in a recording whose noise is understood; of
 # the poses, for a method that models the noise and need not reject what is merely noisy.
-FEWEST_INLIERS, FEWEST_OF_MODEL = 0.7, 0.9
+FEWEST_INLIERS = 0.7
+FEWEST_OF_MODEL = 0.9
 
 # Rules that state a limit of the recording; the others are signs that something is wrong.
 _KINDS = dict.fromkeys(
@@ -148,7 +151,8 @@ class Judged(Result):
     @property
     def headline(self) -> str:
         """The verdict with its gravest reason, or with what is known, in one line."""
-        decided, gravest = self.verdict.value, shown(self.reasons)
+        decided = self.verdict.value
+        gravest = shown(self.reasons)
         notable = "".join(f"; {finding.what}" for finding in self.findings if _is_notable(finding))
         if not gravest:
             return f"{decided}: {what_is_known(self)}{notable}"
@@ -183,7 +187,8 @@ def what_is_known(result: Result) -> str:
     """Axes, and the largest standard deviations of a translation and of a rotation, with the floor,
     in words.
     """
-    axes, texts = _axes(result), []
+    axes = _axes(result)
+    texts = []
     for names in (TRANSLATIONS, ROTATIONS):
         if known := [axis for axis in axes if axis.name in names]:
             worst = max(known, key=lambda axis: axis.total)
@@ -245,7 +250,8 @@ def _findings_of(severity: Severity, result: Result) -> Iterator[_Found]:
 
 def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
     """Other answers (``kind``: halves or methods) that lie farther away than they may."""
-    told, sigmas = {}, []
+    told = {}
+    sigmas = []
     for axis in _axes(result):
         row = (result.cross_check or {}).get(axis.name)
         if row is None or not math.isfinite(axis.sigma):
@@ -263,9 +269,13 @@ def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
 def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
     """Scatter of other answers (``kind``: halves or methods) on an axis, and if it is too large."""
     if kind == "halves":
-        scatter, excess, over_own = row.of_halves, row.excess_of_halves, None
+        scatter = row.of_halves
+        excess = row.excess_of_halves
+        over_own = None
     else:
-        scatter, excess, over_own = row.of_methods, row.excess_of_methods, row.excess_over_own
+        scatter = row.of_methods
+        excess = row.excess_of_methods
+        over_own = row.excess_over_own
     if scatter is None and over_own is not None:
         # Too few answers determine the axis for a scatter, but those that do are about as certain.
         scatter = over_own * axis.total
@@ -399,7 +409,8 @@ class _Axis(NamedTuple):
 
 
 def _axes(result: Result) -> list[_Axis]:
-    hidden, totals = result.unobservable(), result.sigmas.tolist()
+    hidden = result.unobservable()
+    totals = result.sigmas.tolist()
     return [
         _Axis(
             name=dof.name,
@@ -414,7 +425,8 @@ def _axes(result: Result) -> list[_Axis]:
     ]
 
 
-_NEVER, _CARE = Verdict.DO_NOT_USE, Verdict.USE_WITH_CARE
+_NEVER = Verdict.DO_NOT_USE
+_CARE = Verdict.USE_WITH_CARE
 _APART = (
     f"differ by more than {CONTRADICTED_SIGMAS:g} joint standard deviations and "
     f"{CONTRADICTED_SHARE:g} of the target"

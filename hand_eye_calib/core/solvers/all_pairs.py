@@ -87,7 +87,8 @@ def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |A X - X B|_F^2`` over X, of K >= 1 pairs."""
-    coefficients, weights = quadratic_form.coefficients(pairs), np.ones(len(pairs))
+    coefficients = quadratic_form.coefficients(pairs)
+    weights = np.ones(len(pairs))
     Q = quadratic_form.weighted_sum(coefficients, weights)
     T, converged = lowest(Q, pairs)
     objective = float(quadratic_form.costs(coefficients, T).sum())

@@ -24,13 +24,15 @@ from hand_eye_calib.core.solvers import quadratic_form
 
 # The bound may exceed the minimum by this share of it, and by this share of the form's mean
 # eigenvalue, which is rounding.
-_RELATIVE, _ROUNDING = 1e-6, 1e-11
+_RELATIVE = 1e-6
+_ROUNDING = 1e-11
 
 _MAX_STEPS = 60
 
 # The barrier's weight, first the square of this, grows by this factor once a Newton step is short,
 # until the bound is this close to the best that any multipliers give.
-_SHARPENING, _CLOSE = 10.0, 1e-12
+_SHARPENING = 10.0
+_CLOSE = 1e-12
 
 
 def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
@@ -68,7 +70,8 @@ def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
     free = beside.T @ Z @ beside
     derivatives = np.concatenate([beside.T @ of_free @ beside, np.eye(9)[None]])
     shift = max(-float(np.linalg.eigvalsh(free)[0]), 0.0) + 0.1
-    unknowns, weight = np.append(np.zeros(len(of_free)), shift), _SHARPENING**2
+    unknowns = np.append(np.zeros(len(of_free)), shift)
+    weight = _SHARPENING**2
     best = float(np.linalg.eigvalsh(Z)[0])
     for _ in range(_MAX_STEPS):
         if best >= enough:

@@ -45,7 +45,9 @@ _SHARP = 30.0
 _INLIER_SHARES = (0.2, 0.5)
 _SUBSET_SIZES = (4, 8, 16, 32)
 _STARTED_PAIRS = 5000
-_FIRST_ROUNDS, _FOLLOWED, _MAX_GENERATIONS = 3, 3, 3
+_FIRST_ROUNDS = 3
+_FOLLOWED = 3
+_MAX_GENERATIONS = 3
 
 # A rival from any subset replaces the answer if its objective is below this share of it. A new
 # answer that is lower by less than the second share ends the search.
@@ -55,7 +57,8 @@ _HARDLY = 1e-6
 # Rounds of weights and X in turn, and the share by which the objective falls in the last one: in
 # the search, and on all pairs.
 _MAX_ROUNDS = 100
-_SETTLED, _CONVERGED = 1e-4, 1e-9
+_SETTLED = 1e-4
+_CONVERGED = 1e-9
 
 # Cost of a pair that is left out: finite, and never that of an inlier.
 _NEVER = 1e100
@@ -104,7 +107,9 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
             Q = Q + quadratic_form.weighted_sum(
                 coefficients[changed], weights_new[changed] - weights[changed]
             )
-            T, weights, objective = T_new, weights_new, objective_new
+            T = T_new
+            weights = weights_new
+            objective = objective_new
         if converged:
             break
     return Solution(T, float(objective), converged, weights)
@@ -143,7 +148,8 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
     at least d, the floor. Pairs of equal cost share what those of smaller cost leave of it.
     """
     counted = costs < threshold
-    too_few, weights = counted.sum(axis=-1) < floor, counted.astype(float)
+    too_few = counted.sum(axis=-1) < floor
+    weights = counted.astype(float)
     if too_few.any():
         last = math.ceil(floor) - 1
         largest = np.partition(costs, last, axis=-1)[..., last, None]
@@ -195,7 +201,8 @@ class _Search:
             for kind, enough in ((slice(_FOLLOWED), 1.0), (slice(_FOLLOWED, None), _DECISIVE)):
                 first = [(kind.start or 0) + int(np.argmin(objectives[kind]))]
                 if objectives[first] < enough * objective:
-                    best, objective = rivals[first], objectives[first]
+                    best = rivals[first]
+                    objective = objectives[first]
             if objective >= before * (1 - _HARDLY):
                 break
         return best[0]
@@ -247,7 +254,8 @@ class _Search:
         weights, objectives = truncate(self.costs(Ts, left_out), self.threshold, self.floor)
         Ts, falling = Ts.copy(), np.arange(len(Ts))
         for _ in range(_MAX_ROUNDS):
-            Ts_new, before = self.refit(weights, Ts[falling]), objectives[falling]
+            Ts_new = self.refit(weights, Ts[falling])
+            before = objectives[falling]
             costs = self.costs(Ts_new, None if left_out is None else left_out[falling])
             weights, new = truncate(costs, self.threshold, self.floor)
             better = new < before
@@ -255,5 +263,6 @@ class _Search:
             if (new >= before * (1 - tolerance)).all():
                 break
             still = new < before * (1 - _CONVERGED)
-            falling, weights = falling[still], weights[still]
+            falling = falling[still]
+            weights = weights[still]
         return Ts, objectives

@@ -38,7 +38,8 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
     :func:`hand_eye_calib.core.solvers.dnlo.solve`.
     """
     n_pairs = len(pairs)
-    pose, alpha = casadi.MX.sym("pose", 6), casadi.MX.sym("alpha", n_pairs)
+    pose = casadi.MX.sym("pose", 6)
+    alpha = casadi.MX.sym("alpha", n_pairs)
     costs = _cost_expressions(pairs, pose).T
     floor = min_inlier_fraction * n_pairs
     problem = {
@@ -72,15 +73,18 @@ def _minimum(
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
     """(1, K) expression of ``|A X - X B|_F^2``, mapped over the pairs: a small graph."""
-    motion_a, motion_b = casadi.SX.sym("A", 3, 4), casadi.SX.sym("B", 3, 4)
+    motion_a = casadi.SX.sym("A", 3, 4)
+    motion_b = casadi.SX.sym("B", 3, 4)
     x = casadi.SX.sym("x", 6)
-    rotation, translation = _rodrigues(x[:3]), x[3:]
+    rotation = _rodrigues(x[:3])
+    translation = x[3:]
     rotation_residual = motion_a[:, :3] @ rotation - rotation @ motion_b[:, :3]
     translation_residual = (
         motion_a[:, :3] @ translation + motion_a[:, 3] - rotation @ motion_b[:, 3] - translation
     )
     cost = casadi.sumsqr(rotation_residual) + casadi.sumsqr(translation_residual)
-    columns_a, columns_b = casadi.vec(motion_a), casadi.vec(motion_b)
+    columns_a = casadi.vec(motion_a)
+    columns_b = casadi.vec(motion_b)
     function = casadi.Function("cost", [x, columns_a, columns_b], [cost])
     return function.map(len(pairs))(
         pose, _columns(pairs.Ts_parenti_parentj), _columns(pairs.Ts_childi_childj)

@@ -24,13 +24,15 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 DIMENSION = 13
 
 # Pairs per block, so that the intermediate arrays stay in the cache of the processor.
-_BLOCK, _SUMMED_BLOCK = 128, 1024
+_BLOCK = 128
+_SUMMED_BLOCK = 1024
 
 # Eigenvalues of the translation block below this share of the largest are rounding: they count as
 # zero.
 _RANK_TOLERANCE = 1e-10
 
-_MAX_NEWTON_STEPS, _STEP_TOLERANCE = 60, 1e-12
+_MAX_NEWTON_STEPS = 60
+_STEP_TOLERANCE = 1e-12
 
 
 def _tables() -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
@@ -67,7 +69,8 @@ def condense(pairs: MotionPairs) -> FloatArray:
     """Upper triangles (K, 91) of every pair's Q_k, in the order of ``numpy.triu_indices(13)``:
     ``condensed @ monomials(X)`` gives all costs.
     """
-    condensed, u = np.empty((len(pairs), len(_ROWS))), coefficients(pairs)
+    condensed = np.empty((len(pairs), len(_ROWS)))
+    u = coefficients(pairs)
     upper = _ROWS * DIMENSION + _COLUMNS
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, start + _BLOCK)
@@ -121,7 +124,8 @@ def decrease(
     """Decrease of ``x^T Q x`` of one form (13, 13) from one transform (4, 4) to another, accurate
     for small steps.
     """
-    x, x_new = T_parent_child.ravel()[_X_IN_T], T_parent_child_new.ravel()[_X_IN_T]
+    x = T_parent_child.ravel()[_X_IN_T]
+    x_new = T_parent_child_new.ravel()[_X_IN_T]
     return np.float64((x - x_new) @ Q @ (x + x_new))
 
 
@@ -247,7 +251,8 @@ def _derivatives(
     """Value (B,) of forms of (vec R, 1) without the constant, gradient (B, 3) and Hessian (B, 3, 3)
     under ``R Exp(phi)`` at phi = 0.
     """
-    S, linear = reduced[:, :9, :9], reduced[:, :9, 9]
+    S = reduced[:, :9, :9]
+    linear = reduced[:, :9, 9]
     flat = rotation.reshape(-1, 9)
     S_flat = se3.times(S, flat)
     value = ((S_flat + 2 * linear) * flat).sum(axis=1)

@@ -28,10 +28,12 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers import all_pairs
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-_MAX_ITERATIONS, _STEP_TOLERANCE = 500, 1e-8
+_MAX_ITERATIONS = 500
+_STEP_TOLERANCE = 1e-8
 
 # A minimum is lower by at least this share of the cost, and by residuals of this share of the data.
-_LOWER, _ROUNDING = 1e-6, 1e-12
+_LOWER = 1e-6
+_ROUNDING = 1e-12
 
 
 def solve(pairs: MotionPairs) -> Solution:
@@ -58,7 +60,8 @@ def _gauss_newton(
     """
     for _ in range(_MAX_ITERATIONS):
         products, derivative = _products(parameters)
-        rows, values = residual_of_products @ derivative, -residual_of_products @ products
+        rows = residual_of_products @ derivative
+        values = -residual_of_products @ products
         step = np.linalg.lstsq(rows, values, rcond=all_pairs.RANK_TOLERANCE)[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
@@ -72,11 +75,15 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     """Matrix (at most 20, 16) that maps the products to residuals of the same squared length as all
     f and g together.
     """
-    Ts_parent, Ts_child = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
-    rotation_parent, translation_parent = Ts_parent[:, :3, :3], Ts_parent[:, :3, 3]
+    Ts_parent = pairs.Ts_parenti_parentj
+    Ts_child = pairs.Ts_childi_childj
+    rotation_parent = Ts_parent[:, :3, :3]
+    translation_parent = Ts_parent[:, :3, 3]
     translation_child = Ts_child[:, :3, 3]
-    axes_parent, axes_child = _axes(rotation_parent), _axes(Ts_child[:, :3, :3])
-    apart, together = axes_parent - axes_child, axes_parent + axes_child
+    axes_parent = _axes(rotation_parent)
+    axes_child = _axes(Ts_child[:, :3, :3])
+    apart = axes_parent - axes_child
+    together = axes_parent + axes_child
     f = np.concatenate([apart[:, :, None], se3.skew(together)], axis=2)
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = (rotation_parent - np.eye(3))[:, :, None]
@@ -89,7 +96,8 @@ def _condense(pairs: MotionPairs) -> FloatArray:
 
 def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Products (16,) of (1, z) and (1, t), z slowest, and their derivatives (16, 6) by (z, t)."""
-    one_z, one_t = np.append(1.0, parameters[:3]), np.append(1.0, parameters[3:])
+    one_z = np.append(1.0, parameters[:3])
+    one_t = np.append(1.0, parameters[3:])
     derivative = np.zeros((4, 4, 6))
     derivative[1:, :, :3] = one_t[:, None] * np.eye(3)[:, None]
     derivative[:, 1:, 3:] = one_z[:, None, None] * np.eye(3)

@@ -133,7 +133,8 @@ def calibrate_many(
 def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tuple[str, _Pair]]:
     """Each recording with its name."""
     if isinstance(recordings, Mapping):
-        names, recordings = [*recordings], recordings.values()
+        names = [*recordings]
+        recordings = recordings.values()
     pairs = [*recordings]
     if not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
         raise InputError("each recording must be a pair of parent and child: [(parent, child)]")
@@ -174,7 +175,8 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         told = "; ".join(f"{name}: {why}" for name, why in unfit.items())
         raise InputError(f"no recording can be used: {told or 'there is none'}")
     found = agreement_of_results([*fit.values()])
-    names, unknown = [*fit], dict.fromkeys(results, np.full((2, 6), np.nan))
+    names = [*fit]
+    unknown = dict.fromkeys(results, np.full((2, 6), np.nan))
     unfit |= {names[index]: "it does not belong to the others" for index in found.apart}
     used = [each for name, each in fit.items() if name not in unfit]
     pairs = np.stack([found.deviations, found.sigmas], axis=1)
@@ -210,7 +212,8 @@ def _says_nothing(result: Calibration) -> bool:
 def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> Calibration:
     """The result of recordings that belong together."""
     T = found.T_parent_child
-    covariance, by_prior = found.covariance.copy(), set()
+    covariance = found.covariance.copy()
+    by_prior = set()
     for axis, name in enumerate(AXES):
         dofs = [one.observability_measured[axis] for one in used]
         known = [dof for dof in dofs if math.isfinite(dof.sigma)]

@@ -33,7 +33,10 @@ from hand_eye_calib.offline.cli.bags import read_recording
 from hand_eye_calib.offline.cli.options import STREAMS
 from hand_eye_calib.offline.cli.present import exit_code
 
-STATE, TABLE, INDEX, VEHICLES = "batch.jsonl", "rows.csv", "index.html", "vehicles"
+STATE = "batch.jsonl"
+TABLE = "rows.csv"
+INDEX = "index.html"
+VEHICLES = "vehicles"
 
 Row = Document
 
@@ -196,7 +199,8 @@ def work(task: Task) -> Outcome:
     try:
         with remote.local_copies(task.bags) as (paths, as_given):
             recording = read_recording([*map(Path, paths)], task.sources, task.options)
-            result, inputs = recording.solved(task.with_fingerprints), recording.inputs
+            result = recording.solved(task.with_fingerprints)
+            inputs = recording.inputs
             page = render(result, recording.snapshot, inputs) if task.with_report else ""
             failure = result.status.failure or None
             return Outcome.of(task, failure, result, inputs, page, as_given)
@@ -220,7 +224,8 @@ def outcomes(
     """
     waiting = [[*tasks]] if tasks else []
     while waiting:
-        some, lost = waiting.pop(0), dict[str, str]()
+        some = waiting.pop(0)
+        lost = dict[str, str]()
         with _cluster(dask) if dask else _processes(min(jobs, len(some))) as executor:
             futures = {executor.submit(do, task): task for task in some}
             for future in as_completed([*futures]):

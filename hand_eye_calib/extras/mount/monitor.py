@@ -168,7 +168,8 @@ class MountMonitor:
         Alarm or None
             A new one, if it was raised by these poses.
         """
-        before, raised = self.alarm, None
+        before = self.alarm
+        raised = None
         for second in self._by_second(pose_pairs):
             stamp_ns, motions, *terms = second
             if not _is_motion(motions, self._noise):
@@ -185,7 +186,8 @@ class MountMonitor:
 
     def restart(self) -> None:
         """Begin anew with stamps of any time; what was learned stays."""
-        self._tail, self._last_s = PosePairs.empty(), -1
+        self._tail = PosePairs.empty()
+        self._last_s = -1
 
     # ------------------------------------------------------------- the motions
 
@@ -197,7 +199,8 @@ class MountMonitor:
                 self._tail = PosePairs.empty()
         poses = PosePairs.concatenate(self._tail, pose_pairs)
         poses = poses[np.unique(poses.stamps_ns // TUNING.step_ns, return_index=True)[1]]
-        stamps_ns, seconds = poses.stamps_ns, poses.stamps_ns // _SECOND_NS
+        stamps_ns = poses.stamps_ns
+        seconds = poses.stamps_ns // _SECOND_NS
         j = np.searchsorted(stamps_ns, stamps_ns + _SECOND_NS)
         # A second is complete once a motion of the next one has its end.
         has_end = j < len(stamps_ns)
@@ -206,7 +209,8 @@ class MountMonitor:
         i = np.flatnonzero(has_end & (seconds < under_way) & (seconds > self._last_s))
         i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.most_late * _SECOND_NS]
         self._last_s = max(self._last_s, under_way - 1)
-        pairs, of_pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i]), seconds[i]
+        pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
+        of_pairs = seconds[i]
         residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)  # all at once
         by_scale = -se3.inverse(pairs.Ts_childi_childj)[:, :3, 3:]
         jacobians = np.append(jacobians, np.pad(by_scale, ((0, 0), (0, 3), (0, 0))), axis=2)
@@ -218,7 +222,8 @@ class MountMonitor:
         self._learning.append(second)
         if len(self._learning) < TUNING.learning_s:
             return
-        learned, self._learning = self._learning, []
+        learned = self._learning
+        self._learning = []
         parent = np.concatenate([each.Ts_parenti_parentj for _, each, *_ in learned])
         child = np.concatenate([each.Ts_childi_childj for _, each, *_ in learned])
         index = np.arange(len(parent))
@@ -272,10 +277,12 @@ class MountMonitor:
         best = int(np.argmax(ratios))
         if ratios[best] < (self.alarm.log_ratio if self.alarm else TUNING.threshold):
             return
-        H, S = information(tables[best]), score(tables[best])
+        H = information(tables[best])
+        S = score(tables[best])
         covariance = np.linalg.inv(H + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
         to_parent = np.kron(np.eye(2), self._installed[:3, :3])
-        since_ns, raised_ns = int(self._stamps_ns[-lags[best]]), int(self._stamps_ns[-1])
+        since_ns = int(self._stamps_ns[-lags[best]])
+        raised_ns = int(self._stamps_ns[-1])
         self.alarm = Alarm(
             since_ns=self.alarm.since_ns if self.alarm else since_ns,
             raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
@@ -311,7 +318,8 @@ class MountMonitor:
         H = H / len(self._stamps_ns)
         # Of that, what the rotation noise of a motion seems to tell of a translation: rotations
         # that never took place reveal nothing.
-        turns, of_noise = se3.skew(np.eye(3)), np.linalg.inv(self._noise)[:3, :3]
+        turns = se3.skew(np.eye(3))
+        of_noise = np.linalg.inv(self._noise)[:3, :3]
         seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, of_noise, turns)
         H[:3, :3] -= self._motions_per_s * seeming
         H *= seconds / self.long_run
@@ -386,8 +394,10 @@ class MountWatch:
         why_unknown: Callable[[], str],
         log: NodeLog,
     ) -> None:
-        self._session, self._log = session, log
-        self._installed, self._why_unknown = installed, why_unknown
+        self._session = session
+        self._log = log
+        self._installed = installed
+        self._why_unknown = why_unknown
         self._monitor: MountMonitor | None = None
         self._last_ns = -1
 
@@ -417,7 +427,8 @@ class MountWatch:
         monitor = self._monitor
         if monitor is None:
             return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
-        visible, alarm = monitor.visible(TUNING.session_s), monitor.alarm
+        visible = monitor.visible(TUNING.session_s)
+        alarm = monitor.alarm
         if alarm is not None:
             text = str(alarm)
         elif monitor.is_learning:

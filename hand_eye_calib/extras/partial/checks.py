@@ -306,9 +306,11 @@ def _with_orientations(pairs: PosePairs, T_parent_child: FloatArray, stream: str
     They are rotated to the world frame of the positions, window by window.
     """
     if stream == "child":
-        predicted, measured = pairs.Ts_pw_p @ T_parent_child, pairs.Ts_cw_c
+        predicted = pairs.Ts_pw_p @ T_parent_child
+        measured = pairs.Ts_cw_c
     else:
-        predicted, measured = pairs.Ts_cw_c @ se3.inverse(T_parent_child), pairs.Ts_pw_p
+        predicted = pairs.Ts_cw_c @ se3.inverse(T_parent_child)
+        measured = pairs.Ts_pw_p
     windows = (pairs.stamps_ns - pairs.stamps_ns[0]) // round(_WINDOW_S * 1e9)
     borrowed = measured.copy()
     for window in np.unique(windows):
@@ -459,9 +461,11 @@ def _matrix_suspects(
     principal axes of rotation, and 3 elements of the symmetric part off the diagonal.
     """
     if stream == "child":
-        reference, measured = of_child, of_parent
+        reference = of_child
+        measured = of_parent
     else:
-        reference, measured = of_parent, of_child
+        reference = of_parent
+        measured = of_child
     axes = np.linalg.eigh(reference.T @ reference)[1][:, ::-1]
     x = reference @ axes
     y = measured @ axes

@@ -33,11 +33,14 @@ from hand_eye_calib.extras.partial.rate_bias import RateBias
 
 # Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
 # at most, of two 0.5 and more.
-_SUSPECT_PATH, _UNRELATED_PATH, _UNRELATED_ROTATION = 0.1, 0.3, 0.5
+_SUSPECT_PATH = 0.1
+_UNRELATED_PATH = 0.3
+_UNRELATED_ROTATION = 0.5
 
 # Poses between the ends of the motions that tell how much of the rotation is explained; the
 # quantile of their angles above which they count.
-_SPAN, _TURNING = 10, 0.75
+_SPAN = 10
+_TURNING = 0.75
 
 # Rates in degrees instead of radians are off by that factor, within this share of it.
 _UNIT_WITHIN = 0.2
@@ -48,7 +51,9 @@ _MENDED_PATH = 0.5
 # A scale between the streams must exceed so many of its standard deviations, and the data must
 # know it better than the expectation of the model (share of the information).
 _EXPECTED_SCALE = TUNING.of_positions[3]
-_SCALE_SIGMAS, _SHOWN_SCALE, _LEAST_SCALE = 5.0, 0.5, 1e-3
+_SCALE_SIGMAS = 5.0
+_SHOWN_SCALE = 0.5
+_LEAST_SCALE = 1e-3
 
 # Standard deviation (m) along each axis of where the frame of an odometry is, and of where an
 # antenna or a prism measures.
@@ -65,9 +70,11 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     InputError
         If no lever arm explains the positions.
     """
-    stamps_ns, is_child = pose_pairs.stamps_ns, config.child_measures == "positions"
+    stamps_ns = pose_pairs.stamps_ns
+    is_child = config.child_measures == "positions"
     given = config.given_scale
-    of_parent, of_child = pose_pairs.Ts_pw_p, pose_pairs.child_scaled(given).Ts_cw_c
+    of_parent = pose_pairs.Ts_pw_p
+    of_child = pose_pairs.child_scaled(given).Ts_cw_c
     poses, measured = (of_parent, of_child) if is_child else (of_child, of_parent)
     positions = measured[:, :3, 3]
     with_scale = config.scale in ("auto", "estimate")
@@ -207,7 +214,8 @@ def _of_scale(
     shown = 1.0 - (solution.scale_sigma / expected) ** 2
     if shown < _SHOWN_SCALE:
         return ()
-    excess, sigma = (solution.scale - 1.0) / shown, solution.scale_sigma / shown**0.5
+    excess = (solution.scale - 1.0) / shown
+    sigma = solution.scale_sigma / shown**0.5
     scale = 1.0 + excess if is_child else 1.0 / max(1.0 + excess, _LEAST_SCALE)
     if abs(excess) < _SCALE_SIGMAS * sigma:
         return ()
@@ -282,7 +290,8 @@ def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: Calibrator
     of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
     if config.child_measures != "rates":
         rotation = solution.T_parent_child[:3, :3]
-        of, bias = "parent", -rotation @ bias
+        of = "parent"
+        bias = -rotation @ bias
         sigmas = np.sqrt(np.diag(rotation @ np.diag(sigmas**2) @ rotation.T))
     return RateBias(of=of, rad_per_s=tuple(bias.tolist()), sigma=tuple(sigmas.tolist()))
 
@@ -310,9 +319,12 @@ def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, .
         max(float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING)), 1e-12)
         for Ts in (steps.Ts_parenti_parentj, steps.Ts_childi_childj)
     )
-    stream, ratio, degrees = "child", of_child / of_parent, float(np.degrees(1.0))
+    stream = "child"
+    ratio = of_child / of_parent
+    degrees = float(np.degrees(1.0))
     if config.child_measures != "rates":
-        stream, ratio = "parent", of_parent / of_child
+        stream = "parent"
+        ratio = of_parent / of_child
     if min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0)) >= _UNIT_WITHIN:
         return ()
     unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")

@@ -44,7 +44,8 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         from hand_eye_calib.formats.bags.sources import source_of
         from hand_eye_calib.offline.cli.bags import read_sources, refuse_recordings
 
-        names, sources = topics, [*map(source_of, topics)]
+        names = topics
+        sources = [*map(source_of, topics)]
         refuse_recordings(arguments.paths, sources)
         with PoseBag(*arguments.paths) as bag:
             stamps = arguments.stamps or "header"

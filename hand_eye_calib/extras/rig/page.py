@@ -45,7 +45,8 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
     A time offset and a scale in numbers are the child's, which has them; the others have none.
     """
 
-    config, (parent, child) = session.snapshot.config, session.snapshot.streams
+    config = session.snapshot.config
+    parent, child = session.snapshot.streams
     of_all = ["method", "max_gap", "target.translation", "target.rotation"]
     if isinstance(config.time_offset, str):
         of_all.append("time_offset")

@@ -74,7 +74,8 @@ def calibrate_rig(
         replace(trajectory, sensor_frame=frame_name(name))
         for name, trajectory in trajectories.items()
     ]
-    star, moved = [], []
+    star = []
+    moved = []
     for other in rest:
         found = run(whole_snapshot(first, other, options))
         answer = found.calibration
@@ -239,11 +240,13 @@ class RigCalibration:
         answers close: weighted least squares.
         """
         K = len(self.calibrations)
-        information, pulled = np.zeros((K, 6, K, 6)), np.zeros((K, 6))
+        information = np.zeros((K, 6, K, 6))
+        pulled = np.zeros((K, 6))
         for at, (each, X) in enumerate(zip(self.calibrations, self.Xs[1:], strict=True)):
             information[at, :, at] += np.linalg.inv(_moved(each, X))
         for at, each in enumerate(self.neighbours):
-            before, after = self.Xs[at + 1], self.Xs[at + 2]
+            before = self.Xs[at + 1]
+            after = self.Xs[at + 2]
             miss = se3.log(before @ each.T_parent_child @ se3.inverse(after))
             weight = np.linalg.inv(_moved(each, after))
             for row, sign in ((at + 1, 1.0), (at, -1.0)):

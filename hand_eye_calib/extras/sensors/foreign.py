@@ -119,7 +119,8 @@ def _lines(data: bytes) -> list[str]:
 def _of_nmea(data: bytes, _: str | None) -> _Rows:
     """GGA sentences; the day is that of the last RMC sentence."""
     rows: list[Sequence[float]] = []
-    day, n_damaged = None, 0
+    day = None
+    n_damaged = 0
     for line in _lines(data):
         text, _, check = line[line.find("$") + 1 :].partition("*")
         if check and f"{reduce(xor, text.encode(), 0):02X}" != check[:2].upper():
@@ -148,7 +149,8 @@ def _of_nmea(data: bytes, _: str | None) -> _Rows:
 def _of_gpx(data: bytes, _: str | None) -> _Rows:
     rows = []
     for point in ElementTree.fromstring(data).iterfind(".//{*}trkpt"):
-        time, height = point.findtext("{*}time"), point.findtext("{*}ele")
+        time = point.findtext("{*}time")
+        height = point.findtext("{*}ele")
         if time is None:
             raise ValueError("a point of the GPX track has no time; record it with times")
         rows.append((time, point.attrib["lat"], point.attrib["lon"], height or "0"))
@@ -173,7 +175,8 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
     rows = []
     for line in _lines(data):
         head, _, body = line.partition(";")
-        about, cells = head.split(","), body.split(",")
+        about = head.split(",")
+        cells = body.split(",")
         if about[0][1:].startswith("INSPVA") and float(cells[2]):  # 0 before there is a solution
             has_undulation = "INSPVAX" in about[0]
             height = float(cells[4]) + has_undulation * float(cells[5])
@@ -289,15 +292,18 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
         raise ValueError("Vicon without segments: export Segments or Objects (global), not markers")
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
     body = _chosen(starts, choice, "segments")
-    at, place = starts[body], columns.index("TX", starts[body])
+    at = starts[body]
+    place = columns.index("TX", starts[body])
     rows = (
         [int(cells[0]) / rate_hz, *cells[at : place + 3]]
         for cells in all_lines
         if len(cells) >= place + 3 and all(cells[at : place + 3])
     )
-    kind, turns = "rotation vectors", [f"{name} [{units[at]}]" for name in ROTATION_VECTOR]
+    kind = "rotation vectors"
+    turns = [f"{name} [{units[at]}]" for name in ROTATION_VECTOR]
     if "RW" in columns[at:place]:
-        kind, turns = "quaternions", [*QUATERNION]
+        kind = "quaternions"
+        turns = [*QUATERNION]
     header = ("t [s]", *turns, *(f"{axis} [{units[place]}]" for axis in POSITION))
     return header, rows, [f"poses of {body}; rotations read as {kind}"]
 
@@ -310,7 +316,8 @@ def _of_pcd(data: bytes, _: str | None) -> _Rows:
     """Key poses as LIO-SAM saves them: points with angles and a time."""
     head, form, body = re.split(rb"(?m)^DATA (\w+)\r?\n", data, maxsplit=1)
     about = {name: values for name, *values in map(str.split, _lines(head))}
-    names, sizes = about["FIELDS"], zip(about["TYPE"], about["SIZE"], strict=True)
+    names = about["FIELDS"]
+    sizes = zip(about["TYPE"], about["SIZE"], strict=True)
     if form == b"ascii":
         return names, map(str.split, _lines(body)), ()
     if form != b"binary":

@@ -59,8 +59,10 @@ class ImageReading(Reading):
 
     def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
         super().__init__(stream, topic)
-        self._finder, self._frame = TargetFinder(target, camera), ""
-        self._stamps_ns, self._bag_ns = list[int](), list[int]()
+        self._finder = TargetFinder(target, camera)
+        self._frame = ""
+        self._stamps_ns = list[int]()
+        self._bag_ns = list[int]()
 
     def take(self, run: messages.Run) -> None:
         for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):

@@ -93,7 +93,9 @@ def scan_of(message: Any) -> Scan:
     names = [field.name for field in message.fields]
     if not {*"xyz"} <= {*names}:
         raise InputError(f"points have no x, y, z, but {', '.join(names)}")
-    order, size, n = "<>"[message.is_bigendian], message.point_step, message.height * message.width
+    order = "<>"[message.is_bigendian]
+    size = message.point_step
+    n = message.height * message.width
     try:
         kinds = [order + _DATATYPES[field.datatype] for field in message.fields]
         places = [field.offset for field in message.fields]
@@ -107,18 +109,19 @@ def scan_of(message: Any) -> Scan:
     if len(used) > TUNING.most_points:
         used = used[np.linspace(0, len(used) - 1, TUNING.most_points).astype(int)]
     of_time = next((rows[name] for name in _TIMES if name in names), np.zeros(len(rows)))
-    points, times = points[used].astype(float), of_time[used].astype(float)
+    points = points[used].astype(float)
+    times = of_time[used].astype(float)
     rings = np.round(np.degrees(2 * np.arccos(-points[:, 2] / ranges[used]))).astype(int)
     first, last = (times.min(), times.max()) if len(times) else (0.0, 0.0)
     fitting = (ns for ns in STAMP_UNITS.values() if 0 < (last - first) * ns <= TUNING.longest_ns)
-    unit_ns, middle = max(fitting, default=0), (first + last) / 2
+    unit_ns = max(fitting, default=0)
+    middle = (first + last) / 2
     # Times may be relative to the stamp of the header, or absolute.
-    middle_ns, header_ns = round(float(middle) * unit_ns), ns_of(message.header.stamp) or 0
+    middle_ns = round(float(middle) * unit_ns)
+    header_ns = ns_of(message.header.stamp) or 0
     stamp_ns = middle_ns + header_ns * (middle_ns <= TUNING.longest_ns)
-    times_s, frame = (
-        (times - middle) * unit_ns * 1e-9,
-        printable(frame_name(message.header.frame_id)),
-    )
+    times_s = (times - middle) * unit_ns * 1e-9
+    frame = printable(frame_name(message.header.frame_id))
     return Scan(points, rings, times_s, stamp_ns, frame)
 
 
@@ -138,16 +141,21 @@ class ScanReading(Reading):
         with suppress(Exception):
             kept = read_arrays(self._place)
             if np.array_equal(kept["bag_files"], self._state):
-                self._kept, self.topics = [kept[name] for name in _KEPT], ()
+                self._kept = [kept[name] for name in _KEPT]
+                self.topics = ()
                 return
         self._gicp = required("small_gicp", "odometry from the points of a lidar", "lidar")
-        self._voxel_m, self._has_failed = 0.0, [False]
+        self._voxel_m = 0.0
+        self._has_failed = [False]
         self._maps: list[Any] = []
         # Of all scans, and the newest three of them.
-        self._poses, self._stamps_ns, self._bag_ns = [np.eye(4)], list[int](), list[int]()
+        self._poses = [np.eye(4)]
+        self._stamps_ns = list[int]()
+        self._bag_ns = list[int]()
         self._scans = list[Scan]()
         # What rings measure too far (m), and of what it is the ratio.
-        self._too_far_m, self._sums = np.zeros(TUNING.n_rings), np.zeros((2, TUNING.n_rings))
+        self._too_far_m = np.zeros(TUNING.n_rings)
+        self._sums = np.zeros((2, TUNING.n_rings))
 
     def take(self, run: Run) -> None:
         for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
@@ -206,7 +214,8 @@ class ScanReading(Reading):
         """Find the pose of the scan at this index from the end: roughly, or finely as a part of the
         maps.
         """
-        still, (_, _, matched, least) = self._still(index), TUNING.steps[step]
+        still = self._still(index)
+        _, _, matched, least = TUNING.steps[step]
         points = self._thinned(still, step)
         found = self._gicp.align(
             *(self._maps[step], points, self._poses[index]),
@@ -217,7 +226,8 @@ class ScanReading(Reading):
             pose = np.array(found.T_target_source)
             # Rounding must not grow from scan to scan.
             pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
-            self._poses[index], self._has_failed[index] = pose, False
+            self._poses[index] = pose
+            self._has_failed[index] = False
         elif not step:
             self._poses[index] = self._poses[index - 1]  # rather than on and away from the map
         if step and not self._has_failed[index]:
@@ -230,7 +240,8 @@ class ScanReading(Reading):
         """Points (N, 3) of a scan as if all were taken in its middle, in the motion through its
         pose and those beside it.
         """
-        scan, near = self._scans[index], slice(-len(self._scans), None)
+        scan = self._scans[index]
+        near = slice(-len(self._scans), None)
         since_s = (np.array(self._stamps_ns[near]) - scan.stamp_ns) * 1e-9
         motions = se3.log(se3.inverse(self._poses[index]) @ np.array(self._poses[near]))
         polynomial = np.linalg.lstsq(np.vander(since_s), motions, rcond=None)[0]
@@ -248,11 +259,13 @@ class ScanReading(Reading):
         """Learn what rings measure too far, from their points beside planes of the map."""
         means = np.array(self._maps[1].voxel_points())[:, :3]
         covs = np.reshape(self._maps[1].voxel_covs(), (-1, 4, 4))[:, :3, :3]
-        placed, rays = still @ pose[:3, :3].T + pose[:3, 3], scan.points @ pose[:3, :3].T
+        placed = still @ pose[:3, :3].T + pose[:3, 3]
+        rays = scan.points @ pose[:3, :3].T
         nearest = self._gicp.KdTree(means).batch_nearest_neighbor_search(placed)[0]
         planes, of_point = np.unique(nearest, return_inverse=True)
         variances, axes = np.linalg.eigh(covs[planes])
-        is_flat, normals = variances[:, 0] < TUNING.flat * variances[:, 1], axes[of_point, :, 0]
+        is_flat = variances[:, 0] < TUNING.flat * variances[:, 1]
+        normals = axes[of_point, :, 0]
         offsets = np.einsum("ni,ni->n", normals, placed - means[planes[of_point]])
         cosines = np.einsum("ni,ni->n", normals, rays) / np.linalg.norm(rays, axis=1)
         cosines *= is_flat[of_point] & (np.abs(offsets) < TUNING.near_m)

@@ -36,7 +36,8 @@ _TO_GREY = {
 }
 
 # An image needs so many corners of the target, and may miss them by so much (pixels, rms).
-_FEWEST_CORNERS, _LARGEST_RMS_PX = 8, 5.0
+_FEWEST_CORNERS = 8
+_LARGEST_RMS_PX = 5.0
 
 _EXPECTED_TARGET = (
     "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], such as charuco:5x7:0.04:0.03:4X4_50, or "
@@ -113,7 +114,8 @@ def read_camera(path: str | Path) -> Camera:
         document = document.get("cam0", document)
         if "intrinsics" in document:
             fu, fv, pu, pv = document["intrinsics"]
-            matrix, distortion = [fu, 0, pu, 0, fv, pv, 0, 0, 1], document["distortion_coeffs"]
+            matrix = [fu, 0, pu, 0, fv, pv, 0, 0, 1]
+            distortion = document["distortion_coeffs"]
         else:
             matrix, distortion = (
                 value["data"] if isinstance(value, Mapping) else value
@@ -175,7 +177,8 @@ def grey_of(message: Any) -> Any:
     if message.encoding not in _TO_GREY:
         known = ", ".join(_TO_GREY)
         raise InputError(f"images are encoded as {message.encoding[:40]!r}; expected {known}")
-    n_channels, conversion = message.step // message.width, _TO_GREY[message.encoding]
+    n_channels = message.step // message.width
+    conversion = _TO_GREY[message.encoding]
     rows = data.reshape(message.height, message.step)[:, : message.width * n_channels]
     image = rows.reshape(message.height, message.width, n_channels)
     if not conversion:
@@ -197,7 +200,8 @@ class TargetPoses:
     n_images: int
 
     def __str__(self) -> str:
-        rms_px, (shift_m, turn_rad) = np.median(self.rms_px), np.median(self.sigmas, axis=0)
+        rms_px = np.median(self.rms_px)
+        shift_m, turn_rad = np.median(self.sigmas, axis=0)
         return (
             f"the target is seen in {len(self.images)} of {self.n_images} images, its corners to "
             f"{rms_px:.2f} pixels (rms): {length(shift_m)} and {angle(turn_rad)} of a pose"
@@ -210,15 +214,19 @@ class TargetFinder:
     """
 
     def __init__(self, target: Target, camera: Camera) -> None:
-        self._cv2, self._target, self._camera = _opencv(), target, camera
-        aruco, self._n_images = self._cv2.aruco, 0
+        self._cv2 = _opencv()
+        self._target = target
+        self._camera = camera
+        aruco = self._cv2.aruco
+        self._n_images = 0
         self._found: list[tuple[FloatArray, int, float, FloatArray]] = []
         markers = getattr(aruco, f"DICT_{target.dictionary}", None)
         if markers is None:
             raise ConfigError(
                 f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
             )
-        dictionary, size = aruco.getPredefinedDictionary(markers), (target.columns, target.rows)
+        dictionary = aruco.getPredefinedDictionary(markers)
+        size = (target.columns, target.rows)
         # The corners (k, 3) of each number that is detected.
         if target.kind == "charuco":
             board = aruco.CharucoBoard(size, target.size, target.marker, dictionary)
@@ -238,7 +246,8 @@ class TargetFinder:
 
     def look(self, image: Any) -> bool:
         """Whether the next image shows the target, well enough."""
-        number, self._n_images = self._n_images, self._n_images + 1
+        number = self._n_images
+        self._n_images = self._n_images + 1
         pixels, ids, *_ = self._detect(image)
         known = np.ravel([] if ids is None else ids).astype(int)
         is_known = known < len(self._corners)
@@ -269,10 +278,12 @@ class TargetFinder:
         """Pose of the target in the camera, the rms error of its corners in pixels, and standard
         deviations. Of the two poses that a flat target nearly fits, the better one.
         """
-        cv2, camera = self._cv2, self._camera
+        cv2 = self._cv2
+        camera = self._camera
         undistort = cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
         rays = undistort(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
-        ideal, focal = (np.eye(3), None), camera.matrix[[0, 1], [0, 1]]
+        ideal = (np.eye(3), None)
+        focal = camera.matrix[[0, 1], [0, 1]]
         _, turns, shifts, _ = cv2.solvePnPGeneric(corners, rays, *ideal, flags=cv2.SOLVEPNP_IPPE)
         found = []
         for start in zip(turns, shifts, strict=True):

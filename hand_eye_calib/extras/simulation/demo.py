@@ -122,7 +122,8 @@ def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> 
     yield offline.headline
     heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))
     yield f"{f'Pose of {offline.child_frame} in {offline.parent_frame}':<26}{heads}  deg"
-    truth, replayed = drive.T_parent_child, offline.T_parent_child
+    truth = drive.T_parent_child
+    replayed = offline.T_parent_child
     for title, T in (("truth", truth), ("replay of the bag", replayed), ("live node", live)):
         metres, radians = absolute_errors(T, truth)
         pose = se3.xyz_rpy(T).tolist()

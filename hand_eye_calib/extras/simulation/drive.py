@@ -21,11 +21,13 @@ from hand_eye_calib.extras.simulation import options
 _START = np.array([0.0, 0.5])
 
 # Time from their start to the first pose (s), and time for which their first yaw rate is held.
-_LEAD_S, _FIRST_HOLD_S = 0.1, 0.4
+_LEAD_S = 0.1
+_FIRST_HOLD_S = 0.4
 
 # Largest offset of the child sensor along each axis of the parent (m), and variance of a jump per
 # axis (m^2).
-_LARGEST_OFFSET_M, _JUMP_VARIANCE = 0.5, 0.02
+_LARGEST_OFFSET_M = 0.5
+_JUMP_VARIANCE = 0.02
 
 _NO_NOISE = options.NoiseConfig()
 
@@ -183,8 +185,11 @@ def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[
     Its height and scale are metres per unit of :func:`_peaks` and of its arguments; arguments
     beyond +/- its limit are mirrored back, so that a long drive stays on the hills.
     """
-    height, scale, limit = config.terrain_height, config.terrain_scale, config.terrain_limit
-    (u, sign_u), (v, sign_v) = _mirrored(x / scale, limit), _mirrored(y / scale, limit)
+    height = config.terrain_height
+    scale = config.terrain_scale
+    limit = config.terrain_limit
+    u, sign_u = _mirrored(x / scale, limit)
+    v, sign_v = _mirrored(y / scale, limit)
     peaks, along_u, along_v = _peaks(u, v)
     slope = height / scale
     return height * peaks, slope * sign_u * along_u, slope * sign_v * along_v
@@ -195,7 +200,8 @@ def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     derivatives by x and y; arrays of one shape, no unit.
     """
     hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
-    middle, polynomial = 10.0 * np.exp(-(x**2) - y**2), x / 5.0 - x**3 - y**5
+    middle = 10.0 * np.exp(-(x**2) - y**2)
+    polynomial = x / 5.0 - x**3 - y**5
     hollow = np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
     total = (1.0 - x) ** 2 * hill - polynomial * middle - hollow
     along_x = -2.0 * (1.0 - x) * (1.0 + x * (1.0 - x)) * hill

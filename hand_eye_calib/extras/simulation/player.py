@@ -21,7 +21,8 @@ from hand_eye_calib.online.ros.conversions import LATCHED, to_time
 
 # Nothing is lost on the way to a subscription that is reliable too.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-_SPIN_S, _PATIENCE_S = 0.02, 120.0
+_SPIN_S = 0.02
+_PATIENCE_S = 120.0
 
 
 def play(
@@ -51,7 +52,8 @@ def play(
     except RCLError as error:
         raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
     node = rclpy.create_node("hand_eye_calib_player", context=context)
-    executor, heard = SingleThreadedExecutor(context=context), [TransformStamped()]
+    executor = SingleThreadedExecutor(context=context)
+    heard = [TransformStamped()]
     executor.add_node(node)
     publishers = {name: node.create_publisher(Odometry, topics[name], _LOSSLESS) for name in topics}
     solve = node.create_client(Trigger, "calibrator/solve")
@@ -94,7 +96,8 @@ def _odometry(poses: PoseTable, row: int) -> Odometry:
     message.header.stamp = to_time(int(poses.stamps_ns[row]))
     message.header.frame_id = poses.world_frames[row]
     message.child_frame_id = poses.sensor_frames[row] or ""
-    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    position = message.pose.pose.position
+    orientation = message.pose.pose.orientation
     position.x, position.y, position.z, *quat_xyzw = poses.poses[row].tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw
     return message

@@ -20,8 +20,11 @@ from hand_eye_calib.offline.cli.options import (
 )
 
 # The layout of the published simulations: sensor 1 is the parent.
-PARENT_FILE, CHILD_FILE, TRUTH_FILE = "T_S1_W1.txt", "T_S2_W2.txt", "T_S2_S1.txt"
-PARENT_TOPIC, CHILD_TOPIC = "/parent/odometry", "/child/odometry"
+PARENT_FILE = "T_S1_W1.txt"
+CHILD_FILE = "T_S2_W2.txt"
+TRUTH_FILE = "T_S2_S1.txt"
+PARENT_TOPIC = "/parent/odometry"
+CHILD_TOPIC = "/child/odometry"
 _TYPE = "nav_msgs/msg/Odometry"
 
 _DRIVES = {"published": PUBLISHED_DRIVE, "hilly": HILLY_DRIVE}

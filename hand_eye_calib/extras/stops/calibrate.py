@@ -372,11 +372,13 @@ def _with_scale(
     start = rough_scale or 1.0
     fit, stops, is_inverse, lead = _fit(given, start)
     is_unusable = any(found.makes_unusable for found in findings)
-    scale, sigma = 1.0, 0.0
+    scale = 1.0
+    sigma = 0.0
     is_determined = given.has_positions and turns_about_two_axes(given.parent)
     if wants_scale or (is_determined and not is_unusable):
         free = _with_free_scale(given, start, is_inverse)
-        scale, sigma = free[2], free[3]
+        scale = free[2]
+        sigma = free[3]
         off = _off_scale(scale, sigma, len(stops))
         is_auto = config.scale == "auto"
         is_clear = off > _SCALE_SHARE or (is_auto and base != 1.0)
@@ -387,7 +389,8 @@ def _with_scale(
         if is_clear and not is_asked:
             findings = [*findings, scale_finding(base * scale, base * sigma)]
         if is_used:
-            fit, stops = free[0], free[1]
+            fit = free[0]
+            stops = free[1]
             if not wants_scale:
                 undo = "none" if base == 1.0 or is_auto else base
                 warnings = [
@@ -396,7 +399,8 @@ def _with_scale(
                     f"{base * sigma:.4f}; to take them as they are, give scale {undo}",
                 ]
         else:
-            scale, sigma = 1.0, 0.0
+            scale = 1.0
+            sigma = 0.0
     if scale == 1.0 and start != 1.0:
         fit, stops, is_inverse, lead = _fit(given, 1.0)
     findings = [*findings, *_of_unknown(given, fit, findings)]
@@ -495,12 +499,16 @@ def _reading(solved: _Solved, named: Mapping[str, str]) -> tuple[list[Finding], 
     on_world_m = float(np.linalg.norm(solved.fit.Ts_world_world[0][:3, 3]))
     if solved.is_inverse:
         place = "beside the robot"
-        on_hand_m, on_base_m = on_world_m, on_parent_m
-        moving, fixed = target, camera
+        on_hand_m = on_world_m
+        on_base_m = on_parent_m
+        moving = target
+        fixed = camera
     else:
         place = "on the hand"
-        on_hand_m, on_base_m = on_parent_m, on_world_m
-        moving, fixed = camera, target
+        on_hand_m = on_parent_m
+        on_base_m = on_world_m
+        moving = camera
+        fixed = target
     text = (
         f"read as a camera {place}; if that is wrong, one side or both hold inverse poses: give "
         "parent_invert poses (robot), child_invert poses (target), or both; or exchange both sides"
@@ -514,12 +522,18 @@ def _reading(solved: _Solved, named: Mapping[str, str]) -> tuple[list[Finding], 
 
 
 def _assessed(solved: _Solved, frames: list[str]) -> Calibration:
-    fit, stops, config = solved.fit, solved.stops, solved.config
-    X, Z = fit.Ts_parent_child[0], fit.Ts_world_world[0]
+    fit = solved.fit
+    stops = solved.stops
+    config = solved.config
+    X = fit.Ts_parent_child[0]
+    Z = fit.Ts_world_world[0]
     parent, child, parent_world, child_world = frames
-    covariance, of_Z, unknown = fit.covariance[:6, :6], fit.covariance[6:, 6:], fit.undetermined()
+    covariance = fit.covariance[:6, :6]
+    of_Z = fit.covariance[6:, 6:]
+    unknown = fit.undetermined()
     if config.measured == "rotations":
-        covariance, of_Z = _without_positions(covariance), _without_positions(of_Z)
+        covariance = _without_positions(covariance)
+        of_Z = _without_positions(of_Z)
         of_rotation = unknown[3:, np.linalg.norm(unknown[3:], axis=0) > _NEARER]
         unknown = np.zeros((6, 3 + of_rotation.shape[1]))
         unknown[:3, :3] = np.eye(3)

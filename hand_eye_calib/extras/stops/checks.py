@@ -118,7 +118,8 @@ class GivenStops:
         return len(self.parent)
 
     def __getitem__(self, rows: IntArray) -> "GivenStops":
-        parent, child = self.parent[rows], self.child[rows]
+        parent = self.parent[rows]
+        child = self.child[rows]
         return GivenStops(parent, child, self.is_arm, self.has_positions)
 
     def sides(self, mistakes: "Mistakes") -> tuple[FloatArray, FloatArray]:
@@ -305,15 +306,18 @@ def _frozen(given: GivenStops) -> Iterator[Finding]:
 def _rows(given: GivenStops) -> Iterator[Finding]:
     """Rows that belong together only if those of one side are shifted, or in another order."""
     n = min(len(given), _MOST)
-    of_parent, of_child = angles_between(given.parent[:n]), angles_between(given.child[:n])
+    of_parent = angles_between(given.parent[:n])
+    of_child = angles_between(given.child[:n])
     apart = median(np.abs(_upper(of_parent - of_child)))
-    best, least = "", apart / _CLEARLY
+    best = ""
+    least = apart / _CLEARLY
     for text, rows in _orders(n):
         left = median(
             np.abs(_upper(of_parent[np.ix_(rows[0], rows[0])] - of_child[np.ix_(rows[1], rows[1])]))
         )
         if left < least:
-            best, least = text, left
+            best = text
+            least = left
     # Rows of poses that hardly differ agree anyhow.
     if best and apart > _ROTATES / 2:
         yield finding("rows", text=best)
@@ -328,7 +332,8 @@ def _orders(n: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
         if n - shift < _FEWEST:
             continue
         times = f"{shift} row{'s' if shift > 1 else ''}"
-        later, earlier = rows[shift:], rows[:-shift]
+        later = rows[shift:]
+        earlier = rows[:-shift]
         yield f"if the child's are moved down by {times}", (later, earlier)
         yield f"if the parent's are moved down by {times}", (earlier, later)
     yield "if those of one side are read from the last to the first", (rows, rows[::-1])
@@ -345,10 +350,8 @@ def _shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterator[Find
     n = len(of_parent)
     usual = _agreeing(of_parent, of_child)
     for shift in (1, -1):
-        later, earlier = (
-            slice(max(shift, 0), n + min(shift, 0)),
-            slice(max(-shift, 0), n - max(shift, 0)),
-        )
+        later = slice(max(shift, 0), n + min(shift, 0))
+        earlier = slice(max(-shift, 0), n - max(shift, 0))
         agreeing = _agreeing(of_parent[later, later], of_child[earlier, earlier])
         lost = agreeing & ~usual[later] & ~usual[earlier]
         if lost.mean() > _BLOCK:
@@ -474,7 +477,8 @@ def _read_otherwise(Ts: FloatArray) -> Iterator[tuple[str, FloatArray]]:
 
 def _is_unrelated(angles: dict[str, FloatArray]) -> bool:
     """Whether the stops of both sides agree hardly better than in any other order."""
-    of_parent, of_child = angles["parent"], angles["child"]
+    of_parent = angles["parent"]
+    of_child = angles["child"]
     random = np.random.default_rng(0)
     apart = median(np.abs(_upper(of_parent - of_child)))
     others = []

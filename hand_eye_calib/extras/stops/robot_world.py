@@ -25,14 +25,17 @@ _TAILS = 12.0
 
 # Outliers are left out: a stop this far off (squared distance of six values; 1 in 300,000 if errors
 # are normal) under heavy tails of so many degrees of freedom, which few outliers do not widen.
-_OUTLIER, _OUTLIER_TAILS = 36.0, 3.0
+_OUTLIER = 36.0
+_OUTLIER_TAILS = 3.0
 
 # Rounds of weights, levels and a Gauss-Newton step; steps below this many standard deviations end
 # them.
-_ROUNDS, _SMALL_STEP = 60, 1e-2
+_ROUNDS = 60
+_SMALL_STEP = 1e-2
 
 # Starts from so many stops each: two in three are clean with a tenth of outliers.
-_STARTS, _START_STOPS = 12, 5
+_STARTS = 12
+_START_STOPS = 5
 
 # Errors of copied poses are rounding (m^2, rad^2).
 _SMALLEST_VARIANCE = 1e-24
@@ -83,7 +86,8 @@ class Stops:
         return len(self.child)
 
     def __getitem__(self, which: IntArray | BoolArray) -> "Stops":
-        A, B = self.Ts_world_parent[which], self.Ts_world_child[which]
+        A = self.Ts_world_parent[which]
+        B = self.Ts_world_child[which]
         return Stops(A, B, self.child[which], self.world[which])
 
 
@@ -165,7 +169,8 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
     pose a camera measured), follow a Student-t distribution with one level for positions and one
     for rotations.
     """
-    n_children, n_worlds = 1 + int(stops.child.max(initial=0)), 1 + int(stops.world.max(initial=0))
+    n_children = 1 + int(stops.child.max(initial=0))
+    n_worlds = 1 + int(stops.world.max(initial=0))
     counts = np.zeros((n_children, n_worlds), dtype=np.int64)
     np.add.at(counts, (stops.child, stops.world), 1)
     if counts.max() < MIN_STOPS or not counts.any(axis=1).all() or not counts.any(axis=0).all():
@@ -173,13 +178,16 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
             f"{len(stops)} stops are too few: at least {MIN_STOPS} of each sensor, with rotations "
             "about two axes, are necessary; 15 or more are better"
         )
-    starts, views = _starts(stops, counts), _views(stops)
-    alone, fits = _alone(views), []
+    starts = _starts(stops, counts)
+    views = _views(stops)
+    alone = _alone(views)
+    fits = []
     # With heavier tails a few stops fit exactly, and all others are outliers.
     few = 8.0 * sum(counts.shape) / max(len(stops) - sum(counts.shape), 0.1)
     for in_world in (False, True):
         rough = _fit(stops, starts, in_world, max(few, _OUTLIER_TAILS), alone)
-        kept, weights = rough.weights > 0.0, np.zeros(len(stops))
+        kept = rough.weights > 0.0
+        weights = np.zeros(len(stops))
         begin = rough.Ts_parent_child, rough.Ts_world_world
         fit = _fit(stops[kept], begin, in_world, max(few, _TAILS), alone[kept])
         weights[kept] = fit.weights
@@ -215,7 +223,8 @@ def closest_rotations(
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
     """X and Z (4, 4) of one child and one world."""
-    A, B = stops.Ts_world_parent, stops.Ts_world_child
+    A = stops.Ts_world_parent
+    B = stops.Ts_world_child
     rotation_x, rotation_z = closest_rotations(A[:, :3, :3], B[:, :3, :3])
     columns = np.concatenate([A[:, :3, :3], -np.broadcast_to(np.eye(3), (len(A), 3, 3))], axis=2)
     values = B[:, :3, 3] @ rotation_z.T - A[:, :3, 3]
@@ -255,7 +264,8 @@ def _starts(stops: Stops, counts: IntArray) -> tuple[FloatArray, FloatArray]:
             raise NotEnoughDataError("the stops of some sensors or targets are tied to no others")
         child, world = (int(k) for k in np.unravel_index(np.argmax(near), near.shape))
         pair = stops[(stops.child == child) & (stops.world == world)]
-        A, B = pair.Ts_world_parent, pair.Ts_world_child
+        A = pair.Ts_world_parent
+        B = pair.Ts_world_child
         if has_X[child]:
             Zs[world] = _most_central(A @ Xs[child] @ se3.inverse(B))
         elif has_Z[world]:
@@ -306,7 +316,8 @@ def _products(rows: FloatArray, pairs: list[tuple[IntArray, IntArray]], n: int) 
     """Products (n + 1, n + 1) of columns: of rows (N, 6, 13) by X and Z of a stop, and one more."""
     whole = np.zeros((n + 1, n + 1))
     for own, columns in pairs:
-        part, at = rows[own].reshape(-1, 13), np.append(columns, n)
+        part = rows[own].reshape(-1, 13)
+        at = np.append(columns, n)
         whole[at[:, None], at] += part.T @ part
     return whole
 
@@ -348,7 +359,8 @@ def _shares(kernels: FloatArray, rows: FloatArray) -> FloatArray:
     Restricted likelihood: D. A. Harville, *Maximum likelihood approaches to variance component
     estimation*, JASA 72, 1977.
     """
-    n, n_columns = len(rows), rows.shape[2]
+    n = len(rows)
+    n_columns = rows.shape[2]
     factors = np.linalg.cholesky(kernels)
     whitened = np.linalg.solve(factors, rows.reshape(1, n, -1))
     # The last of the triangle's rows is what no values explain.
@@ -424,7 +436,8 @@ def _fit(
 ) -> RobotWorld:
     """Weights, levels and Gauss-Newton steps in turn."""
     Xs, Zs = starts
-    n, n_values = len(stops), 6 * (len(Xs) + len(Zs))
+    n = len(stops)
+    n_values = 6 * (len(Xs) + len(Zs))
     pairs = _pairs(stops, len(Xs))
     # Values that the errors are fitted with make them smaller.
     n_free = max(3.0 * n - 0.5 * n_values, 0.5)

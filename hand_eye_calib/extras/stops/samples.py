@@ -161,7 +161,8 @@ def _joined(
     for frames in ((source, target), (target, source)):
         pair = parts.get(frames, {})
         if "rotation" in pair and "translation" in pair:
-            rotation, translation = pair["rotation"], pair["translation"]
+            rotation = pair["rotation"]
+            translation = pair["translation"]
             Ts = pose_stack((rotation, translation), f"{frames[0]} in {frames[1]}")
             return Ts if frames == (source, target) else se3.inverse(Ts)
     return None

@@ -50,7 +50,8 @@ _POSE_SIZE = struct.calcsize("=7d")
 
 # CDR begins with 4 bytes that say how it is encoded, and alignment counts from there. A ROS 1
 # header begins with as many bytes of sequence number, and nothing is aligned.
-_START, _CDR = struct.calcsize("=I"), b"\x00\x01"
+_START = struct.calcsize("=I")
+_CDR = b"\x00\x01"
 
 
 class Cursor:
@@ -59,7 +60,9 @@ class Cursor:
     def __init__(self, data: bytes, is_ros1: bool) -> None:
         if not is_ros1 and bytes(data[:2]) != _CDR:
             raise ValueError(f"expected plain CDR, found encoding 0x{bytes(data[:2]).hex()}")
-        self._data, self._is_ros1, self.position = data, is_ros1, _START
+        self._data = data
+        self._is_ros1 = is_ros1
+        self.position = _START
 
     def read(self, format_: str) -> tuple[Any, ...]:
         """Read numbers of one size, by their format in struct."""
@@ -81,7 +84,8 @@ class Cursor:
         and the leading slash of ROS 1 is left out.
         """
         (length,) = self.read("I")
-        start, self.position = self.position, self.position + length
+        start = self.position
+        self.position = self.position + length
         if self.position > len(self._data):
             raise ValueError("a text does not fit into the message")
         if length > LONGEST_NAME:
@@ -107,7 +111,8 @@ def _imu(cursor: Cursor) -> Sequence[float]:
 
 def _fix(cursor: Cursor) -> Sequence[float]:
     """Latitude, longitude (deg) and height (m) of a NavSatFix: NaN without a fix."""
-    (status,), _ = cursor.read("b"), cursor.read("H")
+    (status,) = cursor.read("b")
+    _ = cursor.read("H")
     values = cursor.read("3d")
     return values if status >= 0 else (math.nan,) * 3
 
@@ -130,7 +135,8 @@ class MessageType(NamedTuple):
 
 # Where that stands in what is unpacked; latitude, longitude and height are positions.
 _PARTS = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7), "rates": slice(3)}
-_OF_POSES, _OF_POINTS = ("poses", "positions", "rotations"), ("positions",)
+_OF_POSES = ("poses", "positions", "rotations")
+_OF_POINTS = ("positions",)
 _TURN = "qx={0}.x,qy={0}.y,qz={0}.z,qw={0}.w"
 _PLACE = "lat_deg={0}latitude,lon_deg={0}longitude,height={0}altitude"
 
@@ -261,7 +267,8 @@ class PoseTable(Columns):
         """Poses of one stream in the order of stamps; of those with equal stamps the first."""
         stamps_ns, first = np.unique(self.stamps_ns, return_index=True)
         poses = self[first]
-        positions, quats_xyzw = poses.poses[:, :3], poses.poses[:, 3:]
+        positions = poses.poses[:, :3]
+        quats_xyzw = poses.poses[:, 3:]
         frames = poses.sensor_frames[0] or "", poses.world_frames[0]
         return Trajectory.from_quat_xyzw(stamps_ns, positions, quats_xyzw, *frames)
 
@@ -274,7 +281,8 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
     """A function that makes an object of the bytes of a message. Raises InputError if definition or
     encoding of the messages are not known.
     """
-    name, (language, content) = kind.type, kind.definition
+    name = kind.type
+    language, content = kind.definition
     if kind.encoding == "json":
         return partial(json.loads, object_hook=lambda fields: SimpleNamespace(**fields))
     if kind.encoding not in ("cdr", "ros1", "protobuf"):
@@ -291,7 +299,8 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
 
         types = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
         if content and name not in types.types:
-            text, is_idl = content.decode(), "idl" in language.lower()
+            text = content.decode()
+            is_idl = "idl" in language.lower()
             known = get_types_from_idl(text) if is_idl else get_types_from_msg(text, name)
             types.register({key: each for key, each in known.items() if key not in types.types})
         types.types[name]
@@ -316,16 +325,19 @@ def ns_of(stamp: Any) -> int | None:
 
 def pose_row(position: Any, orientation: Any) -> tuple[float, ...]:
     """x y z qx qy qz qw of a position, or translation, and an orientation of a message."""
-    at, turn = position, orientation
+    at = position
+    turn = orientation
     return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
 def transform_of(message: Any) -> PoseFields:
     """A transform of ROS or of Foxglove; its frames without a leading slash."""
     if is_ros := hasattr(message, "header"):
-        stamp, parent = message.header.stamp, message.header.frame_id
+        stamp = message.header.stamp
+        parent = message.header.frame_id
     else:
-        stamp, parent = message.timestamp, message.parent_frame_id
+        stamp = message.timestamp
+        parent = message.parent_frame_id
     parent = printable(frame_name(parent[:LONGEST_NAME]))
     frame = printable(frame_name(message.child_frame_id[:LONGEST_NAME]))
     pose = message.transform if is_ros else message
@@ -376,7 +388,8 @@ _Unpacked = tuple[int, str, str | None, Sequence[float], int]
 def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     """Stamp in ns, the header's frame, the sensor's behind it, values, and where these end."""
     cursor = Cursor(data, is_ros1)
-    stamp_ns, frame = cursor.stamp_ns(), cursor.name()
+    stamp_ns = cursor.stamp_ns()
+    frame = cursor.name()
     sensor_frame = cursor.name() if row.has_child_frame else None
     values = row.unpack(cursor) if row.unpack else ()
     return stamp_ns, frame, sensor_frame, values, cursor.position
@@ -386,7 +399,8 @@ def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) ->
     """Unpack one or more messages of one of MESSAGE_TYPES, poses together if they differ only in
     stamps and values; raises MALFORMED.
     """
-    row, size = MESSAGE_TYPES[message_type], len(messages[0])
+    row = MESSAGE_TYPES[message_type]
+    size = len(messages[0])
     if row.unpack is _pose and len(messages) > 1 and {*map(len, messages)} == {size}:
         _, world, sensor, _, end = _unpack(row, is_ros1, messages[0])
         bytes_of = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
@@ -404,7 +418,8 @@ def _unpack_together(rows: np.ndarray, is_ros1: bool) -> tuple[IntArray, FloatAr
     """Stamps and poses of rows of bytes (N, size) that begin with a stamp and end with a pose; None
     if what is between them, the frames, differs, or a stamp cannot be right.
     """
-    frames, stamps = rows[:, 8:-_POSE_SIZE], np.ascontiguousarray(rows[:, :8])
+    frames = rows[:, 8:-_POSE_SIZE]
+    stamps = np.ascontiguousarray(rows[:, :8])
     seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(np.int64)
     if (frames != frames[0]).any() or not (nanoseconds // NS_PER_S == 0).all():
         return None
@@ -425,7 +440,8 @@ class MessageReader:
     """
 
     def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
-        self._row, self._measures = MESSAGE_TYPES[message_type], measures
+        self._row = MESSAGE_TYPES[message_type]
+        self._measures = measures
         self._are_poses = message_type in POSE_TYPES and measures == "poses"
         self._rates = RateIntegrator()
         # Of the pose before: the bytes of its frames, where they end, and the frames.
@@ -494,5 +510,6 @@ class MessageReader:
         if not is_usable.all():
             raise NoPoseError(f"the message has no {self._measures}")
         values = columns.poses[0].tolist()
-        world, sensor = columns.world_frames[0], columns.sensor_frames[0]
+        world = columns.world_frames[0]
+        sensor = columns.sensor_frames[0]
         return PoseFields(int(columns.stamps_ns[0]), world, sensor, values[:3], values[3:])

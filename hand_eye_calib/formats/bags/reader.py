@@ -59,7 +59,8 @@ class PoseBag:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
         self.files = [file for storage in self._storages for file in storage.files]
-        types, counts = defaultdict[str, set[str]](set), Counter[str]()
+        types = defaultdict[str, set[str]](set)
+        counts = Counter[str]()
         for kind, count in chain(*(storage.counts.items() for storage in self._storages)):
             types[kind.topic].add(kind.type)
             counts[kind.topic] += count
@@ -235,7 +236,8 @@ class PoseBag:
         for reading in readings:
             reading.use_stamps((stamps or {}).get(reading.stream, "header"))
         topics = {topic for reading in readings for topic in reading.topics}
-        count, runs = sum(self.topics[topic].count for topic in topics), self.runs(topics)
+        count = sum(self.topics[topic].count for topic in topics)
+        runs = self.runs(topics)
         for run in self.shown(runs, count, f"reading {self}", lambda run: len(run.messages)):
             for reading in readings:
                 if run.kind.topic in reading.topics:
@@ -280,7 +282,8 @@ class PoseBag:
         if not len(poses):
             raise InputError(f"no poses on {source} of {self}")
         kind: Any = self.measured(source, measures)
-        trajectory, notes = replace(poses.trajectory(), measures=kind), []
+        trajectory = replace(poses.trajectory(), measures=kind)
+        notes = []
         if (np.diff(poses.stamps_ns) <= 0).any():
             notes.append(
                 f"{source}: poses were put in the order of their stamps; "
@@ -293,7 +296,8 @@ class PoseBag:
         """The frames of the bag and their static transforms; of repeated ones the last. As in tf2,
         one that is no pose is left out. An InputError if they form no tree or are damaged.
         """
-        tree, notes = FrameTree("the bag's transforms"), {}
+        tree = FrameTree("the bag's transforms")
+        notes = {}
         for run in self.runs(self._of_transforms()):
             is_fixed = run.kind.topic.endswith("tf_static")
             for _, (_, parent, frame, *values) in run.transforms():

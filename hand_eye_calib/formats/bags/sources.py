@@ -48,7 +48,8 @@ class Reading(ABC):
     """
 
     def __init__(self, stream: str, *topics: str) -> None:
-        self.stream, self.topics = stream, topics
+        self.stream = stream
+        self.topics = topics
         self.notes: list[str] = []
         self.stamps = "header"
 
@@ -165,7 +166,8 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
     delays_s = np.asarray(bag_ns - stamps_ns, dtype=float) * 1e-9
     # At both ends the two neighbours are on one side.
     delays_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
-    steps_s, across_s = np.abs(np.diff(delays_s)), np.abs(delays_s[2:] - delays_s[:-2])
+    steps_s = np.abs(np.diff(delays_s))
+    across_s = np.abs(delays_s[2:] - delays_s[:-2])
     off_s = np.minimum(steps_s[:-1], steps_s[1:])
     return np.asarray(off_s <= _JUMP_S + across_s + np.median(steps_s[1:-1]))
 
@@ -196,7 +198,8 @@ class JoinedReading(Reading):
         first_ns, last_ns = orientations.stamps_ns[[0, -1]]
         fixes = fixes[(fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)]
         quats_xyzw = se3.to_quat_xyzw(orientations.at(fixes.stamps_ns))
-        poses, frame = np.c_[fixes.poses[:, :3], quats_xyzw], orientations.sensor_frame
+        poses = np.c_[fixes.poses[:, :3], quats_xyzw]
+        frame = orientations.sensor_frame
         table = messages.PoseTable.of(fixes.stamps_ns, poses, "", frame)
         return table.recorded(self.stream, fixes.bag_ns)
 
@@ -281,7 +284,8 @@ class FieldReading(Reading):
         if not table.stamps:
             topic = self.topics[0]
             raise InputError(f"no messages on {topic}, or none of its fields is a stamp, t")
-        stamps_ns, self.notes = stamps_in_ns(table, None), table.guesses
+        stamps_ns = stamps_in_ns(table, None)
+        self.notes = table.guesses
         self._note_null(table.n_left_out, table.n_rows)
         if table.measures == "twists":
             poses = _integrated(stamps_ns, table.values())

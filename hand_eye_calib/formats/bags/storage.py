@@ -78,7 +78,8 @@ class Storage(ABC):
     repair = ""
 
     def __init__(self, path: Path, file: Path, opened: ExitStack) -> None:
-        self.path, self._file = path, file
+        self.path = path
+        self._file = file
         self.files = [path, *_unfinished(path)]
         self.counts = Counter[MessageKind]()
         self.span_ns: tuple[int, ...] = ()
@@ -99,7 +100,8 @@ class Storage(ABC):
         of mcap that overlap come one after the other.
         """
         kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
-        blocks, block = message_blocks(self._messages(kinds) if kinds else ()), None
+        blocks = message_blocks(self._messages(kinds) if kinds else ())
+        block = None
         while block != []:
             with self._guarded():
                 block = next(blocks, [])
@@ -162,14 +164,18 @@ class RosbagsFile(Storage):
 
     def _of_chunks(self, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
         """Messages of rosbag1, from where the library has found them: its own reading is slow."""
-        reader, at, chunk = self._reader, -1, b""
+        reader = self._reader
+        at = -1
+        chunk = b""
         found = [(each, kind) for key, kind in kinds.items() for each in reader.indexes[key]]
         for entry, kind in sorted(found, key=lambda each: each[0].time):
             if entry.chunk_pos != at:
-                at, about = entry.chunk_pos, reader.chunks[entry.chunk_pos]
+                at = entry.chunk_pos
+                about = reader.chunks[entry.chunk_pos]
                 reader.bio.seek(about.datapos)
                 chunk = about.decompressor(reader.bio.read(about.datasize))
-            end, is_message = entry.offset, False
+            end = entry.offset
+            is_message = False
             while not is_message:  # or the record of a connection, before its first message
                 begin = end + _LENGTH.size + _LENGTH.unpack_from(chunk, end)[0]
                 is_message = b"op=\x02" in chunk[end:begin]
@@ -180,7 +186,8 @@ class RosbagsFile(Storage):
 
 
 # Opcode and length of a record; channel, number, log time and time of publication of a message.
-_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<H4xQ8x")
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<H4xQ8x")
 _LENGTH = struct.Struct("<I")
 
 
@@ -196,7 +203,8 @@ class McapFile(Storage):
         self._chunks: list[Any] | None = None
         try:
             summary: Any = make_reader(self._stream).get_summary()
-            about, chunks = summary.statistics, summary.chunk_indexes
+            about = summary.statistics
+            chunks = summary.chunk_indexes
             found = len(summary.channels), len(chunks), bool(chunks)
             if found != (about.channel_count, about.chunk_count, about.message_count > 0):
                 raise ValueError("it has no index of its messages")
@@ -220,7 +228,8 @@ class McapFile(Storage):
 
     def _search(self, reason: Exception) -> None:
         """Count what is in a file without an index."""
-        schemas, times_ns = {}, []
+        schemas = {}
+        times_ns = []
         for record in self._records(self.losses):
             kind = type(record).__name__
             if kind == "Schema":
@@ -289,10 +298,12 @@ def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iter
     """
     from mcap.opcode import Opcode
 
-    position, of_message = 0, int(Opcode.MESSAGE)
+    position = 0
+    of_message = int(Opcode.MESSAGE)
     while position < len(content):
         opcode, size = _RECORD.unpack_from(content, position)
-        start, position = position + _RECORD.size, position + _RECORD.size + size
+        start = position + _RECORD.size
+        position = position + _RECORD.size + size
         if position > len(content):
             raise EOFError("a chunk ends in the middle of a record")
         if opcode == of_message:
@@ -326,7 +337,8 @@ def rosbags(version: int) -> Any:
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
     """Messages in blocks; those compressed one by one are unpacked."""
-    rows, size = list[Message](), 0
+    rows = list[Message]()
+    size = 0
     for kind, bag_ns, data in messages:
         if data.startswith(_ZSTD_MAGIC):  # as plain CDR never does
             data = bytes(_zstd().decompress(data))
@@ -334,7 +346,8 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
         size += len(data)
         if size > files.BLOCK_BYTES:
             yield rows
-            rows, size = [], 0
+            rows = []
+            size = 0
     if rows:
         yield rows
 
@@ -411,7 +424,8 @@ def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
 
 def _unpack(file: Path, target: Path) -> str:
     """Unpack a file that is compressed as a whole, as far as it goes; what is lost."""
-    zstd, most = _zstd(), files.LARGEST_RATIO * file.stat().st_size
+    zstd = _zstd()
+    most = files.LARGEST_RATIO * file.stat().st_size
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
         try:
             for piece in iter(lambda: packed.read(files.BLOCK_BYTES), b""):

@@ -60,7 +60,8 @@ def stamped_messages(
     def make(name: str, *values: Any) -> Any:
         return types[f"geometry_msgs/msg/{name}"](*values)
 
-    zero, no_covariance = make("Vector3", 0.0, 0.0, 0.0), np.zeros(36)
+    zero = make("Vector3", 0.0, 0.0, 0.0)
+    no_covariance = np.zeros(36)
     twist = make("TwistWithCovariance", make("Twist", zero, zero), no_covariance)
     rows = zip(trajectory.stamps_ns, se3.to_rows(trajectory.poses).tolist(), strict=True)
     for number, (stamp_ns, row) in enumerate(rows):

@@ -104,7 +104,8 @@ def lines_of(path: str | Path, text: str, after: int | None = None) -> Iterator[
     """The lines of a text that are not blank, with their numbers; those after one that are no
     comments.
     """
-    number, end = 1, 0
+    number = 1
+    end = 0
     for line in _LINE.finditer(text):
         number += text.count("\n", end, line.start())
         end = line.end()

@@ -26,7 +26,8 @@ from hand_eye_calib.offline.cli.reading import Recording
 
 # Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
 # A part may begin before the last poses of the one before it are written.
-_LONGEST_PAUSE_S, _LONGEST_OVERLAP_S = 60.0, 1.0
+_LONGEST_PAUSE_S = 60.0
+_LONGEST_OVERLAP_S = 1.0
 
 
 class SeveralRecordingsError(InputError):
@@ -34,7 +35,8 @@ class SeveralRecordingsError(InputError):
 
     def __init__(self, reason: str, groups: list[list[Path]]) -> None:
         super().__init__(f"{reason}; calibrate each by itself, or all of one rig together")
-        self.reason, self.groups = reason, groups
+        self.reason = reason
+        self.groups = groups
 
 
 def read_recording(

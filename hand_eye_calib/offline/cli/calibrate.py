@@ -175,7 +175,8 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     for topic in topics:
         rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
         cells = (topic["name"], topic["type"] or "several types", topic["count"], rate)
-        usable, frames = "yes" * topic["is_usable"], " ".join(topic["frames"])
+        usable = "yes" * topic["is_usable"]
+        frames = " ".join(topic["frames"])
         lines.append(_ROW.format(*cells, usable, frames).rstrip())
     lines.append(
         "--parent-topic and --child-topic take the topics with poses, or frames of /tf: odom:lidar"

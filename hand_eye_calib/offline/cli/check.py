@@ -50,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     given = options.options_from(arguments)
     sources, (first, second), repairs = _opened(arguments, given)
     snapshot = whole_snapshot(first, second, given)
-    config, (parent, child) = snapshot.config, snapshot.unpaired
+    config = snapshot.config
+    parent, child = snapshot.unpaired
     with waiting_for("checking the streams"):
         checked = check(snapshot, None if config.measured == "poses" else snapshot.estimate())
     of_files = [finding("disorder", text=text) for text in repairs]
@@ -99,7 +100,8 @@ def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -
     yield from (f"{stream} is {source}" for stream, source in sources.items())
     yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
-        path, rotation = summary.path_m, summary.rotation_rad
+        path = summary.path_m
+        rotation = summary.rotation_rad
         yield (
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
             f"{summary.longest_interval_s:10.3f} s {'none' if path is None else length(path):>12} "

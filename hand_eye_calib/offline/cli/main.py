@@ -122,7 +122,8 @@ def _run(argv: Sequence[str]) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     added = {name: commands.add_parser(name, help=COMMANDS[name].help) for name in COMMANDS}
     for one in (parser, *added.values()):
-        one.formatter_class, one.allow_abbrev = argparse.RawDescriptionHelpFormatter, False
+        one.formatter_class = argparse.RawDescriptionHelpFormatter
+        one.allow_abbrev = False
     if command is not None:
         module = COMMANDS[command].load()
         added[command].description = COMMANDS[command].help
@@ -139,6 +140,7 @@ def _run(argv: Sequence[str]) -> int:
     elif command is None:
         parser.print_help()
     else:
-        arguments.passed_on, arguments.typed = rest, list(argv)
+        arguments.passed_on = rest
+        arguments.typed = list(argv)
         return int(module.run(arguments))
     return 0

@@ -111,7 +111,8 @@ def as_typed(text: str) -> str:
     """
 
     def typed(match: re.Match[str]) -> str:
-        name, value = match[1] or match[2], match[3] or ""
+        name = match[1] or match[2]
+        value = match[3] or ""
         if name in _OPTIONS and name.startswith("prior."):
             return f"--prior {name.removeprefix('prior.')}{value.replace(' ', '=')}"
         return f"--{flag(name)}{value}" if name in _OPTIONS else match[0]
@@ -231,7 +232,8 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
-    add, metavar = group.add_argument, "AXIS=VALUE+/-SIGMA"
+    add = group.add_argument
+    metavar = "AXIS=VALUE+/-SIGMA"
     prior = (
         "what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; AXIS "
         f"is one of {_AXES}; may be repeated"
@@ -253,7 +255,8 @@ def _prior(text: str) -> tuple[str, OptionValue]:
 def _named(name: str, value: object) -> tuple[str, OptionValue]:
     """An option and its value, from text or as YAML has it; lengths and angles may name a unit."""
     field = OPTION_FIELDS[name]
-    kind, unit = type(field.default), field.metadata["unit"]
+    kind = type(field.default)
+    unit = field.metadata["unit"]
     if isinstance(value, str) and kind in (int, float):
         if unit in ("m", "rad"):
             return name, check_value(field, *quantities(name, [unit], [value], ""))
@@ -279,7 +282,8 @@ def _read_config(path: Path) -> Options:
         found = type(document).__name__
         raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
     options: dict[str, OptionValue] = {}
-    ignored, of_others = [], []
+    ignored = []
+    of_others = []
     for name, value in _flat(document or {}):
         node, is_of_ros, option = name.rpartition(f"{_OF_ROS}.")
         if is_of_ros and re.split("[./]", node.rstrip("."))[-1] not in _NODES:

@@ -121,8 +121,10 @@ def as_lines(
     to take next, the recordings, the goal of the session and the comparison with what is
     installed; with details also quaternions, and how it was solved.
     """
-    parent, child = calibration.parent_frame, calibration.child_frame
-    transforms, lines = transforms_of(calibration), [*verdict_lines(calibration)]
+    parent = calibration.parent_frame
+    child = calibration.child_frame
+    transforms = transforms_of(calibration)
+    lines = [*verdict_lines(calibration)]
     shown = [
         (child, parent, "T_parent_child"),
         (parent, child, "T_child_parent"),

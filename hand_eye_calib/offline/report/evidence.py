@@ -19,7 +19,8 @@ from hand_eye_calib.core.results.calibration import Calibration
 _PATH_STEP_S = 0.2
 
 # Most samples of the angular rates, and the shortest window of each (s).
-_MAX_RATES, _MIN_WINDOW_S = 1500, 0.2
+_MAX_RATES = 1500
+_MIN_WINDOW_S = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +133,8 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
     longest_s = max(parent.duration_s, child.duration_s)
     step_s = max(parent.interval_s, child.interval_s, longest_s / _MAX_RATES)
     has_rates = parent.has_rotations and child.has_rotations
-    rates, spans = [], []
+    rates = []
+    spans = []
     for stream in (parent, child):
         window_s = max(3 * step_s, _MIN_WINDOW_S)
         found = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
@@ -153,10 +155,13 @@ def _paths(
     the paths if one sensor has positions alone.
     """
     if calibration.measured == "positions":
-        poses, measured = pose_pairs.Ts_pw_p @ calibration.T_parent_child, pose_pairs.Ts_cw_c
+        poses = pose_pairs.Ts_pw_p @ calibration.T_parent_child
+        measured = pose_pairs.Ts_cw_c
         if of_parent:
-            poses, measured = pose_pairs.Ts_cw_c @ calibration.T_child_parent, pose_pairs.Ts_pw_p
-        path, positions = poses[:, :3, 3], measured[:, :3, 3]
+            poses = pose_pairs.Ts_cw_c @ calibration.T_child_parent
+            measured = pose_pairs.Ts_pw_p
+        path = poses[:, :3, 3]
+        positions = measured[:, :3, 3]
         path = path - path.mean(axis=0)
         rotation = se3.nearest_rotation((positions - positions.mean(axis=0)).T @ path)
         path = path @ rotation.T + positions.mean(axis=0)

@@ -32,8 +32,13 @@ from hand_eye_calib.offline.report.evidence import Evidence, StreamView
 # ---- how every figure looks
 
 # Colours as drawn on a page, each with the name of the page's own colour that replaces it.
-INK, MUTED, GRID = "#1b1f24", "#5c6670", "#d9dee3"
-PARENT, CHILD, BAD, GREEN = "#0072b2", "#d98300", "#c8452f", "#009e73"
+INK = "#1b1f24"
+MUTED = "#5c6670"
+GRID = "#d9dee3"
+PARENT = "#0072b2"
+CHILD = "#d98300"
+BAD = "#c8452f"
+GREEN = "#009e73"
 _VARIABLES = {INK: "ink", MUTED: "muted", GRID: "grid", PARENT: "parent", CHILD: "child"}
 _VARIABLES |= {BAD: "bad", GREEN: "good"}
 
@@ -268,12 +273,16 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
     sizes.pop({"rotations": "x", "positions": "yaw"}.get(calibration.measured, ""), None)
     is_out = ~residuals.is_inlier
     if calibration.reference == "stops":
-        what, times, unit, label = "stops", np.arange(1.0, len(residuals) + 1), "", "stop"
+        what = "stops"
+        times = np.arange(1.0, len(residuals) + 1)
+        unit = ""
+        label = "stop"
     else:
         first_ns = residuals.start_ns.min(initial=residuals.end_ns[0])
         times = (residuals.end_ns - first_ns) * 1e-9
         factor, unit = _time_axis(float(times.max()))
-        times, label = times * factor, f"time ({unit})"
+        times = times * factor
+        label = f"time ({unit})"
         is_of_positions = calibration.measured == "positions"
         what = "distances from one position to the next" if is_of_positions else "motion pairs"
     figure, panels = _figure(1.2 + 1.6 * len(sizes), len(sizes), 1, bottom=0.8, sharex=True)
@@ -298,10 +307,12 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
 
 def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:
     """Sizes (K,) of residuals, above zero, and which were rejected."""
-    dots, crosses = np.flatnonzero(~is_out), np.flatnonzero(is_out)
+    dots = np.flatnonzero(~is_out)
+    crosses = np.flatnonzero(is_out)
     dots = dots[_downsample(len(dots))]
     crosses = crosses[np.argsort(-values[crosses])[: LOOK.points]]
-    used, rejected = (times[dots], values[dots], "o"), (times[crosses], values[crosses], "x")
+    used = (times[dots], values[dots], "o")
+    rejected = (times[crosses], values[crosses], "x")
     panel.plot(*used, color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
     panel.plot(*rejected, color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
     panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
@@ -399,7 +410,8 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
             _draw_sensor(panel, T[seen], calibration.child_frame, CHILD, axis_m, -14)
             is_known = np.isfinite(calibration.sigmas[seen])
             if is_known.all():
-                R, covariance = T[seen, :3], calibration.covariance[:3, :3]
+                R = T[seen, :3]
+                covariance = calibration.covariance[:3, :3]
                 values, vectors = np.linalg.eigh(R @ covariance @ R.T)
                 wide, high = 2 * LOOK.sigmas * np.sqrt(np.maximum(values, 0.0))
                 turned = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))

@@ -95,18 +95,21 @@ def render(
     """The report as HTML, of a result and the poses and options that gave it (none for stops);
     ``inputs`` say in plain values where the data came from.
     """
-    inputs, command = inputs or {}, calibration.static_transform_command()
+    inputs = inputs or {}
+    command = calibration.static_transform_command()
     calibration = replace(
         calibration,
         parent_frame=_named(calibration.parent_frame, inputs.get("parent", {})),
         child_frame=_named(calibration.child_frame, inputs.get("child", {})),
     )
-    parent, child = printable(calibration.parent_frame), printable(calibration.child_frame)
+    parent = printable(calibration.parent_frame)
+    child = printable(calibration.child_frame)
     verdict, _, said = calibration.headline.partition(": ")
     document = calibration.to_dict()
     by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
     evidence = gather(calibration, snapshot) if snapshot else None
-    advice, unknown = "", {*calibration.out_of_reach}
+    advice = ""
+    unknown = {*calibration.out_of_reach}
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
     return page(
@@ -209,7 +212,8 @@ def _data(
     usual = CalibratorConfig().to_options()
     given = [f"{name} {each}" for name, each in options.items() if each != usual[name]]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    rows, kind = summary(calibration), "stops"
+    rows = summary(calibration)
+    kind = "stops"
     if evidence:
         kind = f"synchronised pose pairs over {text.duration(evidence.times_s[-1])}"
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True)) if snapshot else {}
@@ -234,7 +238,8 @@ def _stream(name: str, inputs: Document, stream: Trajectory | None) -> dict[str,
     if count and ends_ns and (seconds := (ends_ns[-1] - ends_ns[0]) * 1e-9):
         row |= {"duration": text.duration(seconds), "rate": f"{(count - 1) / seconds:.1f} Hz"}
     if stream is not None and len(stream) >= max(2, count or 0):
-        whole, count = summarise(stream), len(stream)
+        whole = summarise(stream)
+        count = len(stream)
         row |= {"gap": f"{whole.longest_interval_s:.2f} s", "rate": f"{whole.rate_hz:.1f} Hz"}
         row |= {"duration": text.duration(whole.duration_s)}
         row |= {"path": "-" if whole.path_m is None else text.length(whole.path_m)}

@@ -40,14 +40,17 @@ WITNESSES = 6
 # Near another message: within so much (ns), or so many periods. A real change farther back is a
 # jump of the clock, and a new session. Messages that wait follow each other within the longest
 # pause (ns).
-NEAR_NS, _PERIODS, _LONGEST_PAUSE_NS = 1_000_000_000, 5, 60_000_000_000
+NEAR_NS = 1_000_000_000
+_PERIODS = 5
+_LONGEST_PAUSE_NS = 60_000_000_000
 
 # A stream is silent after so long (s). After one has jumped back, the others' messages of before
 # are left out for as long.
 SILENT_AFTER_S = 2.0
 
 # A session is paused after so long (s), or so many periods of the stream, without a pose.
-PAUSED_AFTER_S, PAUSED_PERIODS = 5.0, 5
+PAUSED_AFTER_S = 5.0
+PAUSED_PERIODS = 5
 
 Stamped = tuple[int, Any]
 
@@ -127,12 +130,14 @@ class StampGuard:
 
     def _drop_held(self) -> list[int]:
         """Drop the messages that wait; returns their stamps."""
-        dropped, self._held = [stamp_ns for stamp_ns, _ in self._held], []
+        dropped = [stamp_ns for stamp_ns, _ in self._held]
+        self._held = []
         return dropped
 
     def _believe(self, now_s: float) -> Judgement:
         """Take the messages that wait."""
-        members, self._held = self._held, []
+        members = self._held
+        self._held = []
         before_ns = statistics.median_low(self._recent_ns or [members[0][0]])
         jumped = members[0][0] < before_ns - NEAR_NS
         follows = now_s < self._outdated_until_s
@@ -174,21 +179,31 @@ class PoseInput:
         log: NodeLog,
         on_jump_back: Callable[["PoseInput"], None],
     ) -> None:
-        self.name, self.topic = name, topic
-        self.is_enabled, self.problem, self._sensor_frame = True, "", ""
+        self.name = name
+        self.topic = topic
+        self.is_enabled = True
+        self.problem = ""
+        self._sensor_frame = ""
         self._world_frame = ""
-        self._guard, self._refused = StampGuard(), Counter[str]()
-        self._session, self._log, self._on_jump_back = session, log, on_jump_back
+        self._guard = StampGuard()
+        self._refused = Counter[str]()
+        self._session = session
+        self._log = log
+        self._on_jump_back = on_jump_back
         self._wanted = "auto"
-        self._arrived, self._lost, self._null = 0, 0, 0
+        self._arrived = 0
+        self._lost = 0
+        self._null = 0
         self._next_number: int | None = None
         self._arrived_s: float | None = None
         self._taken_s: float | None = None
         self.publishers: tuple[str, ...] | None = None
-        self._bad, self._bad_at_s = "", -np.inf
+        self._bad = ""
+        self._bad_at_s = -np.inf
         self._counts = deque([(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._last_stamp_ns: int | None = None
-        self._longest_gap_ns, self._is_new = 0, True
+        self._longest_gap_ns = 0
+        self._is_new = True
 
     @property
     def has_poses(self) -> bool:
@@ -203,7 +218,8 @@ class PoseInput:
         """Begin a new session: asked for, or because the stamps of an input have jumped back."""
         self._sensor_frame = ""
         self._world_frame = ""
-        self._last_stamp_ns, self._longest_gap_ns = None, 0
+        self._last_stamp_ns = None
+        self._longest_gap_ns = 0
         self._taken_s = None
         self._is_new = because_of is None
         if because_of is None:
@@ -221,14 +237,16 @@ class PoseInput:
         """Count the lost messages before one with this number of its publisher; None if nothing is
         known of them: there are several publishers, or the middleware gives no numbers.
         """
-        expected, number = self._next_number, sequence_number
+        expected = self._next_number
+        number = sequence_number
         self._next_number = None if number is None else number + 1
         if expected is not None and number is not None:  # less: the publisher was started again
             self._lost += max(number - expected, 0)
 
     def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         """Take a message; it is read when its stamp is believed."""
-        self._arrived, self._arrived_s = self._arrived + 1, time.monotonic()
+        self._arrived = self._arrived + 1
+        self._arrived_s = time.monotonic()
         if not self.is_enabled:
             return
         if self._last_stamp_ns is not None:
@@ -248,7 +266,8 @@ class PoseInput:
     def refuse(self, which: str, reason: str, text: str) -> None:
         """Count a message that cannot be used, and say why."""
         self._refused[reason] += 1
-        self._bad, self._bad_at_s = text, time.monotonic()
+        self._bad = text
+        self._bad_at_s = time.monotonic()
         self._log.warning(f"{self.topic}: a message is refused: {text}")
         self._log.debug(f"{self.topic}: message {which} refused: {text}")
 
@@ -292,7 +311,8 @@ class PoseInput:
             except HandEyeCalibError as error:
                 self.refuse(with_stamp(stamp_ns), "unusable", str(error))
         if judgement.taken and self._is_new:
-            self._is_new, first_s = False, judgement.taken[0][0] * 1e-9
+            self._is_new = False
+            first_s = judgement.taken[0][0] * 1e-9
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
     # ----------------------------------------------------------------- state

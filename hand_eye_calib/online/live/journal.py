@@ -78,7 +78,9 @@ class SessionJournal:
         log: NodeLog,
         resumed: journal.Journal | None = None,
     ) -> None:
-        self.directory, self.error, self._log = directory, "", log
+        self.directory = directory
+        self.error = ""
+        self._log = log
         self._lock = lock_directory(directory.parent)
         self._about = about
         self.poses: list[_Pose] = []
@@ -91,7 +93,8 @@ class SessionJournal:
 
     def flush(self) -> None:
         """Hand what is new to the thread; to be called often."""
-        poses, self.poses = self.poses, []
+        poses = self.poses
+        self.poses = []
         if self._jobs.qsize() > _MOST_WAITING and not self.error:
             self._give_up("the disk does not answer")
         elif not self.error:
@@ -149,6 +152,7 @@ class SessionJournal:
             self._writer.describe(about)
 
     def _close(self) -> None:
-        writer, self._writer = self._writer, None
+        writer = self._writer
+        self._writer = None
         if writer is not None:
             writer.close()

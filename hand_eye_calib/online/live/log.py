@@ -50,7 +50,8 @@ class NodeLog:
             self._logger.error(_escaped(text))
 
     def _is_due(self, text: str, every_s: float) -> bool:
-        key, now_s = _NUMBERS.sub("", text), time.monotonic()
+        key = _NUMBERS.sub("", text)
+        now_s = time.monotonic()
         is_due = now_s - self._written_at_s.get(key, -float("inf")) >= every_s
         if is_due and len(self._written_at_s) < 10_000:
             self._written_at_s[key] = now_s

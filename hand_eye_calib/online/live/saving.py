@@ -27,7 +27,9 @@ class Saver:
     """
 
     def __init__(self, session: LiveSession, cycle: SolveCycle, log: NodeLog) -> None:
-        self._session, self._cycle, self._log = session, cycle, log
+        self._session = session
+        self._cycle = cycle
+        self._log = log
         self._earlier_kept_in = ""
         self._process: subprocess.Popen[bytes] | None = None
         self.state: SavedState | None = None
@@ -45,7 +47,8 @@ class Saver:
 
     def _save(self, options: NodeConfig) -> str:
         directory = options.output_directory
-        result, snapshot = self._cycle.result_to_save(), self._cycle.snapshot()
+        result = self._cycle.result_to_save()
+        snapshot = self._cycle.snapshot()
         if not directory:
             raise ConfigError("set the parameter output_directory to a directory")
         if result is None or snapshot is None:

@@ -44,7 +44,8 @@ class LiveSession:
         self.engines |= {name: Calibrator(_of_other(config)) for name in others}
         self.number = 0
         self.topics: dict[str, str] = {}
-        self._is_solved, self._n_solved = True, 0
+        self._is_solved = True
+        self._n_solved = 0
         self._log = log
         self._measures: Document = {}
         self._origins: dict[str, LocalOrigin] = {}
@@ -71,7 +72,8 @@ class LiveSession:
         """
         self._is_solved = limits is None
         made = Calibrator(self.calibrator.config, limits or BufferLimits())
-        self.engines, self._n_solved = Calibrators(child=made), 0
+        self.engines = Calibrators(child=made)
+        self._n_solved = 0
 
     def set_measures(self, stream: str, measures: str) -> None:
         """Take what a stream measures, as its message type says, one of config.MEASURES.
@@ -149,7 +151,9 @@ class LiveSession:
 
     def journal_state(self, options: NodeConfig) -> JournalState:
         """Whether a crash would lose the session."""
-        journal, level, text = self.journal, Level.OK, "the session is being written"
+        journal = self.journal
+        level = Level.OK
+        text = "the session is being written"
         if journal is not None and journal.error:
             level = Level.ERROR
             text = f"cannot write the journal: {journal.error}; "
@@ -157,7 +161,8 @@ class LiveSession:
         elif journal is None:
             text = "off"
             if options.journal != "off":
-                level, text = Level.WARN, "off: the node began without output_directory"
+                level = Level.WARN
+                text = "off: the node began without output_directory"
         directory = str(journal.directory) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 

@@ -224,7 +224,8 @@ class SolvingProcess:
     """
 
     def __init__(self, on_answer: Callable[[], None], command: str = _SOLVE) -> None:
-        self._on_answer, self._command = on_answer, command
+        self._on_answer = on_answer
+        self._command = command
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._is_stopping = False
         self._start()
@@ -255,7 +256,8 @@ class SolvingProcess:
     def _run(self, job: Job) -> None:
         to: Any = self._process.stdin
         back: Any = self._process.stdout
-        found, began_s = None, time.monotonic()
+        found = None
+        began_s = time.monotonic()
         killer = threading.Timer(HANGS_AFTER_S, self._process.kill)
         killer.daemon = True
         killer.start()

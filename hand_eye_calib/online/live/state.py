@@ -17,7 +17,8 @@ from hand_eye_calib.online.live.progress import Progress
 
 # The node says how it is so often (s). A disk, a solve under way and who listens may each hold up
 # its end for so long (s).
-REPORT_PERIOD_S, GRACE_S = 1.0, 0.4
+REPORT_PERIOD_S = 1.0
+GRACE_S = 0.4
 
 # Who asks for a solve has an answer within so long (s), also where others use the processor.
 ANSWER_WITHIN_S = 20.0

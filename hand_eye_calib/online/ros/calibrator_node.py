@@ -67,7 +67,8 @@ class CalibratorNode(Node):
         self._options = Parameters(self, self._follow_parameters, self._check_options)
         for line in self._options.unknown:
             self._log.warning(line)
-        options, config = self._options.node, self._options.calibrator
+        options = self._options.node
+        config = self._options.calibrator
         self._config = config
         # From now on, participants may choose a directory below this one.
         self._output_base = output_path(options.output_directory or ".").resolve()
@@ -124,7 +125,8 @@ class CalibratorNode(Node):
 
     def _say_start(self) -> None:
         """Say in one line what the node goes by."""
-        options, inputs = self._options.node, self._inputs
+        options = self._options.node
+        inputs = self._inputs
         what = "watching" if options.monitor else "calibrating"
         children = ", ".join(each.topic for each in inputs[1:])
         given = self._options.given.items()
@@ -203,7 +205,8 @@ class CalibratorNode(Node):
         self._cycle.tell_who_waits()
 
     def _why_not_broadcast(self) -> str:
-        result, progress = self._cycle.result, self._cycle.goal.progress
+        result = self._cycle.result
+        progress = self._cycle.goal.progress
         if result is None:
             return "no result yet"
         if self._cycle.published is None:
@@ -214,7 +217,9 @@ class CalibratorNode(Node):
         return "" if result.base_frame == wanted else f"base_frame {wanted} is not known"
 
     def _state(self) -> NodeState:
-        cycle, name, steady_s = self._cycle, self.get_fully_qualified_name(), time.monotonic()
+        cycle = self._cycle
+        name = self.get_fully_qualified_name()
+        steady_s = time.monotonic()
         # A robot that rests, once there is a result, has nothing more to show. Who has no publisher
         # any more does not rest, unless the goal is reached.
         rests = cycle.published is not None
@@ -300,7 +305,8 @@ class CalibratorNode(Node):
             output_path(options.output_directory, self._output_base)
 
     def _follow_parameters(self) -> None:
-        options, config = self._options.node, self._options.calibrator
+        options = self._options.node
+        config = self._options.calibrator
         before = self._config
         if (config, config.given) != (before, before.given):
             self._config = config

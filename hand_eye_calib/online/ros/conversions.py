@@ -15,7 +15,8 @@ from hand_eye_calib.core.results.calibration import Calibration
 # Messages that may wait in a queue: seconds of a fast stream, and every publisher's last message.
 _QUEUE = 1000
 
-_RELIABLE, _LASTING = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
+_RELIABLE = ReliabilityPolicy.RELIABLE
+_LASTING = DurabilityPolicy.TRANSIENT_LOCAL
 # Of a publisher: who comes later gets the last message. Of a subscription: every publisher's.
 LATCHED = QoSProfile(depth=1, reliability=_RELIABLE, durability=_LASTING)
 LISTENING = QoSProfile(depth=_QUEUE, reliability=_RELIABLE, durability=_LASTING)
@@ -65,7 +66,8 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message = PoseWithCovarianceStamped()
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = calibration.parent_frame
-    T, pose = calibration.T_parent_child, message.pose.pose
+    T = calibration.T_parent_child
+    pose = message.pose.pose
     _put(T, pose.position, pose.orientation)
     covariance = turned(T[:3, :3], calibration.covariance)
     message.pose.covariance = covariance.ravel().tolist()

@@ -60,7 +60,9 @@ class TopicInput(RosInput):
     def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
         self._relative_topic = f"{name}_odom"
         super().__init__(name, node.resolve_topic_name(self._relative_topic), parts)
-        self._node, self._wanted_type, self._n_publishers = node, wanted_type, 0
+        self._node = node
+        self._wanted_type = wanted_type
+        self._n_publishers = 0
         self._type_name = ""
 
     def discover(self) -> None:

@@ -17,7 +17,8 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # One wait of the executor costs as much as ten messages. Those that come faster than the first of
 # these (s) are taken without it; it has its turn after the second.
-_REST_S, _TURN_S = 0.004, 0.02
+_REST_S = 0.004
+_TURN_S = 0.02
 
 
 def main(args: list[str] | None = None) -> int:
@@ -86,7 +87,8 @@ def _run_node(signals: int) -> int:
     from hand_eye_calib.online.ros.calibrator_node import CalibratorNode
 
     # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
-    executor, stopping = SingleThreadedExecutor(), threading.Event()
+    executor = SingleThreadedExecutor()
+    stopping = threading.Event()
 
     def wait_for_signal() -> None:
         os.read(signals, 1)
@@ -94,7 +96,8 @@ def _run_node(signals: int) -> int:
         executor.create_task(stopping.set)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
-    node, code = None, 1
+    node = None
+    code = 1
     try:
         node = CalibratorNode()
         executor.add_node(node)

@@ -71,7 +71,8 @@ class Parameters:
         self.given: Options = {name: check_value(FIELDS[name], overrides[name]) for name in ours}
         self.calibrator, self.node = _configs(self.given)
         check(self.node)
-        self._check_node, self._on_change = check, on_change
+        self._check_node = check
+        self._on_change = on_change
         for name, field in FIELDS.items():
             value = self.given.get(name, field.default)
             node.declare_parameter(name, value, _descriptor(field), ignore_override=True)

@@ -27,7 +27,9 @@ from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import Broadcast
 from hand_eye_calib.online.ros.conversions import LATCHED, LISTENING, quick, to_transform
 
-TF, STATIC_TOPIC, DYNAMIC_TOPIC = "tf", "/tf_static", "/tf"
+TF = "tf"
+STATIC_TOPIC = "/tf_static"
+DYNAMIC_TOPIC = "/tf"
 
 # The transform tree is listened to for so long before anything is broadcast (s): discovery takes up
 # to 2.4 s.
@@ -54,13 +56,15 @@ class RobotTree(FrameTree):
     def __init__(self, node: Node, log: NodeLog) -> None:
         super().__init__(STATIC_TOPIC)
         self.own: deque[TransformStamped] = deque(maxlen=100)
-        self._node, self._log = node, log
+        self._node = node
+        self._log = log
         self._subscriptions: dict[str, Subscription] = {}
 
     def listen(self, topic: str = STATIC_TOPIC) -> None:
         """Listen to a topic from now on."""
         if topic not in self._subscriptions:
-            heard, qos = partial(self._hear, topic), LISTENING if topic == STATIC_TOPIC else quick()
+            heard = partial(self._hear, topic)
+            qos = LISTENING if topic == STATIC_TOPIC else quick()
             subscription = self._node.create_subscription(message_type(), topic, heard, qos)
             self._subscriptions[topic] = subscription
 
@@ -112,8 +116,10 @@ class Robot:
     """
 
     def __init__(self, log: NodeLog, options: NodeConfig, frames: FrameTree) -> None:
-        self._log, self._frames = log, frames
-        self._source, self._base_frame = options.installed, options.base_frame
+        self._log = log
+        self._frames = frames
+        self._source = options.installed
+        self._base_frame = options.base_frame
         # What is installed between the two frames that were asked for last.
         self._installed: Extrinsic | None = None
         self._installed_for = ("", "")
@@ -184,15 +190,19 @@ class TfBroadcaster:
     """
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
-        self._node, self._log, self._tree = node, log, tree
-        self._is_on, self._began_s = False, 0.0
+        self._node = node
+        self._log = log
+        self._tree = tree
+        self._is_on = False
+        self._began_s = 0.0
         self._publisher: Any = None
         self.state: tuple[Broadcast, str] = Broadcast.OFF, ""
 
     def switch(self, on: bool) -> None:
         """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
         if on != self._is_on:
-            self._is_on, self._began_s = on, time.monotonic()
+            self._is_on = on
+            self._began_s = time.monotonic()
             if on:
                 self._tree.listen()
                 self._tree.listen(DYNAMIC_TOPIC)
@@ -205,7 +215,8 @@ class TfBroadcaster:
         """
         if self._is_on and self._publisher is None:  # without a message: discovery takes seconds
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
-        was_on, self.state = self.state[0] is Broadcast.ON, self._judged(result, why_not)
+        was_on = self.state[0] is Broadcast.ON
+        self.state = self._judged(result, why_not)
         if result is not None and self.state[0] is Broadcast.ON:
             self._broadcast(result, not was_on)
         elif was_on:  # new listeners get nothing; the others keep it
@@ -237,7 +248,8 @@ class TfBroadcaster:
 
     def _broadcast(self, result: Calibration, is_first: bool) -> None:
         self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
-        own, transform = self._tree.own, to_transform(result, True)
+        own = self._tree.own
+        transform = to_transform(result, True)
         if is_first:
             self._log.info("the result is broadcast on /tf_static from now on")
         elif transform == own[-1]:

@@ -58,7 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.online.ros.watcher import Watcher
     from hand_eye_calib.online.watch.board import Board
 
-    board, requests = Board(arguments.node), queue.SimpleQueue[str]()
+    board = Board(arguments.node)
+    requests = queue.SimpleQueue[str]()
     came: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda signum, _: came.append(signum))
@@ -92,8 +93,11 @@ class Session:
         self, board: "Board", requests: "queue.SimpleQueue[str]", keys: Callable[[], str]
     ) -> None:
         self.is_over = self.shows_code = False
-        self._board, self._requests, self._keys = board, requests, keys
-        self._sure, self._sure_until_s = "", 0.0
+        self._board = board
+        self._requests = requests
+        self._keys = keys
+        self._sure = ""
+        self._sure_until_s = 0.0
 
     def view(self) -> "View":
         """Do what was typed, and make the view."""
@@ -107,7 +111,8 @@ class Session:
             elif request not in self._board.view(now_s).buttons:
                 continue
             elif key in _SURE and (key != self._sure or now_s > self._sure_until_s):
-                self._sure, self._sure_until_s = key, now_s + _SURE_WITHIN_S
+                self._sure = key
+                self._sure_until_s = now_s + _SURE_WITHIN_S
                 self._board.answer(request, False, f"{_SURE[key]}: press {key} again", now_s)
             else:
                 self._requests.put(request)

@@ -73,9 +73,12 @@ class Watcher:
             self._board.acknowledge()
         elif self._board.node and request not in self._asked:
             parameters = self._parameters(request)
-            kind, name, message = Trigger, request, Trigger.Request()
+            kind = Trigger
+            name = request
+            message = Trigger.Request()
             if parameters:
-                kind, name = SetParameters, "set_parameters"
+                kind = SetParameters
+                name = "set_parameters"
                 messages = [parameter.to_parameter_msg() for parameter in parameters]
                 message = SetParameters.Request(parameters=messages)
             client = self._node.create_client(kind, f"{self._board.node}/{name}")

@@ -34,7 +34,8 @@ from hand_eye_calib.online.live.state import (
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 MOVED = "MOUNT MOVED"
-CHANGE_MOTION, PAUSED = "CHANGE THE MOTION", "PAUSED"
+CHANGE_MOTION = "CHANGE THE MOTION"
+PAUSED = "PAUSED"
 _ADVICE = "; check it, then recalibrate or acknowledge"
 
 # The answer to a button is shown for so long (s).
@@ -166,7 +167,8 @@ class Board:
         state, heard_s = self._heard
         view = _view(state, now_s - heard_s)
         if view.word == MOVED and _alarm_of(state) == self._acknowledged:
-            facts, buttons = f"{view.facts}; acknowledged", ("recalibrate", "reset")
+            facts = f"{view.facts}; acknowledged"
+            buttons = ("recalibrate", "reset")
             told = view.sentence.replace(" or acknowledge", "")
             view = replace(view, tone=Tone.ACT, sentence=told, buttons=buttons, facts=facts)
         if view.word in ("CHECK INPUT", "BAD INPUT"):
@@ -224,7 +226,8 @@ def _buttons(state: NodeState, word: str) -> tuple[str, ...]:
 
 def _axes_by_hand(state: NodeState, word: str) -> tuple[str, ...]:
     """Axes that somebody may measure, or whose prior may be corrected or removed."""
-    extrinsic, at = state.extrinsic, state.progress
+    extrinsic = state.extrinsic
+    at = state.progress
     if extrinsic is None or at is None:
         return ()
     axes = [*extrinsic.contradicted]
@@ -252,7 +255,10 @@ def _where(saved: SavedState) -> str:
 
 def _headline(state: NodeState) -> tuple[Tone, str, str]:
     """Sign, word and sentence: what a person should know or do first, the gravest that applies."""
-    extrinsic, mount, at, checks = state.extrinsic, state.mount, state.progress, state.checks
+    extrinsic = state.extrinsic
+    mount = state.mount
+    at = state.progress
+    checks = state.checks
     is_safe = at is not None and at.progress.done and state.saved  # whatever the journal lacks
     inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
     is_contradicted = extrinsic is not None and bool(extrinsic.contradicted)
@@ -363,21 +369,28 @@ def _bar(axis: str, state: NodeState) -> Bar:
     share = min(1.0, (known.target / known.sigma) ** 2) if known.sigma > 0 else 1.0
     has_end = math.isfinite(known.seconds_left)
     left = f"{duration(known.seconds_left)} left" if has_end else "not with this motion"
-    tone, word = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, left
+    tone = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY
+    word = left
     wanted = amount(axis, known.target)
     sigma = amount(axis, known.sigma).removesuffix(f" {wanted.rpartition(' ')[2]}")
     against = f"± {sigma} of {wanted}"
     if state.extrinsic is not None and state.extrinsic.contradicted:
-        tone, word, against = Tone.UNKNOWN, "no usable result", f"wanted: {wanted}"
+        tone = Tone.UNKNOWN
+        word = "no usable result"
+        against = f"wanted: {wanted}"
     elif not math.isfinite(known.sigma):
-        tone, word = Tone.UNKNOWN, "out of reach" if has_end else "not seen yet"
+        tone = Tone.UNKNOWN
+        word = "out of reach" if has_end else "not seen yet"
         against = "" if has_end else f"wanted: {wanted}"
     elif at.progress.is_faulty:
-        tone, word = Tone.UNKNOWN, "of faulty streams"
+        tone = Tone.UNKNOWN
+        word = "of faulty streams"
     elif known.seconds_left == 0:
-        tone, word = Tone.GOOD, "enough"
+        tone = Tone.GOOD
+        word = "enough"
     elif known.sigma <= known.target:
-        tone, word = Tone.BUSY, f"nearly: {left}"
+        tone = Tone.BUSY
+        word = f"nearly: {left}"
     difference = ""
     if at.comparison is not None and at.comparison.differences:
         row = at.comparison.differences[0].axes[axis]
@@ -390,7 +403,8 @@ def _bar(axis: str, state: NodeState) -> Bar:
 def _values(result: ResultState) -> Iterator[tuple[str, str]]:
     """Each axis with its value and standard deviation; a question mark if it is not observed."""
     for axis in AXES:
-        value, sigma = result.pose.get(axis), result.pose_sigma.get(axis)
+        value = result.pose.get(axis)
+        sigma = result.pose_sigma.get(axis)
         if value is None or sigma is None:
             yield axis, "? not observed"
         elif axis in ROTATIONS:
@@ -401,13 +415,17 @@ def _values(result: ResultState) -> Iterator[tuple[str, str]]:
 
 def _watched(axis: str, mount: MountState) -> Line:
     """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
-    shift, sigma = mount.shift.get(axis) or 0.0, mount.shift_sigma.get(axis) or math.inf
+    shift = mount.shift.get(axis) or 0.0
+    sigma = mount.shift_sigma.get(axis) or math.inf
     visible = mount.visible_10min.get(axis)
-    tone, text = Tone.UNKNOWN, "cannot be watched with this motion"
+    tone = Tone.UNKNOWN
+    text = "cannot be watched with this motion"
     if abs(shift) > LARGEST_OF_SIX * sigma:
-        tone, text = Tone.BAD, f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
+        tone = Tone.BAD
+        text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
     elif visible is not None:
-        tone, text = Tone.GOOD, f"not moved (would see {amount(axis, visible)})"
+        tone = Tone.GOOD
+        text = f"not moved (would see {amount(axis, visible)})"
     elif mount.is_learning or not mount.visible_10min:
         text = "not known yet"
     return Line(tone, _NAMES[axis], text)
@@ -428,7 +446,8 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
     for name, part in state.parts():
         if name in ("extrinsic", "progress", "mount"):
             continue
-        tone, text = _TONES[part.level], part.text
+        tone = _TONES[part.level]
+        text = part.text
         if part is state.checks and state.checks.age_s is None:
             tone = Tone.BUSY  # a check that has not been made yet asks for nothing
         if isinstance(part, InputState) and part.topic not in text:
@@ -444,7 +463,8 @@ def _result(state: NodeState) -> Iterator[Line]:
     if state.extrinsic is not None:
         yield from _priors(state.extrinsic)
     if state.progress and (found := state.progress.comparison):
-        text, tone = found.sentence.replace("+/-", "±"), _TONES.get(found.verdict, Tone.UNKNOWN)
+        text = found.sentence.replace("+/-", "±")
+        tone = _TONES.get(found.verdict, Tone.UNKNOWN)
         yield Line(tone, "compared with what is installed", text)
     if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
         text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))

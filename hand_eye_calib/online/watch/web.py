@@ -67,7 +67,8 @@ def _kept_key() -> str:
         file.parent.mkdir(parents=True, exist_ok=True)
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         with open(os.open(file, flags, 0o600), "r+") as kept:
-            about, text = os.fstat(kept.fileno()), kept.read()
+            about = os.fstat(kept.fileno())
+            text = kept.read()
             is_own = about.st_uid == os.getuid() and not about.st_mode & 0o077
             if is_own and re.fullmatch(r"[\w-]{8,}", text, re.ASCII):
                 return text
@@ -99,7 +100,8 @@ class WebServer(ThreadingHTTPServer):
 
     def __init__(self, board: Board, ask: Callable[[str], None], address: tuple[str, int]) -> None:
         self.key = _kept_key()
-        self.board, self.ask = board, ask
+        self.board = board
+        self.ask = ask
         self.stopping = threading.Event()
         self._host, port = address
         try:
@@ -134,7 +136,8 @@ class WebServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: WebServer
     protocol_version = "HTTP/1.1"
-    server_version, sys_version = "hand_eye_calib", ""
+    server_version = "hand_eye_calib"
+    sys_version = ""
     timeout = _PATIENCE_S
 
     def do_GET(self) -> None:
@@ -160,10 +163,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         self.close_connection = True  # a body, if there is one, is not read
-        request, axis = self._path(), self._given("axis")
-        status, text = HTTPStatus.OK, ""
+        request = self._path()
+        axis = self._given("axis")
+        status = HTTPStatus.OK
+        text = ""
         if not self._has_key():
-            status, text = HTTPStatus.FORBIDDEN, "the key is missing"
+            status = HTTPStatus.FORBIDDEN
+            text = "the key is missing"
         elif request == "forget" and axis in AXIS_UNITS:
             self.server.ask(f"prior.{axis}:=")
         elif request in BUTTONS:
@@ -172,7 +178,8 @@ class _Handler(BaseHTTPRequestHandler):
             prior = prior_as_typed(axis, self._given("value"), self._given("sigma"))
             self.server.ask(printable(f"prior.{axis}:={prior}"))
         else:
-            status, text = HTTPStatus.NOT_FOUND, "there is no such request"
+            status = HTTPStatus.NOT_FOUND
+            text = "there is no such request"
         self._send(status, text)
 
     def log_message(self, format: str, *args: Any) -> None:
@@ -213,7 +220,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _events(self) -> Iterator[bytes]:
         """The view whenever it has changed; an empty event every second in between."""
-        sent, sent_s, board = "", 0.0, self.server.board
+        sent = ""
+        sent_s = 0.0
+        board = self.server.board
         while not self.server.stopping.wait(_LOOK_S if sent else 0.0):
             now_s = time.monotonic()
             view = board.view(now_s)
@@ -221,7 +230,8 @@ class _Handler(BaseHTTPRequestHandler):
             made = " ".join(fragment(view, there if view.saved_in else ()).splitlines())
             if made != sent or now_s - sent_s >= REPORT_PERIOD_S:
                 yield f"data: {made if made != sent else ''}\n\n".encode()
-                sent, sent_s = made, now_s
+                sent = made
+                sent_s = now_s
 
 
 def fragment(view: View, files: Sequence[str] = ()) -> str:
