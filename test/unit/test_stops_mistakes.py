@@ -201,6 +201,27 @@ def test_what_contradicts_is_refused_with_its_cause(name, place):
     assert "limit of the recording" not in result.headline
 
 
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("name", ["reversed", "robot that never moved", "shifted by one"])
+def test_a_refused_arm_has_its_cause_alone_and_exit_code_3(name, place, tmp_path, capsys):
+    of_robot, of_target, code = REFUSED[name]
+    robot, tracking, _ = arm(place, seed=9, n=40)
+    samples = tmp_path / "samples.npz"
+    np.savez(samples, robot=of_robot(robot), tracking=of_target(tracking))
+
+    exit_code = main(["calibrate", str(samples), "--json"])
+
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    decisive = [
+        reason["rule"] for reason in document["reasons"] if reason["verdict"] == "DO_NOT_USE"
+    ]
+    assert decisive == ["error_finding"]
+    assert document["findings"][0]["code"] == code
+    assert exit_code == 3
+    assert err == ""
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_positions_do_not_overrule_rotations_on_which_way_round_it_is(seed):
     """Few stops with small rotations seem to fit the other way round, but for large errors."""

@@ -97,6 +97,12 @@ def test_each_rule_alone_decides(rule):
     assert result.headline.startswith(f"{rule.verdict.value}: ")
 
 
+def test_a_finding_explains_why_the_solver_did_not_converge():
+    result = good(status=SolveStatus.NOT_CONVERGED, findings=(FINDING,))
+    assert [reason.rule for reason in result.reasons] == ["error_finding"]
+    assert not result.has_failed
+
+
 @pytest.mark.parametrize(
     ("rule", "sentence"),
     [

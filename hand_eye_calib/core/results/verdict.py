@@ -149,6 +149,11 @@ class Judged(Result):
         return self.reasons[0].verdict if self.reasons else Verdict.USE
 
     @property
+    def has_failed(self) -> bool:
+        """Whether the solve failed, and no finding about the poses explains that."""
+        return bool(self.reasons) and self.reasons[0].rule in ("prior", "not_converged")
+
+    @property
     def headline(self) -> str:
         """The verdict with its gravest reason, or with what is known, in one line."""
         decided = self.verdict.value
@@ -211,12 +216,13 @@ def target_of(axis: str, result: Result) -> float:
 # ---------------------------------------------------------------- the rules
 
 
+def _has_error(result: Result) -> bool:
+    return any(finding.makes_unusable for finding in result.findings)
+
+
 def _not_converged(result: Result) -> Iterator[_Found]:
-    # Stops that contradict each other have no solution: the finding says why.
-    is_explained = result.reference == "stops" and any(
-        finding.makes_unusable for finding in result.findings
-    )
-    if result.status is SolveStatus.NOT_CONVERGED and not is_explained:
+    # Poses that contradict each other have no solution; an error finding names the cause.
+    if result.status is SolveStatus.NOT_CONVERGED and not _has_error(result):
         yield "the solver did not converge", "record more varied motion", (), {}
 
 
@@ -231,6 +237,9 @@ def _contradicted(result: Result) -> Iterator[_Found]:
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
+    if result.reference == "stops" and _has_error(result):
+        # Stops that contradict each other determine nothing; an error finding names the cause.
+        return
     if all(axis.is_hidden for axis in _axes(result)):
         text = "nothing about the mounting can be determined from this motion"
         yield text, "record motion with rotations about all axes", (), {}
@@ -447,7 +456,12 @@ _OWN_RULES = (
         partial(_findings_of, Severity.ERROR),
     ),
     # Behind the faults of the streams, which are often its cause.
-    Rule("not_converged", _NEVER, "the solver did not converge", _not_converged),
+    Rule(
+        "not_converged",
+        _NEVER,
+        "the solver did not converge, and no stream check found an error",
+        _not_converged,
+    ),
     Rule("nothing_known", _NEVER, "all six axes are unobservable; of stops, any", _nothing_known),
     Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
     Rule(

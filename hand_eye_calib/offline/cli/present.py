@@ -74,7 +74,7 @@ def deliver(
             from hand_eye_calib.offline.cli.reporting import write_report
 
             write_report(arguments.out, calibration, snapshot, inputs)
-    for one in calibration.reasons[:1] if calibration.status.failure else ():
+    for one in calibration.reasons[:1] if calibration.has_failed else ():
         fail(f"{one.sentence}; do not use this result, {one.what_to_do}")
     return exit_code(calibration)
 
@@ -108,7 +108,7 @@ def _with_robot(
 
 def exit_code(calibration: Calibration) -> int:
     """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
-    if calibration.status.failure:
+    if calibration.has_failed:
         return Exit.FAILED
     is_whole = not calibration.hidden and calibration.verdict is not Verdict.DO_NOT_USE
     return Exit.GOOD if is_whole else Exit.NOT_ALL
