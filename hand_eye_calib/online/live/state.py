@@ -204,6 +204,16 @@ class NodeState:
     saved: SavedState | None = None
     has_ended: bool = False
 
+    @property
+    def result(self) -> ResultState | None:
+        """The session's result; None without one."""
+        return self.extrinsic.result if self.extrinsic else None
+
+    @property
+    def standing(self) -> Standing:
+        """Validity of the session's result."""
+        return self.extrinsic.standing if self.extrinsic else Standing.NONE
+
     def parts(self) -> Iterator[tuple[str, Part]]:
         """The parts that there are, by the names that ``/diagnostics`` has for them."""
         before = {"extrinsic": self.extrinsic, "progress": self.progress, "mount": self.mount}

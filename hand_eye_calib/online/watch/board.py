@@ -1,6 +1,7 @@
-"""The state of the node, put into the words and bars that a person is shown.
+"""The state of a node in words, signs and bars, for a person.
 
-Nothing here knows ROS, a terminal or a browser: states go in, a :class:`View` comes out.
+A :class:`Board` receives states and makes a :class:`View`. Nothing here depends on ROS, a terminal
+or a browser.
 """
 
 import json
@@ -9,14 +10,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import from_plain
 from hand_eye_calib.core.base.stats import LARGEST_OF_SIX
 from hand_eye_calib.core.base.text import amount, capital, change, duration, fixed, two_digits
-from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
+from hand_eye_calib.online.live.progress import AxisProgress
 from hand_eye_calib.online.live.state import (
     REPORT_PERIOD_S,
     Broadcast,
@@ -25,37 +26,69 @@ from hand_eye_calib.online.live.state import (
     Level,
     MountState,
     NodeState,
+    Part,
+    ProgressState,
     ResultState,
     SavedState,
     Standing,
 )
 
-# A node that has said nothing for so long (s) is silent.
+# Age (s) of the newest state at which a node counts as silent: three reports are missing.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
-MOVED = "MOUNT MOVED"
-CHANGE_MOTION = "CHANGE THE MOTION"
-PAUSED = "PAUSED"
-_ADVICE = "; check it, then recalibrate or acknowledge"
-
-# The answer to a button is shown for so long (s).
+# Time (s) for which the answer to a button is displayed.
 ANSWER_FOR_S = 20.0
 
-# Names of the axes, and what they mean on a vehicle (REP 103).
-_AXES = [f"{how} {axis}" for how in ("along", "about") for axis in "xyz"]
-_NAMES = dict(zip(AXES, _AXES, strict=True))
-_WORDS = ("forward", "left", "up", "tilt to a side", "nose up or down", "turn")
-_ON_A_VEHICLE = dict(zip(AXES, _WORDS, strict=True))
+# Words of headlines that decide about buttons.
+MOVED = "MOUNT MOVED"
+CHANGE_MOTION = "CHANGE THE MOTION"
+DONE = "DONE"
+
+# Names of the axes.
+_NAMES = {
+    "x": "along x",
+    "y": "along y",
+    "z": "along z",
+    "roll": "about x",
+    "pitch": "about y",
+    "yaw": "about z",
+}
+# Meaning of the axes on a vehicle (REP 103).
+_ON_A_VEHICLE = {
+    "x": "forward",
+    "y": "left",
+    "z": "up",
+    "roll": "tilt to a side",
+    "pitch": "nose up or down",
+    "yaw": "turn",
+}
 
 
 class Tone(Enum):
-    """How good something is: never told by a colour alone, always with this sign."""
+    """Severity, with its sign: a colour alone is not readable by everybody."""
 
     GOOD = "✓"
     BUSY = "▶"
     ACT = "!"
     BAD = "✗"
     UNKNOWN = "?"
+
+
+# Tones of levels, verdicts, comparisons and broadcasts.
+_TONES: dict[object, Tone] = {
+    **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
+    **dict.fromkeys((Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT),
+    **dict.fromkeys((Level.ERROR, "DO NOT USE"), Tone.BAD),
+    Broadcast.WAITING: Tone.BUSY,
+}
+
+
+class Headline(NamedTuple):
+    """The most important fact about a node: sign, a word or two in capitals, and a sentence."""
+
+    tone: Tone
+    word: str
+    sentence: str
 
 
 @dataclass(frozen=True)
@@ -67,13 +100,31 @@ class Line:
     text: str
 
 
+Lines: TypeAlias = tuple[Line, ...]
+Texts: TypeAlias = tuple[str, ...]
+# Pairs of an axis and a text.
+AxisTexts: TypeAlias = tuple[tuple[str, str], ...]
+
+
 @dataclass(frozen=True)
 class Bar:
-    """One axis of the parent sensor's frame, such as "about z", against its target.
+    """Progress of one axis of the parent sensor's frame towards its target.
 
-    ``meaning`` is such as "turn", if the axes are those of a vehicle; ``share``, 0 to 1, of the
-    information that the target needs; ``word`` such as "30 s left"; ``against`` such as "± 0.065
-    deg of 0.3 deg"; ``difference`` from what is installed, empty if not known.
+    Attributes
+    ----------
+    name : str
+        The axis, such as "about z".
+    meaning : str
+        The axis on a vehicle, such as "turn"; empty if the motion is not that of a vehicle.
+    share : float
+        Share of the information that the target needs, 0 to 1.
+    tone : Tone
+    word : str
+        Progress in words, such as "30 s left".
+    against : str
+        Standard deviation and target, such as "± 0.065 deg of 0.3 deg".
+    difference : str
+        Difference from the installed transform; empty if unknown.
     """
 
     name: str
@@ -87,13 +138,40 @@ class Bar:
 
 @dataclass(frozen=True)
 class View:
-    """Everything a person is shown of one node.
+    """Everything that is displayed of one node.
 
-    ``values`` is the pose as it is printed, by axis. ``buttons`` are the requests that make sense
-    now, that to be pressed first; ``by_hand`` are the axes that somebody may measure or correct,
-    that to be looked at first; ``priors`` are those that somebody has measured, as they were typed;
-    ``saved_in`` is the directory of the files. A node that only watches the mount has a line for
-    each axis (``watched``), and no bars, verdict and comparison.
+    Attributes
+    ----------
+    node : str
+        Fully qualified name of the node.
+    tone, word, sentence
+        The headline.
+    facts : str
+        Amount of motion, and age of the result.
+    title : str
+        Name of the pose in ``values``.
+    values : tuple of (str, str)
+        Axes and values of the pose as printed.
+    bars : tuple of Bar
+        Progress of each axis; empty if the node monitors the mount.
+    watched : tuple of Line
+        Axes of a monitored mount; empty if the node calibrates.
+    result, reasons
+        Verdict, priors, comparison and files of the result; reasons of the verdict.
+    health : tuple of Line
+        Inputs, stream checks and journal.
+    topics : tuple of str
+        Topics with poses, if an input lacks poses.
+    buttons : tuple of str
+        Requests that are possible now, the recommended request first.
+    by_hand : tuple of str
+        Axes whose value may be measured by hand or corrected, the most important first.
+    priors : tuple of (str, str)
+        Axes and priors as typed by the user.
+    saved_in : str
+        Directory of the saved files; empty if nothing is saved.
+    answer : tuple of Line
+        Answer to the last button, for some seconds.
     """
 
     node: str
@@ -102,75 +180,86 @@ class View:
     sentence: str
     facts: str = ""
     title: str = ""
-    values: tuple[tuple[str, str], ...] = ()
+    values: AxisTexts = ()
     bars: tuple[Bar, ...] = ()
-    watched: tuple[Line, ...] = ()
-    result: tuple[Line, ...] = ()
-    reasons: tuple[str, ...] = ()
-    health: tuple[Line, ...] = ()
-    topics: tuple[str, ...] = ()
-    buttons: tuple[str, ...] = ()
-    by_hand: tuple[str, ...] = ()
-    priors: tuple[tuple[str, str], ...] = ()
+    watched: Lines = ()
+    result: Lines = ()
+    reasons: Texts = ()
+    health: Lines = ()
+    topics: Texts = ()
+    buttons: Texts = ()
+    by_hand: Texts = ()
+    priors: AxisTexts = ()
     saved_in: str = ""
-    answer: tuple[Line, ...] = ()
+    answer: Lines = ()
 
 
 class Board:
-    """Holds the newest state of one node, and makes views of it; may be used from several threads.
-    The node is known by its fully qualified name; without one, it is the first that is heard, and
-    another one when that is silent. ``topics`` are lines about the topics with poses that exist.
+    """The newest state of one node, from which views are made. Several threads may use it.
+
+    Parameters
+    ----------
+    wanted : str
+        Fully qualified name of the node. If empty, the first node that sends a state is displayed;
+        another node replaces it when it is silent.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        One line for every topic with poses.
     """
 
     def __init__(self, wanted: str = "") -> None:
-        self.topics: tuple[str, ...] = ()
+        self.topics: Texts = ()
         self._wanted = wanted
-        # One assignment each, so that no other thread sees half of it: what, and when.
-        self._heard: tuple[NodeState, float] | None = None
+        # Each with its time (s). A pair is assigned at once, so that no thread reads half of it.
+        self._newest: tuple[NodeState, float] | None = None
         self._answer: tuple[Line, float] | None = None
         self._acknowledged: tuple[str, int | None] | None = None
 
     @property
-    def priors(self) -> tuple[str, ...]:
-        """Axes whose prior is set on the node that is shown."""
-        if self._heard is None or self._heard[0].extrinsic is None:
+    def priors(self) -> Texts:
+        """Axes whose prior is set on the displayed node."""
+        if self._newest is None:
             return ()
-        priors = self._heard[0].extrinsic.priors
-        return tuple(axis for axis in AXES if axis in priors)
+        return tuple(axis for axis, _ in _priors_of(self._newest[0]))
 
     @property
     def node(self) -> str:
-        """Fully qualified name of the node that is shown; empty if none was heard."""
-        return self._heard[0].node if self._heard else ""
+        """Fully qualified name of the displayed node; empty before its first state."""
+        return self._newest[0].node if self._newest else ""
 
     def take(self, state: NodeState, now_s: float) -> None:
-        """Take the state of a node."""
-        is_silent = not self._heard or now_s - self._heard[1] > SILENT_AFTER_S
+        """Store a state of a node; ignored if another node is displayed."""
+        is_silent = not self._newest or now_s - self._newest[1] > SILENT_AFTER_S
         if state.node == (self._wanted or self.node) or (is_silent and not self._wanted):
-            self._heard = state, now_s
+            self._newest = state, now_s
 
     def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
-        """Take the answer to a button; ``good`` is None while it is awaited."""
-        tone = Tone.BUSY if good is None else Tone.GOOD if good else Tone.ACT
-        self._answer = Line(tone, request, text), now_s
+        """Store the answer to a button; ``good`` is None while the answer is awaited."""
+        tones = {None: Tone.BUSY, True: Tone.GOOD, False: Tone.ACT}
+        self._answer = Line(tones[good], request, text), now_s
 
     def acknowledge(self) -> None:
-        """Somebody knows that the mount has moved: it is said without alarm, until the next one."""
-        self._acknowledged = _alarm_of(self._heard[0]) if self._heard else None
+        """Display the present alarm of the mount without alarm, until the next alarm."""
+        self._acknowledged = _alarm_of(self._newest[0]) if self._newest else None
 
     def view(self, now_s: float) -> View:
-        """What to show; ``now_s`` is on the same clock as that of :meth:`take`."""
-        if self._heard is None:
-            who = f"of {self._wanted}" if self._wanted else "of a calibrator"
-            text = f"Nothing heard {who} yet. Is the node running, on the same ROS domain and "
+        """Return the view; ``now_s`` (s) is on the clock of :meth:`take`."""
+        if self._newest is None:
+            name = self._wanted or "a calibrator"
+            text = f"Nothing heard of {name} yet. Is the node running, on the same ROS domain and "
             return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
-        state, heard_s = self._heard
-        view = _view(state, now_s - heard_s)
+        state, received_s = self._newest
+        view = _view(state, now_s - received_s)
         if view.word == MOVED and _alarm_of(state) == self._acknowledged:
-            facts = f"{view.facts}; acknowledged"
-            buttons = ("recalibrate", "reset")
-            told = view.sentence.replace(" or acknowledge", "")
-            view = replace(view, tone=Tone.ACT, sentence=told, buttons=buttons, facts=facts)
+            view = replace(
+                view,
+                tone=Tone.ACT,
+                sentence=view.sentence.replace(" or acknowledge", ""),
+                facts=f"{view.facts}; acknowledged",
+                buttons=("recalibrate", "reset"),
+            )
         if view.word in ("CHECK INPUT", "BAD INPUT"):
             view = replace(view, topics=self.topics)
         if self._answer and now_s - self._answer[1] < ANSWER_FOR_S:
@@ -182,226 +271,261 @@ def _alarm_of(state: NodeState) -> tuple[str, int | None]:
     return state.node, state.mount.since_ns if state.mount else None
 
 
+def _priors_of(state: NodeState) -> AxisTexts:
+    """Return axes and priors that are set, as typed by the user."""
+    if state.extrinsic is None:
+        return ()
+    return tuple(item for item in state.extrinsic.priors.items() if item[0] in AXES)
+
+
 def _view(state: NodeState, silent_s: float) -> View:
-    head = _headline(state)
-    is_old = state.has_ended or silent_s > SILENT_AFTER_S
+    is_silent = silent_s > SILENT_AFTER_S
+    is_old = state.has_ended or is_silent
     if state.has_ended:
-        head = _of_end(state)
-    elif is_old:
-        text = f"No word from the node for {silent_s:.0f} s. If it has died, start it again"
-        text += ", with journal:=resume." if state.journal and state.journal.directory else "."
-        head = Tone.BAD, "SILENT", text
-    saved_in = state.saved.directory if state.saved else ""
-    health = () if state.has_ended else tuple(_health(state, is_old))
-    view = View(state.node, *head, health=health, saved_in=saved_in)
+        headline = _end(state)
+    elif is_silent:
+        headline = _silence(state, silent_s)
+    else:
+        headline = _alarm(state) or _activity(state)
+    view = View(
+        state.node,
+        *headline,
+        health=() if state.has_ended else tuple(_health(state, is_old)),
+        saved_in=state.saved.directory if state.saved else "",
+    )
     if state.mount is not None:
-        asked = ("recalibrate", "acknowledge", "reset") if view.word == MOVED else ()
-        watched = tuple(_watched(axis, state.mount) for axis in AXES)
-        facts = _ago(state.mount) + "; a reset ends the alarm" * bool(asked)
-        return replace(view, facts=facts, watched=watched, buttons=asked)
-    if result := _result_of(state):
+        return _with_mount(view, state.mount)
+    view = replace(view, facts=_facts(state, is_old), result=tuple(_result(state)))
+    if result := state.result:
         view = replace(view, reasons=result.reasons)
-        if _standing(state) is not Standing.REFUTED:
+        if state.standing is not Standing.REFUTED:
             title = f"pose of {result.child_frame} in {result.parent_frame}"
             view = replace(view, title=title, values=tuple(_values(result)))
-    if state.progress:
-        bars = tuple(_bar(axis, state) for axis in AXES)
+    if at := state.progress:
+        bars = tuple(_bar(axis, at, state.extrinsic) for axis in AXES)
         view = replace(view, bars=bars, by_hand=_axes_by_hand(state, view.word))
-    if state.extrinsic and not is_old:
-        priors = state.extrinsic.priors
-        view = replace(view, priors=tuple(item for item in priors.items() if item[0] in AXES))
-    shown = () if is_old else _buttons(state, view.word)
-    return replace(view, facts=_facts(state, is_old), result=tuple(_result(state)), buttons=shown)
+    if is_old:
+        return view
+    return replace(view, priors=_priors_of(state), buttons=_buttons(state, view.word))
 
 
-def _buttons(state: NodeState, word: str) -> tuple[str, ...]:
-    """The requests that make sense for a node that calibrates, that to be pressed first."""
-    buttons: tuple[str, ...] = ("reset",)
-    if _result_of(state):
-        is_wanted = word == "DONE" and not state.saved
-        buttons = ("save", "solve", "reset") if is_wanted else ("solve", "save", "reset")
-    has_priors = state.extrinsic is not None and bool(state.extrinsic.priors)
-    return (*buttons, "forget") if has_priors else buttons
+def _with_mount(view: View, mount: MountState) -> View:
+    """Return the view of a node that monitors the mount."""
+    facts = f"{duration(mount.seconds_of_motion)} of motion seen"
+    if mount.since_ns and mount.newest_ns:
+        facts = f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
+    view = replace(view, facts=facts, watched=tuple(_watched(axis, mount) for axis in AXES))
+    if view.word != MOVED:
+        return view
+    buttons = ("recalibrate", "acknowledge", "reset")
+    return replace(view, facts=f"{facts}; a reset ends the alarm", buttons=buttons)
 
 
-def _axes_by_hand(state: NodeState, word: str) -> tuple[str, ...]:
-    """Axes that somebody may measure, or whose prior may be corrected or removed."""
+def _buttons(state: NodeState, word: str) -> Texts:
+    """Return the requests that are possible, the recommended request first."""
+    buttons: Texts = ("reset",)
+    if state.result:
+        buttons = ("solve", "save", "reset")
+        if word == DONE and not state.saved:
+            buttons = ("save", "solve", "reset")
+    if state.extrinsic and state.extrinsic.priors:
+        buttons += ("forget",)
+    return buttons
+
+
+def _axes_by_hand(state: NodeState, word: str) -> Texts:
+    """Return axes that a person may measure, or whose prior may be corrected or removed."""
     extrinsic = state.extrinsic
-    at = state.progress
-    if extrinsic is None or at is None:
+    if extrinsic is None or state.progress is None:
         return ()
     axes = [*extrinsic.contradicted]
-    if at.progress.will_not_get_there and word == CHANGE_MOTION:
-        axes.append(at.progress.limiting_axis)
+    progress = state.progress.progress
+    if progress.will_not_get_there and word == CHANGE_MOTION:
+        axes.append(progress.limiting_axis)
     axes += extrinsic.priors
     return tuple(axis for axis in dict.fromkeys(axes) if axis in AXES)
 
 
-def _standing(state: NodeState) -> Standing:
-    return state.extrinsic.standing if state.extrinsic else Standing.NONE
-
-
-def _result_of(state: NodeState) -> ResultState | None:
-    return state.extrinsic.result if state.extrinsic else None
-
-
-def _where(saved: SavedState) -> str:
-    """When, by the clock on the wall, and where the result was saved."""
+def _saved_at(saved: SavedState) -> str:
+    """Return time of day and directory of a saved result."""
     return f"at {datetime.fromtimestamp(saved.at_s):%H:%M} in {saved.directory}"
 
 
 # -------------------------------------------------------------------- headline
 
 
-def _headline(state: NodeState) -> tuple[Tone, str, str]:
-    """Sign, word and sentence: what a person should know or do first, the gravest that applies."""
+def _alarm(state: NodeState) -> Headline | None:
+    """Return the gravest condition that requires a person; None if there is none."""
+    for tone, word, level, part in _conditions(state):
+        if part is not None and part.level is level:
+            advice = "; check it, then recalibrate or acknowledge" if word == MOVED else ""
+            return Headline(tone, word, _sentence(part.text + advice))
+    return None
+
+
+def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | None]]:
+    """Yield conditions with the level at which the part of the node meets them, gravest first."""
     extrinsic = state.extrinsic
-    mount = state.mount
-    at = state.progress
     checks = state.checks
-    is_safe = at is not None and at.progress.done and state.saved  # whatever the journal lacks
+    at = state.progress
     inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
-    is_contradicted = extrinsic is not None and bool(extrinsic.contradicted)
-    is_outdated = _standing(state) is Standing.OUTDATED
-    told = [
-        (Tone.BAD, "BROKEN", extrinsic, Level.ERROR),
-        (Tone.BAD, MOVED, mount, Level.ERROR),
-        (Tone.BAD, "CHECK THE PRIOR", extrinsic if is_contradicted else None, Level.WARN),
-        *((Tone.BAD, "BAD INPUT", each, Level.ERROR) for each in inputs),
-        (Tone.BAD, "BROKEN", None if is_safe else state.journal, Level.ERROR),
-        *((Tone.ACT, _word_of(each, at is not None), each, Level.WARN) for each in inputs),
-        (Tone.ACT, "CHECK THE STREAMS", checks, Level.WARN),
-        (Tone.ACT, "OLD RESULT", extrinsic if is_outdated else None, Level.WARN),
-        (Tone.ACT, "NOT WATCHING", mount, Level.WARN),
-    ]
-    for tone, word, part, level in told:
-        is_open = part is checks and checks is not None and checks.age_s is None
-        if part is not None and part.level is level and not is_open:
-            return tone, word, _sentence(part.text + _ADVICE * (word == MOVED))
-    if mount is not None:
-        tone, word = (Tone.BUSY, "LEARNING") if mount.is_learning else (Tone.GOOD, "WATCHING")
-        return tone, word, _sentence(mount.text)
-    if at is None:
-        return Tone.UNKNOWN, "LISTENING", "The node is there, and says nothing of a result yet."
-    sentence = _sentence(at.text.removeprefix("Done: "))
-    if at.progress.is_faulty:  # the result was good, the streams no longer are
-        return Tone.ACT, "CHECK THE STREAMS", sentence
-    if at.progress.done:
-        moved = _moved(at.comparison)
-        return Tone.ACT if moved else Tone.GOOD, "DONE", _of_done(state, moved, sentence)
-    if at.is_paused:
-        return Tone.ACT if at.level >= Level.WARN else Tone.BUSY, PAUSED, sentence
-    if _result_of(state) is None:
-        return Tone.BUSY, "START", sentence
-    if at.level >= Level.WARN:
-        return Tone.ACT, CHANGE_MOTION, sentence
-    return Tone.BUSY, "GO ON", sentence
+    yield Tone.BAD, "BROKEN", Level.ERROR, extrinsic
+    yield Tone.BAD, MOVED, Level.ERROR, state.mount
+    if extrinsic and extrinsic.contradicted:
+        yield Tone.BAD, "CHECK THE PRIOR", Level.WARN, extrinsic
+    for stream in inputs:
+        yield Tone.BAD, "BAD INPUT", Level.ERROR, stream
+    # A crash loses nothing once the final result is saved.
+    if not (at and at.progress.done and state.saved):
+        yield Tone.BAD, "BROKEN", Level.ERROR, state.journal
+    for stream in inputs:
+        yield Tone.ACT, "PAUSED" if at and stream.is_paused else "CHECK INPUT", Level.WARN, stream
+    if checks and checks.age_s is not None:
+        yield Tone.ACT, "CHECK THE STREAMS", Level.WARN, checks
+    if state.standing is Standing.OUTDATED:
+        yield Tone.ACT, "OLD RESULT", Level.WARN, extrinsic
+    yield Tone.ACT, "NOT WATCHING", Level.WARN, state.mount
 
 
-def _word_of(part: InputState, calibrates: bool) -> str:
-    """The word for an input that a person should look at."""
-    return PAUSED if calibrates and part.is_paused else "CHECK INPUT"
-
-
-def _of_done(state: NodeState, moved: str, sentence: str) -> str:
-    """What has changed against what is installed, or how good it is; save, or where it is saved."""
-    if moved and (result := _result_of(state)):
-        sentence = f"{result.child_frame} HAS MOVED: {moved}. Save."
-    if state.saved is None:
-        return sentence
-    told = sentence.removesuffix(" Save.").removesuffix(" Stop and save.")
-    return f"{told} Saved {_where(state.saved)}."
-
-
-def _moved(comparison: Comparison | None) -> str:
-    """What has moved against what is installed, and by how much."""
-    if comparison is None or comparison.verdict != "moved":
-        return ""
-    return comparison.sentence.removeprefix("moved: ").replace("+/-", "±")
-
-
-def _of_end(state: NodeState) -> tuple[Tone, str, str]:
-    """The last word of a node that was told to end."""
+def _activity(state: NodeState) -> Headline:
+    """Return the headline of a node without an alarm."""
     if state.mount is not None:
-        return Tone.ACT, "ENDED", "The node has ended: nobody watches the mount."
-    if state.saved is not None:
-        text = f"The node has ended. The result was saved {_where(state.saved)}."
-        if state.saved.verdict == "DO NOT USE":
-            return Tone.ACT, "ENDED", f"{text} {_sentence(state.saved.text)}"
-        return Tone.GOOD, "ENDED", text
-    lost = "The result is not saved: the log says why."
-    text = lost if _result_of(state) else "There was no result yet."
-    return Tone.ACT, "ENDED", f"The node has ended. {text}"
+        sentence = _sentence(state.mount.text)
+        if state.mount.is_learning:
+            return Headline(Tone.BUSY, "LEARNING", sentence)
+        return Headline(Tone.GOOD, "WATCHING", sentence)
+    at = state.progress
+    if at is None:
+        text = "The node is there, and says nothing of a result yet."
+        return Headline(Tone.UNKNOWN, "LISTENING", text)
+    sentence = _sentence(at.text.removeprefix("Done: "))
+    # The streams are faulty, although an earlier result was good.
+    if at.progress.is_faulty:
+        return Headline(Tone.ACT, "CHECK THE STREAMS", sentence)
+    if at.progress.done:
+        return _done(state, at, sentence)
+    tone = Tone.BUSY if at.level is Level.OK else Tone.ACT
+    if at.is_paused:
+        return Headline(tone, "PAUSED", sentence)
+    if state.result is None:
+        return Headline(Tone.BUSY, "START", sentence)
+    return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence)
+
+
+def _done(state: NodeState, at: ProgressState, sentence: str) -> Headline:
+    """Return the headline of a session that has reached its goal.
+
+    The sentence describes what has moved compared with the installed transform, or the precision.
+    It ends with the next step, or with the directory of the saved result.
+    """
+    tone = Tone.GOOD
+    if at.comparison and at.comparison.verdict == "moved":
+        tone = Tone.ACT
+        if state.result:
+            moved = _typeset(at.comparison.sentence.removeprefix("moved: "))
+            sentence = f"{state.result.child_frame} HAS MOVED: {moved}. Save."
+    if state.saved:
+        sentence = sentence.removesuffix(" Save.").removesuffix(" Stop and save.")
+        sentence = f"{sentence} Saved {_saved_at(state.saved)}."
+    return Headline(tone, DONE, sentence)
+
+
+def _silence(state: NodeState, silent_s: float) -> Headline:
+    """Return the headline of a node that sends no states any more."""
+    text = f"No word from the node for {silent_s:.0f} s. If it has died, start it again"
+    if state.journal and state.journal.directory:
+        text += ", with journal:=resume"
+    return Headline(Tone.BAD, "SILENT", f"{text}.")
+
+
+def _end(state: NodeState) -> Headline:
+    """Return the headline of a node that has ended."""
+    tone = Tone.ACT
+    saved = state.saved
+    text = "The node has ended"
+    if state.mount is not None:
+        text += ": nobody watches the mount."
+    elif saved is not None:
+        text += f". The result was saved {_saved_at(saved)}."
+        if saved.verdict == "DO NOT USE":
+            text += f" {_sentence(saved.text)}"
+        else:
+            tone = Tone.GOOD
+    elif state.result:
+        text += ". The result is not saved: the log says why."
+    else:
+        text += ". There was no result yet."
+    return Headline(tone, "ENDED", text)
+
+
+def _typeset(text: str) -> str:
+    return text.replace("+/-", "±")
 
 
 def _sentence(text: str) -> str:
-    """A sentence: the text with a capital and a full stop."""
-    text = capital(text.replace("+/-", "±"))
+    """Return the text with a capital letter and a full stop."""
+    text = capital(_typeset(text))
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _facts(state: NodeState, is_old: bool) -> str:
-    """How far and how long the sensors have moved, and how old the result is, if that is known."""
-    seen = state.extrinsic
-    if seen is None or not seen.n_poses:
+    """Return path, duration of motion and age of the result, as far as known."""
+    extrinsic = state.extrinsic
+    if extrinsic is None or not extrinsic.n_poses:
         return ""
-    told = [f"{seen.path_m:,.0f} m", f"{duration(seen.motion_s)} of motion"]
-    if seen.result and not is_old and seen.standing is not Standing.REFUTED:
-        told.append(f"result {duration(seen.result.age_s)} old")
-    if seen.standing is Standing.OUTDATED:
-        told.append("newer solves fail")
-    return ", ".join(told)
-
-
-def _ago(mount: MountState) -> str:
-    if not mount.since_ns or not mount.newest_ns:
-        return f"{duration(mount.seconds_of_motion)} of motion seen"
-    return f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
+    facts = f"{extrinsic.path_m:,.0f} m, {duration(extrinsic.motion_s)} of motion"
+    if extrinsic.result and not is_old and extrinsic.standing is not Standing.REFUTED:
+        facts += f", result {duration(extrinsic.result.age_s)} old"
+    if extrinsic.standing is Standing.OUTDATED:
+        facts += ", newer solves fail"
+    return facts
 
 
 # ------------------------------------------------------------------------ axes
 
 
-def _bar(axis: str, state: NodeState) -> Bar:
-    at = state.progress
-    assert at is not None
-    known = at.progress.axes[axis]
-    share = min(1.0, (known.target / known.sigma) ** 2) if known.sigma > 0 else 1.0
-    has_end = math.isfinite(known.seconds_left)
-    left = f"{duration(known.seconds_left)} left" if has_end else "not with this motion"
-    tone = Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY
-    word = left
-    wanted = amount(axis, known.target)
-    sigma = amount(axis, known.sigma).removesuffix(f" {wanted.rpartition(' ')[2]}")
-    against = f"± {sigma} of {wanted}"
-    if state.extrinsic is not None and state.extrinsic.contradicted:
+def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
+    row = at.progress.axes[axis]
+    share = min(1.0, (row.target / row.sigma) ** 2) if row.sigma > 0 else 1.0
+    target = amount(axis, row.target)
+    if extrinsic and extrinsic.contradicted:
         tone = Tone.UNKNOWN
         word = "no usable result"
-        against = f"wanted: {wanted}"
-    elif not math.isfinite(known.sigma):
+        against = f"wanted: {target}"
+    elif math.isfinite(row.sigma):
+        tone, word = _progress_in_words(row, at, axis)
+        unit = target.rpartition(" ")[2]
+        against = f"± {amount(axis, row.sigma).removesuffix(f' {unit}')} of {target}"
+    else:
         tone = Tone.UNKNOWN
-        word = "out of reach" if has_end else "not seen yet"
-        against = "" if has_end else f"wanted: {wanted}"
-    elif at.progress.is_faulty:
-        tone = Tone.UNKNOWN
-        word = "of faulty streams"
-    elif known.seconds_left == 0:
-        tone = Tone.GOOD
-        word = "enough"
-    elif known.sigma <= known.target:
-        tone = Tone.BUSY
-        word = f"nearly: {left}"
+        # A time left without a standard deviation: these streams never observe the axis.
+        is_out_of_reach = math.isfinite(row.seconds_left)
+        word = "out of reach" if is_out_of_reach else "not seen yet"
+        against = "" if is_out_of_reach else f"wanted: {target}"
     difference = ""
-    if at.comparison is not None and at.comparison.differences:
-        row = at.comparison.differences[0].axes[axis]
-        difference = change(axis, row.difference, row.sigma)
-    is_vehicle = state.extrinsic is not None and state.extrinsic.has_vehicle_axes
-    meaning = _ON_A_VEHICLE[axis] if is_vehicle else ""
+    if at.comparison and at.comparison.differences:
+        moved = at.comparison.differences[0].axes[axis]
+        difference = change(axis, moved.difference, moved.sigma)
+    meaning = _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
     return Bar(_NAMES[axis], meaning, share, tone, word, against, difference)
 
 
+def _progress_in_words(row: AxisProgress, at: ProgressState, axis: str) -> tuple[Tone, str]:
+    """Return tone and word of an axis with a standard deviation."""
+    if at.progress.is_faulty:
+        return Tone.UNKNOWN, "of faulty streams"
+    if row.seconds_left == 0:
+        return Tone.GOOD, "enough"
+    word = "not with this motion"
+    if math.isfinite(row.seconds_left):
+        word = f"{duration(row.seconds_left)} left"
+    if row.sigma <= row.target:
+        return Tone.BUSY, f"nearly: {word}"
+    return Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, word
+
+
 def _values(result: ResultState) -> Iterator[tuple[str, str]]:
-    """Each axis with its value and standard deviation; a question mark if it is not observed."""
+    """Yield each axis with value and standard deviation; a question mark if unobserved."""
     for axis in AXES:
         value = result.pose.get(axis)
         sigma = result.pose_sigma.get(axis)
@@ -414,7 +538,10 @@ def _values(result: ResultState) -> Iterator[tuple[str, str]]:
 
 
 def _watched(axis: str, mount: MountState) -> Line:
-    """Whether an axis of a watched mount has moved, or what ten minutes of motion would show."""
+    """Return the line of one axis of a monitored mount.
+
+    The line has the shift, or the smallest shift that ten minutes of motion would reveal.
+    """
     shift = mount.shift.get(axis) or 0.0
     sigma = mount.shift_sigma.get(axis) or math.inf
     visible = mount.visible_10min.get(axis)
@@ -433,54 +560,59 @@ def _watched(axis: str, mount: MountState) -> Line:
 
 # ------------------------------------------------- health, verdict, comparison
 
-# Of levels, verdicts, comparisons and broadcasts.
-_TONES: dict[object, Tone] = {
-    **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
-    **dict.fromkeys((Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT),
-    **dict.fromkeys((Level.ERROR, "DO NOT USE"), Tone.BAD),
-    Broadcast.WAITING: Tone.BUSY,
-}
-
 
 def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
+    """Yield a line for each input, the stream checks and the journal."""
     for name, part in state.parts():
         if name in ("extrinsic", "progress", "mount"):
             continue
         tone = _TONES[part.level]
         text = part.text
+        # Nobody has to act before the first check.
         if part is state.checks and state.checks.age_s is None:
-            tone = Tone.BUSY  # a check that has not been made yet asks for nothing
+            tone = Tone.BUSY
         if isinstance(part, InputState) and part.topic not in text:
             text = f"{text}, {part.topic}"
         yield Line(Tone.UNKNOWN if is_old else tone, name, text)
 
 
 def _result(state: NodeState) -> Iterator[Line]:
-    result = _result_of(state)
-    verdict, notes = (result.verdict, result.warnings) if result else ("no result yet", ())
+    """Yield verdict, warnings, priors, comparison, broadcast and files of the result."""
+    result = state.result
+    verdict = result.verdict if result else "no result yet"
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
-    yield from (Line(Tone.ACT, "note", note.replace("+/-", "±")) for note in notes)
-    if state.extrinsic is not None:
+    if result:
+        for warning in result.warnings:
+            yield Line(Tone.ACT, "note", _typeset(warning))
+    if state.extrinsic:
         yield from _priors(state.extrinsic)
-    if state.progress and (found := state.progress.comparison):
-        text = found.sentence.replace("+/-", "±")
-        tone = _TONES.get(found.verdict, Tone.UNKNOWN)
-        yield Line(tone, "compared with what is installed", text)
-    if state.extrinsic and (broadcast := state.extrinsic.tf_static) is not Broadcast.OFF:
-        text = ": ".join(filter(None, (broadcast.value, state.extrinsic.tf_static_reason)))
-        told = (Tone.ACT, "nothing: the node has ended") if state.has_ended else None
-        tone, text = told or (_TONES[broadcast], text)
-        yield Line(tone, "on /tf_static", text)
-    if state.saved is not None:
+    if state.progress and (comparison := state.progress.comparison):
+        tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
+        yield Line(tone, "compared with what is installed", _typeset(comparison.sentence))
+    if state.extrinsic and state.extrinsic.tf_static is not Broadcast.OFF:
+        yield _broadcast(state.extrinsic, state.has_ended)
+    if state.saved:
         tone = Tone.BAD if state.saved.verdict == "DO NOT USE" else Tone.GOOD
-        yield Line(tone, "saved", f"{_where(state.saved)}: {state.saved.text}")
+        yield Line(tone, "saved", f"{_saved_at(state.saved)}: {state.saved.text}")
+
+
+def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
+    tone = _TONES[extrinsic.tf_static]
+    text = extrinsic.tf_static.value
+    if extrinsic.tf_static_reason:
+        text += f": {extrinsic.tf_static_reason}"
+    if has_ended:
+        tone = Tone.ACT
+        text = "nothing: the node has ended"
+    return Line(tone, "on /tf_static", text)
 
 
 def _priors(extrinsic: ExtrinsicState) -> Iterator[Line]:
-    """The priors that are set, and whether the motion contradicts them."""
-    for axis in (name for name in AXES if name in extrinsic.priors):
-        prior = extrinsic.priors[axis]
-        text = f"{axis} = {prior.replace('+/-', ' ± ')}"
+    """Yield the priors that are set, with contradictions to the motion."""
+    for axis in AXES:
+        if axis not in extrinsic.priors:
+            continue
+        text = f"{axis} = {extrinsic.priors[axis].replace('+/-', ' ± ')}"
         if axis in extrinsic.contradicted:
             yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
         else:
@@ -490,8 +622,8 @@ def _priors(extrinsic: ExtrinsicState) -> Iterator[Line]:
 def state_of(text: str) -> NodeState | None:
     """Return the state of a node from its JSON, without control characters.
 
-    Anybody may publish on that topic. None stands for a text that is no state, such as that of
-    another version, and for a state whose values cannot be shown.
+    Any program may publish on the topic. None is returned for a text that is no state, for the
+    state of another version, and for a state whose values cannot be displayed.
     """
     try:
         state = from_plain(NodeState, _printable(json.loads(text)))
@@ -504,6 +636,7 @@ def state_of(text: str) -> NodeState | None:
 
 
 def _printable(value: Any) -> Any:
+    """Return plain data whose texts have no control characters."""
     if isinstance(value, dict):
         return {printable(key): _printable(item) for key, item in value.items()}
     if isinstance(value, list):
