@@ -318,6 +318,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert "precision" not in fragment(view)
     assert "moved by 1 deg" in drawn(view, 80)
     assert "s solve" not in drawn(view, 80)
+    assert "c recalibrate   a acknowledge   r reset" in drawn(view, 80)
     assert '<p class="advice">Check it, then' in fragment(view)
     assert view_of(mount(level=Level.WARN)).watched[0].text == "not known yet"
 

@@ -39,6 +39,16 @@ SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 # Time (s) for which the answer to a button is displayed.
 ANSWER_FOR_S = 20.0
 
+# Requests that a person can make, with their keys on a terminal.
+KEYS = {
+    "solve": "s",
+    "save": "w",
+    "reset": "r",
+    "recalibrate": "c",
+    "acknowledge": "a",
+    "forget": "f",
+}
+
 # Words of headlines that decide about buttons.
 MOVED = "MOUNT MOVED"
 CHANGE_MOTION = "CHANGE THE MOTION"
