@@ -1,4 +1,4 @@
-"""``watch``: the live node as a person sees it, on a terminal and in a browser."""
+"""``watch``: the live node as a person reads it, on a terminal and in a browser."""
 
 import argparse
 import contextlib
@@ -23,46 +23,45 @@ examples:
   hand_eye_calib watch --node /robot1/calibrator
   hand_eye_calib watch > seen.txt          a line whenever something else is said"""
 
+# Default port of the page.
 _PORT = 8765
+
+# Longest wait (s) for a message between two looks at keyboard and browser.
 _LISTEN_S = 0.1
-_SURE_WITHIN_S = 5.0
-_KEYS = {
-    "s": "solve",
-    "w": "save",
-    "r": "reset",
-    "c": "recalibrate",
-    "a": "acknowledge",
-    "f": "forget",
-}
-_SURE = {
-    "r": "forgets all poses",
-    "c": "stops watching and calibrates anew",
-    "f": "removes all priors",
+
+# Time (s) within which the second press of a key confirms a request.
+_CONFIRM_S = 5.0
+
+# Requests that need a second press of their key, with their consequence.
+_CONSEQUENCES = {
+    "reset": "forgets all poses",
+    "recalibrate": "stops watching and calibrates anew",
+    "forget": "removes all priors",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of the command."""
     parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = EXAMPLES
-    add = parser.add_argument
     node = "full name of the node, such as /robot1/calibrator. Default: the first that is heard"
-    add("--node", metavar="NAME", default="", help=node)
+    parser.add_argument("--node", metavar="NAME", default="", help=node)
     web = f"also serve a page for browsers, at port {_PORT} of all addresses by default"
-    at = ("", _PORT)
-    add("--web", metavar="[HOST:]PORT", nargs="?", const=at, type=_address, help=web)
+    parser.add_argument(
+        "--web", metavar="[HOST:]PORT", nargs="?", const=("", _PORT), type=_address, help=web
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show the node until told to end; returns the exit code."""
+    """Display the node until a signal or the key ``q``; return the exit code."""
     from hand_eye_calib.online.ros.watcher import Watcher
     from hand_eye_calib.online.watch.board import Board
 
     board = Board(arguments.node)
     requests = queue.SimpleQueue[str]()
-    came: list[int] = []
+    received: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda signum, _: came.append(signum))
+        signal.signal(number, lambda signum, _: received.append(signum))
     with contextlib.ExitStack() as stack:
         watcher = stack.enter_context(Watcher(board))
         addresses = [""]
@@ -75,54 +74,83 @@ def run(arguments: argparse.Namespace) -> int:
             for address in addresses:
                 print(f"hand_eye_calib: note: open {address} in a browser", file=sys.stderr)
         session = Session(board, requests, stack.enter_context(_keyboard()))
-        show = stack.enter_context(_display(addresses[0]))
-        while not came and not session.is_over:
+        display = stack.enter_context(_display(addresses[0]))
+        while not received and not session.is_over:
             watcher.spin(_LISTEN_S)
             while not requests.empty():
                 watcher.ask(requests.get())
-            show(session.view(), session.shows_code)
+            display(session.view(), session.shows_code)
     return 0
 
 
 class Session:
-    """What the person at the terminal has typed, also keys that wait for a second press; ``keys``
-    gives those pressed since the last call, and the queue takes the requests.
+    """The keys that a person presses on the terminal.
+
+    Parameters
+    ----------
+    board : Board
+    requests : queue of str
+        Receives the requests of the keys.
+    keys : callable
+        Returns the keys that were pressed since its last call.
+
+    Attributes
+    ----------
+    is_over : bool
+        Whether the person has ended the program.
+    shows_code : bool
+        Whether the QR code of the page's address is displayed in place of the view.
     """
 
     def __init__(
         self, board: "Board", requests: "queue.SimpleQueue[str]", keys: Callable[[], str]
     ) -> None:
-        self.is_over = self.shows_code = False
+        from hand_eye_calib.online.watch.board import KEYS
+
+        self.is_over = False
+        self.shows_code = False
         self._board = board
         self._requests = requests
         self._keys = keys
-        self._sure = ""
-        self._sure_until_s = 0.0
+        self._request_of_key = {key: request for request, key in KEYS.items()}
+        # Request that waits for a second press of its key, and the end of the wait (steady, s).
+        self._unconfirmed = ""
+        self._confirm_until_s = 0.0
 
     def view(self) -> "View":
-        """Do what was typed, and make the view."""
+        """Process the pressed keys and return the view."""
         now_s = time.monotonic()
         for key in self._keys():
-            request = _KEYS.get(key, "")
+            # Ctrl-C and Ctrl-D end the program, too.
             if key in ("q", "\x03", "\x04"):
                 self.is_over = True
             elif key == "p":
                 self.shows_code = not self.shows_code
-            elif request not in self._board.view(now_s).buttons:
-                continue
-            elif key in _SURE and (key != self._sure or now_s > self._sure_until_s):
-                self._sure = key
-                self._sure_until_s = now_s + _SURE_WITHIN_S
-                self._board.answer(request, False, f"{_SURE[key]}: press {key} again", now_s)
             else:
-                self._requests.put(request)
+                self._press(key, now_s)
         return self._board.view(now_s)
+
+    def _press(self, key: str, now_s: float) -> None:
+        """Send the request of a key, or ask for a second press."""
+        request = self._request_of_key.get(key, "")
+        if request not in self._board.view(now_s).buttons:
+            return
+        is_confirmed = request == self._unconfirmed and now_s <= self._confirm_until_s
+        if request in _CONSEQUENCES and not is_confirmed:
+            self._unconfirmed = request
+            self._confirm_until_s = now_s + _CONFIRM_S
+            text = f"{_CONSEQUENCES[request]}: press {key} again"
+            self._board.answer(request, False, text, now_s)
+        else:
+            self._requests.put(request)
 
 
 @contextlib.contextmanager
 def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
-    """Function that shows a view, or the code of the page's address: on the screen of a terminal,
-    or in lines for a file or a pipe.
+    """Function that displays a view, or the QR code of the page's address.
+
+    A terminal has the view on its whole screen. A file or a pipe receives lines, and no line again
+    that differs from an earlier one only in its numbers.
     """
     from rich.live import Live
     from rich.text import Text
@@ -130,51 +158,59 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     from hand_eye_calib.online.watch.terminal import lines, screen
 
     if not sys.stdout.isatty():
-        said: set[str] = set()
+        printed: set[str] = set()
 
         def write(view: "View", shows_code: bool) -> None:
-            before = said.copy()
-            said.clear()
-            for line in lines(view):  # those that differ in their numbers only are the same
-                said.add(key := re.sub(r"[\d.]+", "", line))
+            before = printed.copy()
+            printed.clear()
+            for line in lines(view):
+                key = re.sub(r"[\d.]+", "", line)
+                printed.add(key)
                 if key not in before:
                     print(line, flush=True)
 
         yield write
         return
     code = qr_code(address)
-    footer = f"{'p QR code   ' * bool(code)}phone: {address}" if address else ""
-    shown: tuple[object, ...] = ()
+    footer = f"phone: {address}" if address else ""
+    if code:
+        footer = f"p QR code   {footer}"
+    displayed: tuple[object, ...] = ()
     with Live(screen=True, auto_refresh=False) as live:
 
-        def show(view: "View", shows_code: bool) -> None:
-            nonlocal shown
+        def draw(view: "View", shows_code: bool) -> None:
+            nonlocal displayed
             size = live.console.size
-            if shown != (view, size, shows_code):
-                of_view = screen(view, size.width, footer)
-                of_code = Text.from_ansi(code, style="bright_white on black")  # on light ones, too
-                live.update(of_code if code and shows_code else of_view, refresh=True)
-                shown = view, size, shows_code
+            content = view, size, shows_code
+            if content == displayed:
+                return
+            if code and shows_code:
+                # These colours are readable on light terminals, too.
+                live.update(Text.from_ansi(code, style="bright_white on black"), refresh=True)
+            else:
+                live.update(screen(view, size.width, footer), refresh=True)
+            displayed = content
 
-        yield show
+        yield draw
 
 
 def qr_code(address: str) -> str:
-    """The address as a QR code in characters; empty without the library for it."""
+    """Return an address as a QR code in characters; empty if ``segno`` is not installed."""
     try:
         import segno
     except ModuleNotFoundError:
         return ""
-    drawn = StringIO()
+    text = StringIO()
     if address:
-        segno.make(address, micro=False, error="l").terminal(out=drawn, border=2, compact=True)
-    return drawn.getvalue()
+        segno.make(address, micro=False, error="l").terminal(out=text, border=2, compact=True)
+    return text.getvalue()
 
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[], str]]:
-    """Function that gives the keys pressed since its last call, at once, without Enter and without
-    showing them; none unless a person sits at a terminal.
+    """Function that returns the keys pressed since its last call, without echo and without Enter.
+
+    It always returns an empty text if standard input or output is no terminal.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         yield str
@@ -197,6 +233,7 @@ def _keyboard() -> Iterator[Callable[[], str]]:
 
 
 def _address(text: str) -> tuple[str, int]:
+    """Return host and port from PORT or HOST:PORT."""
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
         raise argparse.ArgumentTypeError(f"expected PORT or HOST:PORT, got {text!r}")

@@ -1,8 +1,8 @@
-"""The view in a browser: a small server of one page, which needs nothing from the internet, and the
-piece of HTML that the page puts in place.
+"""A view in a browser: a server of one page, which loads nothing from the internet.
 
-Events go to the page (server-sent events), presses of buttons come back. Every request must carry
-the key that is part of the address: a page of somebody else in the same browser does not know it.
+The server sends the view as server-sent events, each a fragment of HTML that replaces the last one.
+Buttons of the page send requests back. Every request needs the key in the address of the page, so
+that other pages in the same browser cannot use the server.
 """
 
 import contextlib
@@ -26,24 +26,23 @@ from urllib.parse import parse_qs, urlsplit
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.text import AXIS_UNITS, capital, prior_as_typed
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S
-from hand_eye_calib.online.watch.board import Bar, Board, Line, Tone, View
+from hand_eye_calib.online.watch.board import KEYS, Bar, Board, Line, Tone, View
 
-# Requests of the page, beside those about an axis measured by hand.
-BUTTONS = ("solve", "save", "reset", "recalibrate", "acknowledge", "forget")
-
-# The view is looked at so often (s).
+# Period (s) at which the server looks for changes of the view.
 _LOOK_S = 0.25
 
-# A browser that takes nothing for so long is gone (s).
+# Time (s) after which a browser that accepts no data is disconnected.
 _PATIENCE_S = 10.0
 
-_PAGE = ("page.html", "page.css", "page.js")
+# Files of the page that contain no secrets.
+_STYLE_AND_SCRIPT = ("page.css", "page.js")
 _FOLDER = files("hand_eye_calib.online.watch").joinpath("page")
-# A vehicle from its left side, on which y points to whoever looks at it.
+# A vehicle from its left side: its y axis points towards the reader.
 _SKETCH = _FOLDER.joinpath("sketch.svg").read_text(encoding="utf-8")
-_KINDS = {"css": "text/css", "js": "text/javascript", "html": "text/html", "yaml": "text/plain"}
-# Files of a saved result that the page links to.
+# Files of a saved result to which the page links.
 SAVED = ("report.html", "extrinsic.yaml")
+# Media types by extension; all other files are plain text.
+_MEDIA_TYPES = {"css": "text/css", "js": "text/javascript", "html": "text/html"}
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -56,50 +55,52 @@ _POLICY = (
 _POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
 
-def _kept_key() -> str:
-    """The user's key, the same at every start, so that a page that was left open comes back; one
-    for this time if no file that is only this user's can keep it.
+def _user_key() -> str:
+    """Return the key of this user, the same at every start, so that an open page reconnects.
+
+    The key is a new one if no file that only this user can read can store it.
     """
-    made = secrets.token_urlsafe(6)
+    new_key = secrets.token_urlsafe(6)
     with contextlib.suppress(OSError, RuntimeError, ValueError):
-        state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-        file = Path(state, "hand_eye_calib", "watch_key")
-        file.parent.mkdir(parents=True, exist_ok=True)
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
-        with open(os.open(file, flags, 0o600), "r+") as kept:
-            about = os.fstat(kept.fileno())
-            text = kept.read()
-            is_own = about.st_uid == os.getuid() and not about.st_mode & 0o077
-            if is_own and re.fullmatch(r"[\w-]{8,}", text, re.ASCII):
-                return text
-            kept.write(made if is_own and not text else "")
-    return made
+        folder = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        path = Path(folder, "hand_eye_calib", "watch_key")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        with open(descriptor, "r+") as file:
+            status = os.fstat(descriptor)
+            is_private = status.st_uid == os.getuid() and not status.st_mode & 0o077
+            key = file.read()
+            if is_private and re.fullmatch(r"[\w-]{8,}", key, re.ASCII):
+                return key
+            if is_private and not key:
+                file.write(new_key)
+    return new_key
 
 
 class WebServer(ThreadingHTTPServer):
-    """Serves the view until :meth:`stop`, in threads of its own, under the key of this user.
+    """Server of the view in threads of its own, until :meth:`stop`.
 
     Parameters
     ----------
     board : Board
     ask : callable
-        Called in another thread with one of BUTTONS, or with a parameter and its value as in
-        ``prior.z:=1.85m+/-0.02m``, or ``prior.z:=`` to remove it.
+        Called in another thread with a request of ``board.KEYS``, or with a parameter and its value
+        such as ``prior.z:=1.85m+/-0.02m``; ``prior.z:=`` removes the prior.
     address : (str, int)
-        Host and port; an empty host stands for all addresses of the computer, port 0 for any that
-        is free.
+        Host and port. An empty host stands for all addresses of the computer, port 0 for any free
+        port.
 
     Raises
     ------
     ConfigError
-        If it cannot listen there.
+        If the address cannot be used.
     """
 
     daemon_threads = True
     block_on_close = False
 
     def __init__(self, board: Board, ask: Callable[[str], None], address: tuple[str, int]) -> None:
-        self.key = _kept_key()
+        self.key = _user_key()
         self.board = board
         self.ask = ask
         self.stopping = threading.Event()
@@ -115,12 +116,15 @@ class WebServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, name="web", daemon=True).start()
 
     def addresses(self) -> list[str]:
-        """What to type into a browser, that for other computers first."""
+        """Return addresses of the page; the first one works on other computers too."""
         hosts = [self._host or "localhost"]
         probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        with probe, contextlib.suppress(OSError):  # of a computer without a network
-            probe.connect(("192.0.2.1", 9))  # sends nothing; asks which way it would go
-            hosts[:0] = [] if self._host else [str(probe.getsockname()[0])]
+        # A computer without a network raises.
+        with probe, contextlib.suppress(OSError):
+            # Sends nothing, but selects the network interface. The address is for documentation.
+            probe.connect(("192.0.2.1", 9))
+            if not self._host:
+                hosts.insert(0, str(probe.getsockname()[0]))
         return [f"http://{host}:{self.server_port}/?key={self.key}" for host in hosts]
 
     def stop(self) -> None:
@@ -130,7 +134,7 @@ class WebServer(ThreadingHTTPServer):
         self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of browsers that have gone."""
+        """Ignore browsers that have closed their connection."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -141,167 +145,193 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE_S
 
     def do_GET(self) -> None:
+        """Send a file of the page, the events, or a file of the saved result."""
         name = self._path() or "page.html"
-        if name in _PAGE and (name != "page.html" or self._has_key()):  # the others have no secrets
-            content = _FOLDER.joinpath(name).read_bytes()
-            self._send(HTTPStatus.OK, content, name)
-        elif not self._has_key():
-            text = "Open the whole address that the terminal with `hand_eye_calib watch` shows."
+        if name not in _STYLE_AND_SCRIPT and not self._has_key():
+            text = b"Open the whole address that the terminal with `hand_eye_calib watch` shows."
             self._send(HTTPStatus.FORBIDDEN, text)
+        elif name in ("page.html", *_STYLE_AND_SCRIPT):
+            self._send(HTTPStatus.OK, _FOLDER.joinpath(name).read_bytes(), name)
         elif name == "events":
             self._send_events()
-        elif name in SAVED and (saved := self._saved(name)):
-            self._send(HTTPStatus.OK, saved, name, _POLICY_OF_SAVED)
+        elif name in SAVED and (content := self._saved(name)):
+            self._send(HTTPStatus.OK, content, name, _POLICY_OF_SAVED)
         else:
-            self._send(HTTPStatus.NOT_FOUND, "there is no such page")
-
-    def _saved(self, name: str) -> bytes:
-        """A file of the saved result, if it is on this computer; links are not followed."""
-        directory = self.server.board.view(time.monotonic()).saved_in
-        file = Path(directory, name)
-        return file.read_bytes() if directory and file.is_file() and not file.is_symlink() else b""
+            self._send(HTTPStatus.NOT_FOUND, b"there is no such page")
 
     def do_POST(self) -> None:
-        self.close_connection = True  # a body, if there is one, is not read
-        request = self._path()
-        axis = self._given("axis")
-        status = HTTPStatus.OK
-        text = ""
+        """Pass a request of a button, or a prior, on to the node."""
+        # The body of the request, if any, is not read.
+        self.close_connection = True
         if not self._has_key():
-            status = HTTPStatus.FORBIDDEN
-            text = "the key is missing"
-        elif request == "forget" and axis in AXIS_UNITS:
-            self.server.ask(f"prior.{axis}:=")
-        elif request in BUTTONS:
-            self.server.ask(request)
-        elif request == "prior" and axis in AXIS_UNITS:  # the node refuses what is no number
-            prior = prior_as_typed(axis, self._given("value"), self._given("sigma"))
-            self.server.ask(printable(f"prior.{axis}:={prior}"))
-        else:
-            status = HTTPStatus.NOT_FOUND
-            text = "there is no such request"
-        self._send(status, text)
+            self._send(HTTPStatus.FORBIDDEN, b"the key is missing")
+            return
+        request = self._path()
+        axis = self._argument("axis")
+        if request == "forget" and axis in AXIS_UNITS:
+            request = f"prior.{axis}:="
+        elif request == "prior" and axis in AXIS_UNITS:
+            # The node refuses a value that is no number.
+            prior = prior_as_typed(axis, self._argument("value"), self._argument("sigma"))
+            request = printable(f"prior.{axis}:={prior}")
+        elif request not in KEYS:
+            self._send(HTTPStatus.NOT_FOUND, b"there is no such request")
+            return
+        self.server.ask(request)
+        self._send(HTTPStatus.OK, b"")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Keep the terminal to the view."""
+        """Log nothing: the terminal displays the view."""
+
+    def _saved(self, name: str) -> bytes:
+        """Return a file of the saved result; empty if it is absent here, or a symbolic link."""
+        folder = self.server.board.view(time.monotonic()).saved_in
+        file = Path(folder, name)
+        return file.read_bytes() if folder and file.is_file() and not file.is_symlink() else b""
 
     def _path(self) -> str:
         return urlsplit(self.path).path[1:]
 
-    def _given(self, name: str) -> str:
+    def _argument(self, name: str) -> str:
+        """Return an argument of the request; empty if it is missing."""
         return parse_qs(urlsplit(self.path).query).get(name, [""])[-1]
 
     def _has_key(self) -> bool:
-        given = self._given("key").encode(errors="replace")
-        return hmac.compare_digest(given, self.server.key.encode())
+        key = self._argument("key").encode(errors="replace")
+        return hmac.compare_digest(key, self.server.key.encode())
 
     def _send(
-        self, status: HTTPStatus, content: str | bytes, name: str = "", policy: str = _POLICY
+        self, status: HTTPStatus, content: bytes, name: str = "", policy: str = _POLICY
     ) -> None:
-        made = content.encode() if isinstance(content, str) else content
-        self._begin(status, _KINDS.get(name.rpartition(".")[2], "text/plain"), policy)
-        self.send_header("Content-Length", str(len(made)))
+        media_type = _MEDIA_TYPES.get(name.rpartition(".")[2], "text/plain")
+        self._begin(status, media_type, policy)
+        self.send_header("Content-Length", str(len(content)))
         self.end_headers()
-        self.wfile.write(made)
+        self.wfile.write(content)
 
-    def _begin(self, status: HTTPStatus, kind: str, policy: str = _POLICY) -> None:
+    def _begin(self, status: HTTPStatus, media_type: str, policy: str = _POLICY) -> None:
+        """Send the status and the headers of every response."""
         self.send_response(status)
-        headers = {"Content-Type": f"{kind}; charset=utf-8", "Content-Security-Policy": policy}
-        for name, value in (_HEADERS | headers).items():
+        self.send_header("Content-Type", f"{media_type}; charset=utf-8")
+        self.send_header("Content-Security-Policy", policy)
+        for name, value in _HEADERS.items():
             self.send_header(name, value)
 
     def _send_events(self) -> None:
         self.close_connection = True
         self._begin(HTTPStatus.OK, "text/event-stream")
         self.end_headers()
-        with contextlib.suppress(OSError):  # the browser has gone
+        # The browser may have closed the connection.
+        with contextlib.suppress(OSError):
             for event in self._events():
                 self.wfile.write(event)
 
     def _events(self) -> Iterator[bytes]:
-        """The view whenever it has changed; an empty event every second in between."""
-        sent = ""
+        """Yield the view whenever it has changed, and an empty event every second in between."""
+        html = ""
         sent_s = 0.0
-        board = self.server.board
-        while not self.server.stopping.wait(_LOOK_S if sent else 0.0):
+        while not self.server.stopping.wait(_LOOK_S if html else 0.0):
             now_s = time.monotonic()
-            view = board.view(now_s)
-            there = [name for name in SAVED if os.path.isfile(os.path.join(view.saved_in, name))]
-            made = " ".join(fragment(view, there if view.saved_in else ()).splitlines())
-            if made != sent or now_s - sent_s >= REPORT_PERIOD_S:
-                yield f"data: {made if made != sent else ''}\n\n".encode()
-                sent = made
-                sent_s = now_s
+            view = self.server.board.view(now_s)
+            # Unlike Path.is_file, which raises for a name that is too long.
+            files = [name for name in SAVED if os.path.isfile(f"{view.saved_in}/{name}")]
+            newest = " ".join(fragment(view, files if view.saved_in else ()).splitlines())
+            if newest != html:
+                yield f"data: {newest}\n\n".encode()
+            elif now_s - sent_s >= REPORT_PERIOD_S:
+                yield b"data: \n\n"
+            else:
+                continue
+            html = newest
+            sent_s = now_s
 
 
 def fragment(view: View, files: Sequence[str] = ()) -> str:
-    """Everything but buttons and links, which stay in the page, so that none vanishes under a
-    finger: the attributes of the first element say which of them are shown.
+    """Return the HTML of a view without buttons and links.
+
+    Buttons and links stay in the page, because a button that is replaced under a finger misses the
+    press. Attributes of the first element list those to be displayed.
 
     Parameters
     ----------
     view : View
     files : sequence of str
-        Saved files that the page may have.
+        Saved files to which the page may link.
     """
-    axes = "precision against the target"
-    axes += ", change from installed" * any(bar.difference for bar in view.bars)
-    sketch = [_SKETCH] if any(bar.meaning for bar in view.bars) else []
-    values = (f"<dt>{escape(axis)}</dt><dd>{escape(text)}</dd>" for axis, text in view.values)
-    reasons = (f"<li>{escape(reason)}</li>" for reason in view.reasons)
-    result = [*map(_line, view.result[:1]), *_wrapped("ul", reasons), *map(_line, view.result[1:])]
-    topics = (f"<li>{escape(topic)}</li>" for topic in view.topics)
-    sections = (
-        _section("answer", "", map(_line, view.answer)),
-        _section("topics", "topics with poses", _wrapped("ul", topics)),
-        _section("axes", axes, [*sketch, *map(_bar, view.bars)]),
-        _section("axes", "the mount, after ten minutes of motion", map(_line, view.watched)),
-        '<div class="side">',
-        _section("pose", view.title, _wrapped("dl", values)),
-        _section("health", "result and inputs", [*result, *map(_line, view.health)]),
-        "</div>",
-    )
-    said, _, advice = view.sentence.partition("; ")
-    told = (("advice", capital(advice)), ("facts", view.facts))
-    priors = escape(json.dumps(dict(view.priors)))
-    more = [f'<p class="{name}">{escape(text)}</p>' for name, text in told if text]
+    sentence, _, advice = view.sentence.partition("; ")
+    headline = f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', sentence)}"
+    if advice:
+        headline += _element("p", capital(advice), "advice")
+    if view.facts:
+        headline += _element("p", view.facts, "facts")
+    axes_title = "precision against the target"
+    if any(bar.difference for bar in view.bars):
+        axes_title += ", change from installed"
+    bars = "".join(map(_bar, view.bars))
+    if any(bar.meaning for bar in view.bars):
+        bars = _SKETCH + bars
+    pose = [_element("dt", axis) + _element("dd", text) for axis, text in view.values]
+    # The first line is the verdict; its reasons follow.
+    health = _lines(view.result[:1]) + _listed(view.reasons)
+    health += _lines(view.result[1:] + view.health)
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
-        f'data-by-hand="{" ".join(view.by_hand)}" data-priors="{priors}" '
+        f'data-by-hand="{" ".join(view.by_hand)}" '
+        f'data-priors="{escape(json.dumps(dict(view.priors)))}" '
         f'data-files="{" ".join(files)}">'
-        f'<p class="node">{escape(view.node or "no node")}</p>'
-        f'<section class="headline"><h1>{_sign(view.tone)} {escape(view.word)}</h1>'
-        f"<p>{escape(said)}</p>{''.join(more)}</section>{''.join(sections)}</div>"
+        + _element("p", view.node or "no node", "node")
+        + _section("headline", "", headline)
+        + _section("answer", "", _lines(view.answer))
+        + _section("topics", "topics with poses", _listed(view.topics))
+        + _section("axes", axes_title, bars)
+        + _section("axes", "the mount, after ten minutes of motion", _lines(view.watched))
+        + '<div class="side">'
+        + _section("pose", view.title, _wrapped("dl", pose))
+        + _section("health", "result and inputs", health)
+        + "</div></div>"
     )
 
 
-def _section(name: str, title: str, parts: Iterable[str]) -> str:
-    """A section with a title; nothing if it is empty."""
-    content = "".join(parts)
-    head = f"<h2>{escape(title)}</h2>" if title else ""
+def _section(name: str, title: str, content: str) -> str:
+    """Return a section with a title; empty without content."""
+    head = _element("h2", title) if title else ""
     return f'<section class="{name}">{head}{content}</section>' if content else ""
 
 
-def _wrapped(tag: str, parts: Iterable[str]) -> list[str]:
+def _element(tag: str, text: str, name: str = "") -> str:
+    """Return an element with a text and, unless ``name`` is empty, a class."""
+    attribute = f' class="{name}"' if name else ""
+    return f"<{tag}{attribute}>{escape(text)}</{tag}>"
+
+
+def _wrapped(tag: str, parts: Iterable[str]) -> str:
     content = "".join(parts)
-    return [f"<{tag}>{content}</{tag}>"] if content else []
+    return f"<{tag}>{content}</{tag}>" if content else ""
+
+
+def _listed(texts: Iterable[str]) -> str:
+    return _wrapped("ul", [_element("li", text) for text in texts])
+
+
+def _lines(lines: Iterable[Line]) -> str:
+    return "".join(map(_line, lines))
+
+
+def _line(line: Line) -> str:
+    name = _element("b", line.name)
+    text = f"{_sign(line.tone)} {name} {escape(line.text)}"
+    return f'<p class="line {line.tone.name.lower()}">{text}</p>'
 
 
 def _bar(bar: Bar) -> str:
     difference = f"change: {bar.difference}" if bar.difference else ""
+    name = escape(bar.name)
     return (
         f'<div class="axis {bar.tone.name.lower()}">'
-        f"<span><b>{escape(bar.name)}</b> {escape(bar.meaning)}</span>"
+        f"<span><b>{name}</b> {escape(bar.meaning)}</span>"
         f'<span class="state">{_sign(bar.tone)} {escape(bar.word)}</span>'
-        f'<progress max="1" value="{bar.share:.3f}" aria-label="{escape(bar.name)}"></progress>'
-        f"<span>{escape(bar.against)}</span><span>{escape(difference)}</span></div>"
-    )
-
-
-def _line(line: Line) -> str:
-    return (
-        f'<p class="line {line.tone.name.lower()}">{_sign(line.tone)} <b>{escape(line.name)}</b> '
-        f"{escape(line.text)}</p>"
+        f'<progress max="1" value="{bar.share:.3f}" aria-label="{name}"></progress>'
+        f"{_element('span', bar.against)}{_element('span', difference)}</div>"
     )
 
 
