@@ -1,5 +1,8 @@
 """Streams of positions alone: GNSS antennas and prisms beside the poses of another sensor."""
 
+import functools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from motions import geodetic, planar_poses, walked, wandering_poses
@@ -10,7 +13,9 @@ from hand_eye_calib.core.engine.run import check
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.results.document import usable_numbers
+from hand_eye_calib.extras.partial import positions
 from hand_eye_calib.offline.cli.main import main
 from reproduction.partial import simulated_positions
 
@@ -109,6 +114,17 @@ class TestLeverArm:
         assert abs(found.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
         assert np.abs(distances(found)).max() < 3.0
         assert any("answer to acceleration" in text for text in found.noise.in_words)
+
+    def test_the_expected_scale_of_a_tuning_is_taken_out_of_a_finding(self, monkeypatch):
+        sigmas = list(TUNING.of_positions)
+        sigmas[3] = 0.0015
+        tuning = replace(TUNING, of_positions=tuple(sigmas))
+        solve = functools.partial(positions.solve, tuning=tuning)
+        monkeypatch.setattr(positions, "solve", solve)
+        parent, child = recorded()
+        result = hec.calibrate(parent, child.scaled(1 / 1.02), checks=False)
+        (scale,) = (found for found in result.findings if found.code == "scale")
+        assert scale.evidence["scale"] == pytest.approx(1.02, abs=0.001)
 
     def test_a_scale_is_within_its_sigma_whatever_the_worlds(self):
         parent, child = recorded(drift_rad=1e-3, noise_m=0.02, seed=1)

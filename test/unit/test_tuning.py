@@ -225,7 +225,8 @@ def names_of_the_default(tree):
 
 def test_no_search_reads_the_default_instead_of_what_was_passed():
     folder = ROOT / "hand_eye_calib"
-    searches = [*(folder / "core" / "noise").glob("*.py"), folder / "extras/partial/positions.py"]
+    folders = (folder / "core" / "noise", folder / "extras" / "partial")
+    searches = [path for place in folders for path in place.glob("*.py")]
     reading = {}
     for path in searches:
         names = names_of_the_default(ast.parse(path.read_text(encoding="utf-8")))

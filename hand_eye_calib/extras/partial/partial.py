@@ -24,7 +24,6 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise import estimator as adaptive_estimator
 from hand_eye_calib.core.noise import increments
-from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import Residuals
@@ -50,7 +49,6 @@ _MENDED_PATH = 0.5
 
 # A scale between the streams must exceed so many of its standard deviations, and the data must
 # know it better than the expectation of the model (share of the information).
-_EXPECTED_SCALE = TUNING.of_positions[3]
 _SCALE_SIGMAS = 5.0
 _SHOWN_SCALE = 0.5
 _LEAST_SCALE = 1e-3
@@ -184,7 +182,8 @@ def _of_path(
     """A finding if the path of the positions is not that of the odometry, or in other units."""
     share = of_positions.unexplained_share(poses, positions, solution.lever_arm, solution.scale)
     if share < _SUSPECT_PATH:
-        return () if is_scale_given else _of_scale(solution, _EXPECTED_SCALE, is_child)
+        expected = solution.model.tuning.of_positions[3]
+        return () if is_scale_given else _of_scale(solution, expected, is_child)
     axes = fused.observability[:3]
     is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
     is_near = is_known and share < _UNRELATED_PATH
@@ -197,7 +196,7 @@ def _of_path(
         if unit and not is_near and left < _UNRELATED_PATH:
             return (unit,)
         if not is_scale_given and left < min(_SUSPECT_PATH, _MENDED_PATH * share):
-            return _of_scale(scaled, TUNING.any_scale, is_child)
+            return _of_scale(scaled, scaled.model.tuning.any_scale, is_child)
     share = min(share, 1.0)
     severity = Severity.WARNING if is_near else Severity.ERROR
     text = f"{share:.0%} of the motion of the positions is not that of the odometry"
