@@ -6,7 +6,7 @@ import pytest
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.noise import reml
 from hand_eye_calib.core.noise.normal import Factor, NormalEquations
-from hand_eye_calib.core.noise.outliers import innovations
+from hand_eye_calib.core.noise.outliers import chi_squares, innovations
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 
 N_POSES = 15
@@ -215,3 +215,10 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
         np.testing.assert_allclose(found_below[k], blocks[k + 1, :, k], atol=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
         Factor(-diagonal, below)
+
+
+def test_chi_squares_of_jitter_along_one_velocity_are_finite():
+    prior = 1.7e5 * np.ones((1, 6, 6)) + 1e-14 * np.eye(6)
+    values = np.ones((1, 6))
+    chi_square = chi_squares(values, prior, 0.004 * prior, np.array([False]))
+    assert 0.0 <= chi_square[0] < 1e-3

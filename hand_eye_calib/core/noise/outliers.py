@@ -101,7 +101,7 @@ def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Fl
     space = posterior.space
     levels = posterior.levels
     states, walk = posterior.restricted()
-    of_walk = _chi_squares(
+    of_walk = chi_squares(
         walk[:, :, 0],
         posterior.walk_covariance * space.relative[:, None, None],
         walk_covariance(posterior) + walk[:, :, 1:] @ transposed(walk[:, :, 1:]),
@@ -110,7 +110,7 @@ def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Fl
     white = states[:, :WHITE]
     weights = np.where(spikes, 1.0, space.weights)
     along = np.exp(levels[len(space.white)]) * space.twists
-    of_white = _chi_squares(
+    of_white = chi_squares(
         white[:, :, 0],
         (combined(levels, space.white) + along[:, :, None] * space.twists[:, None])
         / weights[:, None, None],
@@ -121,7 +121,7 @@ def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Fl
     return of_walk, of_white
 
 
-def _chi_squares(
+def chi_squares(
     values: FloatArray, prior: FloatArray, posterior: FloatArray, left_out: BoolArray
 ) -> FloatArray:
     """Chi-square (n,) of smoothed values (n, 6); their covariance is prior minus posterior, or plus
@@ -129,7 +129,8 @@ def _chi_squares(
     """
     spread = prior - posterior
     spread[left_out] = prior[left_out] + posterior[left_out]
-    spread += _RAISED_COVARIANCE * prior + _LEAST_VARIANCE * np.eye(6)
+    # On the diagonal alone: a prior of jitter along one velocity is singular itself.
+    spread += (_RAISED_COVARIANCE * prior + _LEAST_VARIANCE) * np.eye(6)
     return np.asarray((values * np.linalg.solve(spread, values[:, :, None])[:, :, 0]).sum(axis=1))
 
 

@@ -463,7 +463,7 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
             is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
             rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.none))
             normal = NormalEquations(products + problem.known(rival))
-            loss = 2.0 * n_rows * np.log1p(float(normal.cost) / n_rows)
+            loss = 2.0 * n_rows * np.log1p(max(float(normal.cost), 0.0) / n_rows)
             loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
             loss -= 2.0 * log_odds * len(present)
             hypotheses.append(_Hypothesis(loss, rival, normal))
