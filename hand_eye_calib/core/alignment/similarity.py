@@ -286,6 +286,8 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     # the smallest singular value is arbitrary; its sign is chosen so that they are rotations.
     left = forms[:, :12, :12]
     left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
+    # Streams that never move have no form at all.
+    left = left + np.finfo(float).tiny * np.eye(12)
     matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
     rotations = [*se3.nearest_rotation(matrices), *all_pairs.start_rotations(ranked)]
     forms = np.concatenate([forms, *[forms[:1]] * (len(rotations) - len(forms))])
@@ -294,7 +296,8 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     vectors = np.append(np.reshape(rotations, (-1, 9)), np.zeros((len(forms), 1)), axis=1)
     products = se3.times(reduced, vectors)
     scales = -products[:, 9] / np.maximum((vectors * products).sum(axis=1), 1e-300)
-    scales[scales <= 1e-3] = 1.0  # opposite or no motion: a bad candidate, but one for every form
+    # Opposite or no motion: a bad candidate, but one for every form.
+    scales[(scales <= 1e-3) | (scales >= 1e9)] = 1.0
     translations = -se3.times(to_translation, scales[:, None] * vectors + np.eye(10)[9])
     Ts = se3.from_rotation_translation(np.array(rotations), translations)
     costs = quadratic_form.median_costs(quadratic_form.coefficients(ranked), Ts, scales)

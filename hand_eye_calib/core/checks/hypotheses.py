@@ -435,7 +435,9 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
     of_chosen = scatter[chosen.hypothesis]
     least = min(scatter.values())
     if least < min(trajectory.STEADY, of_chosen / trajectory.CLEARLY):
-        best = [each for each in _ALL_WAYS if scatter[each] <= _ABOUT_EQUAL * least]
+        # Rounding makes the scatter of exact motion negative.
+        limit = max(_ABOUT_EQUAL * least, 0.0)
+        best = [way for way in _ALL_WAYS if scatter[way] <= limit]
         steady = _fitted(min(best, key=lambda each: each.complexity), streams, lag_s)
         if steady.holds:
             return steady, True

@@ -18,6 +18,8 @@ class RateIntegrator:
         rates (M, 3), rad/s, about its axes. Between two stamps the mean of both counts; a step back
         in time is a rotation back.
         """
+        if not len(stamps_ns):
+            return np.empty((0, 3, 3))
         last_ns, last_rate = self._last or (stamps_ns[:1], rates[:1])
         intervals_s = np.diff(np.concatenate([last_ns, stamps_ns])) * 1e-9
         means = 0.5 * (rates + np.concatenate([last_rate, rates[:-1]]))

@@ -440,8 +440,11 @@ def _start(
         turns = _rotations(measured, predicted)
         rotated = measured @ turns
         if with_scale:
-            shares = (rotated * predicted).sum(axis=(1, 2)) / (rotated**2).sum(axis=(1, 2))
-            scale = float(np.median(shares))
+            products = (rotated * predicted).sum(axis=(1, 2))
+            squares = (rotated**2).sum(axis=(1, 2))
+            shares = np.divide(products, squares, np.zeros_like(products), where=squares > 0.0)
+            # Paths that do not move have no scale.
+            scale = float(np.median(shares)) or 1.0
         residuals = scale * rotated - path
         errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
         weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)

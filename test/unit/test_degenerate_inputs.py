@@ -1,0 +1,170 @@
+"""Degenerate input ends in a result or in one clear line, for every kind of data and method."""
+
+import warnings
+
+import numpy as np
+import pytest
+from motions import child_of, disturbed, planar_poses, walked, wandering_poses
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.geometry import se3
+
+N_POSES = 40
+STAMPS_NS = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(N_POSES)
+
+# What each stream of data measures; stops have no stamps.
+KINDS = ("poses", "positions", "rotations", "rates", "stops")
+METHODS = ("adaptive", "dnlo", "dnl", "park", "taylor", "zhuang", "ali")
+
+
+def steady(twist):
+    """Poses of a sensor that repeats one motion."""
+    return walked(se3.exp(np.tile(twist, (N_POSES - 1, 1))))
+
+
+def rocking():
+    """Poses of an arm that turns one joint to and fro."""
+    angles = np.cumsum(np.random.default_rng(1).normal(0.0, 0.1, N_POSES))
+    twists = np.zeros((N_POSES, 6))
+    twists[:, 5] = angles
+    return se3.exp(twists) @ se3.exp(np.array([0.5, 0.2, 0.3, 0.3, 0.2, 0.1]))
+
+
+def shifted_only():
+    """Poses that never turn."""
+    rotations = np.tile(np.eye(3), (N_POSES, 1, 1))
+    return se3.from_rotation_translation(rotations, wandering_poses(N_POSES)[:, :3, 3])
+
+
+MOTIONS = {
+    "none": lambda: np.tile(np.eye(4), (N_POSES, 1, 1)),
+    "any": lambda: wandering_poses(N_POSES),
+    "planar": lambda: planar_poses(N_POSES),
+    "about one axis": rocking,
+    "straight": lambda: steady([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    "constant rotation": lambda: steady([0.1, 0.0, 0.0, 0.0, 0.0, 0.05]),
+    "on the spot": lambda: steady([0.0, 0.0, 0.0, 0.0, 0.0, 0.05]),
+    "half turns": lambda: steady([0.1, 0.0, 0.0, 0.0, 0.0, np.pi]),
+    "without rotation": shifted_only,
+    "two poses in turn": lambda: np.tile(wandering_poses(20)[[0, 19]], (N_POSES // 2, 1, 1)),
+}
+
+
+def both_poses(motion, unit=1.0, sigma=0.0):
+    """Poses of parent and child in other units of length, with noise of each (m, rad)."""
+    parent = MOTIONS[motion]()
+    child = child_of(parent)
+    if sigma:
+        parent = disturbed(parent, 1, sigma, sigma)
+        child = disturbed(child, 2, sigma, sigma)
+    for poses in (parent, child):
+        poses[:, :3, 3] *= unit
+    return parent, child
+
+
+def calibrated(kind, stamps_ns, parent, child, **options):
+    """Return a calibration of one kind of data."""
+    if kind == "stops":
+        return hec.calibrate_stops(parent, child)
+    of_parent = hec.Trajectory(stamps_ns, parent)
+    if kind == "positions":
+        of_child = hec.Trajectory.from_positions(stamps_ns, child[:, :3, 3])
+    elif kind == "rates":
+        steps = se3.log(se3.inverse(child[:-1]) @ child[1:])
+        of_child = hec.Trajectory.from_rates(stamps_ns[1:], steps[:, 3:] / 0.1)
+    elif kind == "rotations":
+        of_child = hec.Trajectory(stamps_ns, child, measures="rotations")
+    else:
+        of_child = hec.Trajectory(stamps_ns, child)
+    return hec.calibrate(of_parent, of_child, **options)
+
+
+def assert_clear_end(kind, stamps_ns, parent, child, **options):
+    """Check that a calibration ends in a finite result or in one line, without a warning."""
+    message = ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            result = calibrated(kind, stamps_ns, parent, child, **options)
+        except hec.HandEyeCalibError as error:
+            message = str(error)
+    if message:
+        assert "\n" not in message
+        return
+    assert np.isfinite(result.T_parent_child).all()
+    assert not np.isnan(result.sigmas).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_a_motion_without_noise(motion, kind):
+    parent, child = both_poses(motion)
+    assert_clear_end(kind, STAMPS_NS, parent, child)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_a_motion_without_noise_by_every_method(motion, method):
+    parent, child = both_poses(motion)
+    assert_clear_end("poses", STAMPS_NS, parent, child, method=method, checks=False)
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e-3])
+@pytest.mark.parametrize("kind", ["poses", "positions", "stops"])
+@pytest.mark.parametrize("motion", ["any", "about one axis", "constant rotation"])
+def test_another_unit_of_length(motion, kind, unit):
+    parent, child = both_poses(motion, unit)
+    assert_clear_end(kind, STAMPS_NS, parent, child)
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e-3])
+@pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "zhuang"])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_another_unit_of_length_by_some_methods(motion, method, unit):
+    parent, child = both_poses(motion, unit, 1e-3)
+    options = {"method": method, "scale": "none", "checks": False}
+    assert_clear_end("poses", STAMPS_NS, parent, child, **options)
+
+
+@pytest.mark.parametrize("option", [{"scale": "estimate"}, {"time_offset": "estimate"}])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_an_estimated_scale_or_offset(motion, option):
+    parent, child = both_poses(motion)
+    assert_clear_end("poses", STAMPS_NS, parent, child, checks=False, **option)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("motion", ["none", "any"])
+def test_identical_streams(motion, kind):
+    parent, _ = both_poses(motion)
+    assert_clear_end(kind, STAMPS_NS, parent, parent)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("n_poses", [0, 1, 2, 3])
+def test_few_poses(n_poses, kind):
+    parent, child = both_poses("any")
+    assert_clear_end(kind, STAMPS_NS[:n_poses], parent[:n_poses], child[:n_poses])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("rows", [[7], [*range(0, N_POSES, 4)], [*range(N_POSES)]])
+def test_poses_that_are_not_finite(rows, kind):
+    parent, child = both_poses("any")
+    child[rows, 0, 3] = np.nan
+    assert_clear_end(kind, STAMPS_NS, parent, child)
+
+
+@pytest.mark.parametrize("kind", KINDS[:-1])
+@pytest.mark.parametrize("rows", [[9], [*range(20, 30)], [*range(N_POSES)]])
+def test_equal_stamps(rows, kind):
+    parent, child = both_poses("any")
+    stamps_ns = STAMPS_NS.copy()
+    stamps_ns[rows] = stamps_ns[rows[0] - 1]
+    assert_clear_end(kind, stamps_ns, parent, child)
+
+
+@pytest.mark.parametrize("kind", KINDS[:-1])
+def test_stamps_in_reverse_order(kind):
+    parent, child = both_poses("any")
+    assert_clear_end(kind, STAMPS_NS[::-1].copy(), parent, child)
