@@ -8,6 +8,7 @@ docs/session.md.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -26,7 +27,7 @@ _SHARE = 0.7
 _LEAST_ROOM = 0.25
 # Least duration of motion (s) of the two results in a row that must reach the target.
 _MIN_MOTION_S = 30.0
-# The same in correlation times of the slowest time-correlated error.
+# Least duration in correlation times of the slowest time-correlated error.
 _CORRELATION_TIMES = 10.0
 
 # Times left that are reported (s). They only decrease, by one step for each result. Beyond the last
@@ -37,16 +38,24 @@ _STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, 
 # deviations are estimates, and the newer result has more motion.
 _AS_GOOD = 1.25
 
+# Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
+Targets: TypeAlias = Sequence[float] | FloatArray
+
 _NO_RESULT = "No result yet: move the sensors, with rotations."
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _Result:
     """Result of the session, its motion, and the faults of its streams."""
 
     calibration: Calibration
-    seen: Excitation
-    faults: tuple[str, ...]
+    motion: Excitation
+    faults: Sequence[str]
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the motion is long enough to trust the standard deviations."""
+        return self.motion.motion_s >= _least_motion_s(self.calibration)
 
 
 class Goal:
@@ -68,15 +77,15 @@ class Goal:
     progress : Progress
     """
 
-    def __init__(self, targets: Sequence[float] | FloatArray) -> None:
+    def __init__(self, targets: Targets) -> None:
         self._targets = np.asarray(targets, dtype=float)
         self.restart()
 
     def restart(self) -> None:
         """Begin a new session."""
         # The newest result, and the newest result with less motion.
-        self._newest: _Judged | None = None
-        self._before: _Judged | None = None
+        self._newest: _Result | None = None
+        self._before: _Result | None = None
         self._motion_s = -1.0
         self._start_over(_NO_RESULT)
 
@@ -92,18 +101,15 @@ class Goal:
         if self._newest is None:
             self.progress = self._nothing_yet(sentence)
 
-    def follow(self, targets: Sequence[float] | FloatArray) -> None:
+    def follow(self, targets: Targets) -> None:
         """Start over with these targets, because options have changed.
 
         Earlier results still confirm the next one, because the robot may stand still by now.
         """
         self._targets = np.asarray(targets, dtype=float)
-        if self._newest is not None:
-            self._start_over("Solving with the new options.")
-        else:
-            self._start_over(_NO_RESULT)
+        self._start_over("Solving with the new options." if self._newest else _NO_RESULT)
 
-    def retarget(self, calibration: Calibration, targets: Sequence[float] | FloatArray) -> Progress:
+    def retarget(self, calibration: Calibration, targets: Targets) -> None:
         """Compare the session's result with new targets; no other option has changed.
 
         Parameters
@@ -113,66 +119,74 @@ class Goal:
         targets : (6,) array-like
         """
         self.follow(targets)
-        if self._newest is None:
-            return self.progress
-        return self.add(calibration, self._newest.seen, self._newest.faults)
+        if self._newest is not None:
+            self.add(calibration, self._newest.motion, self._newest.faults)
 
     def add(
-        self, calibration: Calibration, seen: Excitation, faults: Sequence[str] = ()
+        self, calibration: Calibration, motion: Excitation, faults: Sequence[str] = ()
     ) -> Progress:
         """Add the next result of the session and update ``best`` and ``progress``.
 
         Parameters
         ----------
         calibration : Calibration
-        seen : Excitation
+        motion : Excitation
             The motion of the result.
         faults : sequence of str
             Findings of the stream checks. The goal is not reached while there are any.
         """
-        if not faults:  # a result from positions or rates has findings of its own
-            findings = [reason for reason in calibration.reasons if reason.is_finding]
-            errors = [reason for reason in findings if reason.verdict is Verdict.DO_NOT_USE]
-            faults = [error.sentence for error in errors]
+        newest = _Result(calibration, motion, faults or _own_faults(calibration))
         # A result without more motion cannot confirm the one before: the robot stands still.
-        if seen.motion_s > self._motion_s:
+        if motion.motion_s > self._motion_s:
             self._before = self._newest
-            self._motion_s = seen.motion_s
-        self._newest = _Judged(calibration, seen, tuple(faults))
+            self._motion_s = motion.motion_s
+        self._newest = newest
         if calibration.status is SolveStatus.CONTRADICTED:
             self._start_over(f"No usable result: {calibration.status.failure}.")
             return self.progress
         ratios = self._ratios(calibration, calibration)
         worst = int(np.argmax(ratios))
-        motion_s = seen.motion_s
-        may_be_used = calibration.verdict is not Verdict.DO_NOT_USE and not faults
-        is_within = calibration.status is SolveStatus.OK and may_be_used and ratios[worst] <= 1.0
-        least_s = _least_motion_s(calibration)
-        is_known = is_within and motion_s >= least_s
-        may_end = self.best is not None or (is_known and self._is_confirmed(calibration))
-        information = 1.0 / max(ratios[worst], 1e-12)
-        if is_within and may_end and information * _AS_GOOD**2 >= self._best_information:
-            self.best = calibration
-            self._best_information = max(information, self._best_information)
-        # Variances decrease with 1 / time. An infinite ratio times 0 s would be NaN.
-        left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
-        left_s = np.maximum(left_s, max(least_s - motion_s, 0.0))
+        self._update_best(newest, ratios[worst])
         is_done = self.best is not None
-        is_stuck = bool(not is_done and motion_s >= _MIN_MOTION_S and left_s[worst] > _STEPS_S[-2])
+        left_s = _time_left(newest, ratios)
+        is_long = motion.motion_s >= _MIN_MOTION_S
+        is_stuck = bool(not is_done and is_long and left_s[worst] > _STEPS_S[-2])
         left_s = self._in_steps(left_s)
-        limiting = AXES[worst] if is_stuck or ratios[worst] > 1.0 else ""
+        sentence = self._reason_to_stop(newest)
+        if not sentence:
+            limiting = AXES[worst] if is_stuck or ratios[worst] > 1.0 else ""
+            sentence = _advice(limiting, left_s[worst], is_stuck, motion)
         self.progress = Progress(
-            sentence=(
-                self._reason_to_stop(calibration, faults)
-                or _advice(limiting, left_s[worst], is_stuck, seen)
-            ),
-            done=is_done and not faults,
-            is_faulty=bool(faults),
+            sentence=sentence,
+            done=is_done and not newest.faults,
+            is_faulty=bool(newest.faults),
             limiting_axis="" if is_done else AXES[worst],
             will_not_get_there=is_stuck,
             axes=self._by_axis(calibration.sigmas, np.zeros(6) if is_done else left_s),
         )
         return self.progress
+
+    def _update_best(self, newest: _Result, ratio: float) -> None:
+        """Make the newest result the best one if it reaches the goal, unless it is clearly worse.
+
+        Parameters
+        ----------
+        newest : _Result
+        ratio : float
+            Largest ratio of :meth:`_ratios`.
+        """
+        calibration = newest.calibration
+        if calibration.status is not SolveStatus.OK or newest.faults or ratio > 1.0:
+            return
+        if calibration.verdict is Verdict.DO_NOT_USE:
+            return
+        # The first result that reaches the goal must be long enough and confirmed.
+        if self.best is None and not (newest.is_long and self._is_confirmed(calibration)):
+            return
+        information = 1.0 / max(ratio, 1e-12)
+        if information * _AS_GOOD**2 >= self._best_information:
+            self.best = calibration
+            self._best_information = max(information, self._best_information)
 
     def _is_confirmed(self, newest: Calibration) -> bool:
         """Whether the previous result, from less motion, reaches the goal, too.
@@ -181,12 +195,11 @@ class Goal:
         have changed in between.
         """
         before = self._before
-        if before is None or before.faults:
+        if before is None or before.faults or not before.is_long:
             return False
         if before.calibration.status is SolveStatus.NOT_CONVERGED:
             return False
-        is_long = before.seen.motion_s >= _least_motion_s(before.calibration)
-        return bool(is_long and self._ratios(before.calibration, newest).max() <= 1.0)
+        return bool(self._ratios(before.calibration, newest).max() <= 1.0)
 
     def _ratios(self, calibration: Calibration, newest: Calibration) -> FloatArray:
         """Ratios (6,) of the measured variances to the variances that are allowed for them.
@@ -225,15 +238,35 @@ class Goal:
             for axis, sigma, target, seconds in columns
         }
 
-    def _reason_to_stop(self, calibration: Calibration, faults: Sequence[str]) -> str:
+    def _reason_to_stop(self, newest: _Result) -> str:
         """Sentence to stop if more motion is useless or not needed; empty otherwise."""
-        if faults:
-            return f"Stop: the streams are faulty: {faults[0]}."
-        if calibration.status.failure:
-            return f"No usable result: {calibration.status.failure}."
+        if newest.faults:
+            return f"Stop: the streams are faulty: {newest.faults[0]}."
+        if newest.calibration.status.failure:
+            return f"No usable result: {newest.calibration.status.failure}."
         if self.best is not None:
             return f"Done: {what_is_known(self.best)}. Stop and save."
         return ""
+
+
+def _own_faults(calibration: Calibration) -> list[str]:
+    """Errors among the findings of a result from positions, rotations or rates."""
+    return [
+        reason.sentence
+        for reason in calibration.reasons
+        if reason.is_finding and reason.verdict is Verdict.DO_NOT_USE
+    ]
+
+
+def _time_left(newest: _Result, ratios: FloatArray) -> FloatArray:
+    """Times (6,) of further motion (s) until each axis reaches its target.
+
+    Variances decrease with 1 / time.
+    """
+    motion_s = newest.motion.motion_s
+    # An infinite ratio times 0 s would be NaN.
+    left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
+    return np.maximum(left_s, max(_least_motion_s(newest.calibration) - motion_s, 0.0))
 
 
 def _least_motion_s(calibration: Calibration) -> float:
@@ -243,7 +276,7 @@ def _least_motion_s(calibration: Calibration) -> float:
     return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
 
 
-def _advice(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
+def _advice(axis: str, left_s: float, is_stuck: bool, excitation: Excitation) -> str:
     """Sentence with the most helpful motion for the axis that takes longest.
 
     ``axis`` is empty if every axis is within its target.
@@ -251,7 +284,7 @@ def _advice(axis: str, left_s: float, is_stuck: bool, seen: Excitation) -> str:
     left = duration(np.clip(left_s, _STEPS_S[1], _STEPS_S[-2]))
     if not axis:
         return f"Go on for about {left}: every axis is good enough if the next results agree."
-    motion = helpful_motion([axis], seen)
+    motion = helpful_motion([axis], excitation)
     axis_text = axes_in_words([axis])
     if is_stuck:
         return f"This motion will not determine {axis_text} well enough: {motion}."
