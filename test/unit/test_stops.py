@@ -9,6 +9,7 @@ from real_data import data_folder
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
+from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
 from hand_eye_calib.extras.stops.robot_world import Stops, solve
@@ -82,7 +83,8 @@ def test_samples_of_others(file, parent, position, within_m):
     samples = read_arm_samples(folder / file)
     result = calibrate_arm(samples.robot, samples.tracking)
     assert result.parent_frame == parent
-    assert not result.findings
+    # Two of CamOdoCal's 42 stops do not fit the others.
+    assert {found.severity for found in result.findings} <= {Severity.NOTE}
     assert result.verdict is not hec.Verdict.DO_NOT_USE
     if position:
         np.testing.assert_allclose(result.T_parent_child[:3, 3], position, atol=within_m)

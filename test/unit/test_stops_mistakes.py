@@ -8,6 +8,7 @@ import pytest
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
 from hand_eye_calib.offline.cli.main import main
@@ -130,6 +131,15 @@ REFUSED = {
     "inverse on both sides": (se3.inverse, se3.inverse, "inverse"),
     "inverse robot": (se3.inverse, same, "inverse"),
 }
+
+
+def with_outliers(Ts, count):
+    """Poses of which the first ones are wrong by 20 cm and 17 deg on each axis."""
+    random = np.random.default_rng(1)
+    errors = random.normal(size=(count, 6)) * np.repeat([0.2, 0.3], 3)
+    Ts = Ts.copy()
+    Ts[:count] = Ts[:count] @ se3.exp(errors)
+    return Ts
 
 
 def words(result):
@@ -415,3 +425,88 @@ def test_the_options_that_a_finding_names_lead_to_the_right_answer(name, size, p
     found = calibrate_arm(*sides, CalibratorConfig(scale="auto"))
     np.testing.assert_allclose(found.T_parent_child, result.T_parent_child, atol=1e-9)
     assert found.verdict is result.verdict
+
+
+SETUPS = {"hand": ON_HAND, "beside": BESIDE}
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_the_first_line_has_the_place_of_the_camera_and_the_option_for_the_other(setup):
+    robot, tracking, _ = arm(SETUPS[setup])
+    other = "beside" if setup == "hand" else "hand"
+
+    result = calibrate_arm(robot, tracking)
+
+    assert f"; camera {SETUPS[setup]} (--setup {other}" in result.headline
+    assert result.setup == setup
+    assert hec.Calibration.from_dict(result.to_dict()).headline == result.headline
+    assert result.inverse().setup == setup
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+def test_a_setup_that_the_stops_contradict_is_refused_alone(setup):
+    robot, tracking, _ = arm(SETUPS[setup])
+    other = "beside" if setup == "hand" else "hand"
+
+    obeyed = calibrate_arm(robot, tracking, setup=setup)
+    refused = calibrate_arm(robot, tracking, setup=other)
+
+    assert obeyed.findings == ()
+    assert obeyed.warnings == ()
+    assert [found.code for found in refused.findings] == ["setup"]
+    assert f"the stops fit a camera {SETUPS[setup]}, not one {SETUPS[other]}" in refused.headline
+
+
+def test_a_setup_decides_where_the_stops_do_not():
+    robot, tracking, _ = arm(ON_HAND, n=3)
+    assert [found.code for found in calibrate_arm(robot, tracking).findings] == ["ambiguous"]
+    for setup in SETUPS:
+        result = calibrate_arm(robot, tracking, setup=setup)
+        assert result.setup == setup
+        assert "ambiguous" not in [found.code for found in result.findings]
+
+
+def test_an_unknown_setup_is_refused():
+    robot, tracking, _ = arm(ON_HAND)
+    with pytest.raises(ConfigError, match="setup must be one of hand, beside; got"):
+        calibrate_arm(robot, tracking, setup="eye in hand")
+
+
+def test_setup_is_an_option_of_arms_alone(tmp_path, capsys):
+    robot, tracking, _ = arm(ON_HAND)
+    np.savez(tmp_path / "arm.npz", robot=robot, tracking=tracking)
+    files = []
+    for name, Ts in (("hand", robot), ("camera", se3.inverse(tracking))):
+        files.append(str(tmp_path / f"{name}.npy"))
+        np.save(files[-1], Ts)
+
+    assert main(["calibrate", str(tmp_path / "arm.npz"), "--setup", "hand"]) == 0
+    assert main(["calibrate", str(tmp_path / "arm.npz"), "--setup", "beside"]) == 3
+    capsys.readouterr()
+    for order in ("none", "time"):
+        assert main(["calibrate", *files, "--order", order, "--setup", "hand"]) == 2
+        assert "needs the samples of an arm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("count", "severity", "verdict"),
+    [
+        (1, Severity.NOTE, hec.Verdict.USE),
+        (4, Severity.NOTE, hec.Verdict.USE),
+        (5, Severity.WARNING, hec.Verdict.USE_WITH_CARE),
+        (10, Severity.WARNING, hec.Verdict.USE_WITH_CARE),
+    ],
+)
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+def test_stops_that_were_left_out_are_counted_and_named(place, count, severity, verdict):
+    robot, tracking, truth = arm(place, seed=9, n=40)
+
+    result = calibrate_arm(robot, with_outliers(tracking, count))
+
+    (found,) = result.findings
+    assert (found.code, found.severity) == ("outliers", severity)
+    assert found.evidence == {"count": count, "n_stops": 40}
+    assert f"{count} of 40 stops do not fit the others and were left out: 1" in result.headline
+    assert result.verdict is verdict
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[:3]) < WITHIN_M

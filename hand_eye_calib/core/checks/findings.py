@@ -370,11 +370,23 @@ _ROWS = {
         "record more stops, with rotations about two axes: 15 or more are good",
         code="ambiguous",
     ),
+    "setup": _Row(
+        "the stops fit a camera {other}, not one {place}",
+        "leave setup out; or, if one side or both hold inverse poses, give parent_invert poses "
+        "(robot), child_invert poses (target), or both",
+    ),
     "copied_stops": _Row(
         "the poses of the target are those of the robot: the camera and the target would be at the "
         "origins of hand and base",
         "give the poses of the target as the camera measured them",
         code="same_frame",
+    ),
+    "outlier_stops": _Row(
+        "{count} of {n_stops} stops do not fit the others and were left out: {numbers}",
+        "look at these stops: is the target detected well, and does the arm rest?",
+        "a target that was detected mirrored, or a stop during a motion",
+        severity=_WARNING,
+        code="outliers",
     ),
     "stop_units": _Row(
         "{whose} lengths are {unit}",

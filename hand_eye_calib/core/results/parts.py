@@ -84,6 +84,10 @@ class Part:
         """Return lines for a person about the part of a result with this headline."""
         return self._details(value, headline) if self._details else []
 
+    def headline(self, value: Any) -> str:
+        """Return what the first line of a usable result says of the part; empty for nothing."""
+        return ""
+
 
 @cache
 def part(name: str) -> Part:

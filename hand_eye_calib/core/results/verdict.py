@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeAlias
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.registry import EXTRA_RULES
 from hand_eye_calib.core.base.text import amount, amount_beside, axes_in_words, listing
+from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import (
     ROTATIONS,
     TRANSLATIONS,
@@ -158,7 +159,9 @@ class Judged(Result):
         """The verdict with its gravest reason, or with what is known, in one line."""
         decided = self.verdict.value
         gravest = shown(self.reasons)
-        notable = "".join(f"; {finding.what}" for finding in self.findings if _is_notable(finding))
+        notes = [part(name).headline(value) for name, value in self.parts.items()]
+        notes += [finding.what for finding in self.findings if _is_notable(finding)]
+        notable = "".join(f"; {note}" for note in notes if note)
         if not gravest:
             return f"{decided}: {what_is_known(self)}{notable}"
         if gravest[0].rule == "unobservable":
@@ -178,7 +181,7 @@ class Judged(Result):
 
 def _is_notable(finding: Finding) -> bool:
     """Whether a headline names a finding that is no reason: it changes what the numbers mean."""
-    return finding.code == "model_scale" and finding.severity is Severity.NOTE
+    return finding.code in ("model_scale", "outliers") and finding.severity is Severity.NOTE
 
 
 def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
@@ -320,12 +323,10 @@ def _hidden(result: Result) -> Iterator[_Found]:
 
 
 def _few_inliers(result: Result) -> Iterator[_Found]:
-    share = result.n_inliers / max(result.n_pairs, 1)
     if result.reference == "stops":
-        if share < FEWEST_INLIERS:
-            text = f"{1 - share:.0%} of the stops do not fit the others"
-            yield text, "look at these stops: is the target seen well, does the arm stand?", (), {}
+        # A finding has the numbers of the stops that were left out.
         return
+    share = result.n_inliers / max(result.n_pairs, 1)
     uses_reference = METHODS[result.method].uses_reference
     if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
@@ -492,7 +493,7 @@ _OWN_RULES = (
     Rule(
         "outliers",
         _CARE,
-        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs, or of the stops, are outliers; "
+        f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs are outliers; "
         f"more than {1 - FEWEST_OF_MODEL:.0%} with method adaptive",
         _few_inliers,
     ),

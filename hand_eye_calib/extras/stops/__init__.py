@@ -25,6 +25,11 @@ def _add_arguments(parser: Any) -> None:
         "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
     )
     parser.add_argument("--order", choices=("time", "none"), default="time", help=order)
+    setup = (
+        "where the camera of an arm is: on the hand, or beside the robot with the target on the "
+        "hand. Default: as the samples fit"
+    )
+    parser.add_argument("--setup", choices=("hand", "beside"), help=setup)
     add = parser.add_argument_group("images of a target").add_argument
     target = (
         "what the images of --child-topic show, or those of a folder, the second PATH, one for "
@@ -42,6 +47,10 @@ def _are_stops(arguments: Any) -> bool:
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
     are_images = arguments.target and not arguments.child_topic
     are_samples = len(arguments.paths) == 1 and arguments.paths[0].suffix in _SAMPLES
+    if arguments.setup and not (are_samples or are_images):
+        raise ConfigError(
+            "--setup says where the camera of an arm is; it needs the samples of an arm or --target"
+        )
     return bool(are_samples or are_images or arguments.order == "none")
 
 

@@ -15,7 +15,8 @@ from hand_eye_calib.core.base.config import CalibratorConfig, defaults_of
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.base.option import option_name, options_in_words
 from hand_eye_calib.core.base.stats import median
-from hand_eye_calib.core.checks.findings import Finding, finding
+from hand_eye_calib.core.base.text import listing, shown_value
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.engine.estimation import calibration_of
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_stack
@@ -32,7 +33,7 @@ from hand_eye_calib.extras.stops.checks import (
     turns_about_two_axes,
 )
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld, Stops, solve
-from hand_eye_calib.extras.stops.worlds import Worlds
+from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
 
 # Options that mean something for stops; those of groups by the beginnings of their names.
 _OBEYED = {
@@ -77,6 +78,10 @@ _IDENTITY_RAD = 0.001
 # that no camera has.
 _FAR_RAD = 0.17
 
+# More stops than this share that are left out ask for care; so many of them are named.
+_MANY_LEFT_OUT = 0.1
+_MOST_NUMBERS = 8
+
 # What is on a hand is nearer to it than this (m), or than twice the way from the base to what is
 # fixed there.
 _ON_HAND_M = 0.3
@@ -97,6 +102,11 @@ class _Solved:
     warnings: tuple[str, ...]
     # How much larger the objective of the other way round is.
     lead: float = np.inf
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether no finding forbids the use of the result."""
+        return not any(found.makes_unusable for found in self.findings)
 
 
 def calibrate_stops(
@@ -140,7 +150,7 @@ def calibrate_stops(
     config = _usable(config)
     given = _given(Ts_world_parent, Ts_world_child, config, ("parent", "child"))
     solved = _solved(given, config)
-    if not {"parent_invert", "child_invert"} & config.given:
+    if solved.is_usable and not {"parent_invert", "child_invert"} & config.given:
         both = (
             "read as poses of both sensors in their worlds; if both hold inverse poses, which fit "
             "as well, give parent_invert poses and child_invert poses"
@@ -154,10 +164,11 @@ def calibrate_arm(
     tracking: Any,
     config: CalibratorConfig | None = None,
     names: Mapping[str, str] | None = None,
+    setup: str | None = None,
 ) -> Calibration:
     """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
 
-    Which of them it is, is seen from the samples: only one of them leaves small errors.
+    Without ``setup`` both places are tried: only one of them leaves small errors.
 
     Parameters
     ----------
@@ -171,6 +182,8 @@ def calibrate_arm(
         are set.
     names : mapping of str to str, optional
         Names of the frames base, hand, camera, target.
+    setup : {"hand", "beside"}, optional
+        Where the camera is: on the hand or beside the robot. Default: as the samples fit.
 
     Returns
     -------
@@ -199,17 +212,22 @@ def calibrate_arm(
             "calibrate_arm((R_gripper2base, t_gripper2base), (R_target2cam, t_target2cam))"
         )
     config = _usable(config)
+    if setup is not None and setup not in SETUPS:
+        raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
     named = {name: name for name in ("base", "hand", "camera", "target")} | dict(names or {})
     given = _given(robot, tracking, config, ("robot", "tracking"), is_arm=True)
-    solved = _solved(given, config)
+    solved = _solved(given, config, setup)
     parent, world = ("base", "hand") if solved.is_inverse else ("hand", "base")
-    solved = replace(solved, findings=gravest_first((*solved.findings, *_contradictions(solved))))
-    is_unusable = any(found.makes_unusable for found in solved.findings)
-    if not is_unusable and not {"parent_invert", "child_invert"} <= config.given:
+    findings = gravest_first((*solved.findings, *_contradictions(solved, setup)))
+    solved = replace(solved, findings=findings)
+    if solved.is_usable and not {"parent_invert", "child_invert"} <= config.given:
         doubts, warnings = _reading(solved, named)
         findings = gravest_first((*solved.findings, *doubts))
-        solved = replace(solved, findings=findings, warnings=(*solved.warnings, *warnings))
-    return _assessed(solved, [named[name] for name in (parent, "camera", world, "target")])
+        solved = replace(solved, findings=findings)
+        if not setup:
+            solved = replace(solved, warnings=(*solved.warnings, *warnings))
+    frames = [named[name] for name in (parent, "camera", world, "target")]
+    return _assessed(solved, frames, "beside" if solved.is_inverse else "hand")
 
 
 # ------------------------------------------------------------------ what is given
@@ -278,7 +296,7 @@ def _put_right(given: GivenStops, config: CalibratorConfig, child_unit: float) -
 # ------------------------------------------------------------------ the solve
 
 
-def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
+def _solved(given: GivenStops, config: CalibratorConfig, setup: str | None = None) -> _Solved:
     """Check the stops, repair what is certain, solve, and estimate the scale if it matters."""
     unit = config.given_scale
     stops = _put_right(given, config, unit)
@@ -310,7 +328,7 @@ def _solved(given: GivenStops, config: CalibratorConfig) -> _Solved:
     stops = _put_right(given, config, unit)
     # The rough scale is that of lengths whose units are put right.
     scale = None if settled else examination.scale
-    return _with_scale(stops, config, unit, scale, findings, warnings)
+    return _with_scale(stops, config, unit, scale, findings, warnings, setup)
 
 
 def _without_unit_of_child(examination: Examination) -> tuple[Examination, float]:
@@ -361,6 +379,7 @@ def _with_scale(
     rough_scale: float | None,
     findings: list[Finding],
     warnings: list[str],
+    setup: str | None,
 ) -> _Solved:
     """Solve with the scale that the options ask for, or that the stops clearly show.
 
@@ -370,7 +389,10 @@ def _with_scale(
     if wants_scale and not given.has_positions:
         raise ConfigError("scale estimate needs positions; both sides have rotations alone")
     start = rough_scale or 1.0
-    fit, stops, is_inverse, lead = _fit(given, start)
+    fit, stops, is_inverse, lead = _fit(given, start, setup)
+    if setup and lead < -_READING_LEAD:
+        other = "hand" if is_inverse else "beside"
+        findings = [finding("setup", place=SETUPS[setup], other=SETUPS[other]), *findings]
     is_unusable = any(found.makes_unusable for found in findings)
     scale = 1.0
     sigma = 0.0
@@ -402,7 +424,7 @@ def _with_scale(
             scale = 1.0
             sigma = 0.0
     if scale == 1.0 and start != 1.0:
-        fit, stops, is_inverse, lead = _fit(given, 1.0)
+        fit, stops, is_inverse, lead = _fit(given, 1.0, setup)
     findings = [*findings, *_of_unknown(given, fit, findings)]
     return _Solved(
         fit=fit,
@@ -439,13 +461,20 @@ def _off_scale(scale: float, sigma: float, n_stops: int) -> float:
     return float(max(lowest, -highest, 0.0))
 
 
-def _fit(given: GivenStops, scale: float) -> tuple[RobotWorld, Stops, bool, float]:
-    """The likelier solution of both ways round, if both are possible, and its lead."""
+def _fit(
+    given: GivenStops, scale: float, setup: str | None
+) -> tuple[RobotWorld, Stops, bool, float]:
+    """The likelier solution of both ways round, if both are possible, and its lead; with a setup
+    its solution, whose lead may be negative.
+    """
     fits = []
     for is_inverse in (False, True) if given.is_arm else (False,):
         stops = stops_of(given, Mistakes(is_inverse=is_inverse), scale)
         fits.append((solve(stops), stops, is_inverse))
-    fits.sort(key=lambda fit: fit[0].objective)
+    if setup is None:
+        fits.sort(key=lambda fit: fit[0].objective)
+    elif setup == "beside":
+        fits.reverse()
     lead = fits[1][0].objective - fits[0][0].objective if given.is_arm else np.inf
     return *fits[0], lead
 
@@ -468,13 +497,13 @@ def _with_free_scale(
 # ------------------------------------------------------------------ the result
 
 
-def _contradictions(solved: _Solved) -> list[Finding]:
-    """Findings on an arm whose stops fit both readings, or whose sides are the same poses."""
+def _contradictions(solved: _Solved, setup: str | None) -> list[Finding]:
+    """Findings on an arm whose stops fit both setups, or whose sides are the same poses."""
     if solved.fit.undetermined().size:
         return []
     if _is_copy(solved):
         return [finding("copied_stops")]
-    if solved.lead < _READING_LEAD:
+    if not setup and solved.lead < _READING_LEAD:
         return [finding("both_readings")]
     return []
 
@@ -497,21 +526,21 @@ def _reading(solved: _Solved, named: Mapping[str, str]) -> tuple[list[Finding], 
     camera, target, hand, base = (named[name] for name in ("camera", "target", "hand", "base"))
     on_parent_m = float(np.linalg.norm(solved.fit.Ts_parent_child[0][:3, 3]))
     on_world_m = float(np.linalg.norm(solved.fit.Ts_world_world[0][:3, 3]))
+    setup = "beside" if solved.is_inverse else "hand"
     if solved.is_inverse:
-        place = "beside the robot"
         on_hand_m = on_world_m
         on_base_m = on_parent_m
         moving = target
         fixed = camera
     else:
-        place = "on the hand"
         on_hand_m = on_parent_m
         on_base_m = on_world_m
         moving = camera
         fixed = target
     text = (
-        f"read as a camera {place}; if that is wrong, one side or both hold inverse poses: give "
-        "parent_invert poses (robot), child_invert poses (target), or both; or exchange both sides"
+        f"read as a camera {SETUPS[setup]}; if that is wrong, one side or both hold inverse "
+        "poses: give parent_invert poses (robot), child_invert poses (target), or both; or "
+        "exchange both sides"
     )
     if not solved.fit.undetermined().size and solved.stops.Ts_world_child[:, :3, 3].any():
         is_odd = on_hand_m > _ON_HAND_M and on_base_m < _NEARER * on_hand_m
@@ -521,8 +550,30 @@ def _reading(solved: _Solved, named: Mapping[str, str]) -> tuple[list[Finding], 
     return [], [text]
 
 
-def _assessed(solved: _Solved, frames: list[str]) -> Calibration:
+def _left_out(weights: FloatArray) -> Finding | None:
+    """Return the finding that stops do not fit the others, with their numbers from 1."""
+    numbers = [str(row + 1) for row in np.flatnonzero(weights == 0.0)]
+    if not numbers:
+        return None
+    count = len(numbers)
+    share = count / len(weights)
+    if count > _MOST_NUMBERS:
+        numbers = [*numbers[:_MOST_NUMBERS], f"{count - _MOST_NUMBERS} more"]
+    return finding(
+        "outlier_stops",
+        severity=Severity.WARNING if share > _MANY_LEFT_OUT else Severity.NOTE,
+        count=count,
+        n_stops=len(weights),
+        numbers=listing(numbers),
+    )
+
+
+def _assessed(solved: _Solved, frames: list[str], setup: str = "") -> Calibration:
     fit = solved.fit
+    findings = solved.findings
+    outliers = _left_out(fit.weights)
+    if outliers and solved.is_usable:
+        findings = gravest_first((*findings, outliers))
     stops = solved.stops
     config = solved.config
     X = fit.Ts_parent_child[0]
@@ -559,12 +610,12 @@ def _assessed(solved: _Solved, frames: list[str]) -> Calibration:
         measured=config.measured,
         reference="stops",
         stamp_ns=0,
-        findings=solved.findings,
+        findings=findings,
         scale=solved.scale,
         scale_sigma=solved.scale_sigma,
         parent_frame=config.parent_frame or parent,
         child_frame=config.child_frame or child,
-        parts={"worlds": Worlds(Z, of_Z, parent_world, child_world)},
+        parts={"worlds": Worlds(Z, of_Z, parent_world, child_world, setup)},
     )
 
 

@@ -36,7 +36,10 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         path = arguments.paths[0]
         samples = read_arm_samples(path)
         inputs = {"samples": {"file": str(path), "poses": len(samples.robot)}}
-        return calibrate_arm(samples.robot, samples.tracking, config, samples.frames), inputs
+        result = calibrate_arm(
+            samples.robot, samples.tracking, config, samples.frames, arguments.setup
+        )
+        return result, inputs
     if len(arguments.paths) != 2:
         raise ConfigError("--order none takes two trajectory files, or the samples of an arm")
     parent_path, child_path = map(Path, arguments.paths)
@@ -68,7 +71,9 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         seen = finder.found()
         n_child = len(seen.images)
         note(str(seen))
-        found = calibrate_arm(parent.poses[seen.images], seen.Ts_camera_target, config)
+        found = calibrate_arm(
+            parent.poses[seen.images], seen.Ts_camera_target, config, setup=arguments.setup
+        )
     counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
     return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}
 

@@ -12,6 +12,12 @@ from hand_eye_calib.core.geometry.se3 import inverse_covariance
 from hand_eye_calib.core.results.document import covariance_of, matrix_of, transform_of
 from hand_eye_calib.core.results.parts import ExtraTransform, Part
 
+# Where the camera of an arm is, by the values of the option ``setup``.
+SETUPS = {"hand": "on the hand", "beside": "beside the robot"}
+
+# Attributes that are texts.
+_TEXTS = ("parent_world_frame", "child_world_frame", "setup")
+
 
 @dataclass(frozen=True, eq=False)
 class Worlds:
@@ -20,16 +26,20 @@ class Worlds:
     Attributes
     ----------
     T_world_world : (4, 4) array or None
-        Pose of the child's world in the parent's.
+        Pose of the child's world in the parent's world.
     cov_world_world : (6, 6) array or None
-        Its covariance in the child's world.
+        Covariance of ``T_world_world``, in the child's world.
     parent_world_frame, child_world_frame : str
+    setup : {"", "hand", "beside"}
+        Whether the camera is on the hand or beside the robot; empty if the poses are not those of
+        an arm.
     """
 
     T_world_world: FloatArray | None
     cov_world_world: FloatArray | None
     parent_world_frame: str = ""
     child_world_frame: str = ""
+    setup: str = ""
 
     def __post_init__(self) -> None:
         for name in ("parent_world_frame", "child_world_frame"):
@@ -37,15 +47,14 @@ class Worlds:
 
 
 class WorldsPart(Part):
-    """The part ``worlds``: four attributes of a result, and as many fields of a document."""
+    """The part ``worlds``: five attributes of a result, and as many fields of a document."""
 
     def __init__(self) -> None:
         super().__init__("worlds", lambda: Worlds)
         self.without = {
             "T_world_world": None,
             "cov_world_world": None,
-            "parent_world_frame": "",
-            "child_world_frame": "",
+            **dict.fromkeys(_TEXTS, ""),
         }
 
     def attribute(self, value: Worlds, name: str) -> Any:
@@ -60,6 +69,8 @@ class WorldsPart(Part):
             "parent_world_frame": value.parent_world_frame,
             "child_world_frame": value.child_world_frame,
         }
+        if value.setup:
+            document["setup"] = value.setup
         if value.cov_world_world is not None:
             error = "error xi in T_world_world @ exp(xi)"
             document["cov_world_world"] = matrix_of(
@@ -69,18 +80,15 @@ class WorldsPart(Part):
 
     def read(self, document: Mapping[str, Any]) -> Worlds | None:
         """Return the part of a document; None if it has none."""
-        frames = [
-            from_plain(str, document.get(f"{stream}_world_frame", ""))
-            for stream in ("parent", "child")
-        ]
         T = document.get("T_world_world")
         covariance = document.get("cov_world_world")
-        if T is None and covariance is None and not any(frames):
+        texts = {name: from_plain(str, document.get(name, "")) for name in _TEXTS}
+        if T is None and covariance is None and not any(texts.values()):
             return None
         return Worlds(
-            None if T is None else transform_of(T),
-            None if covariance is None else covariance_of(covariance),
-            *frames,
+            T_world_world=None if T is None else transform_of(T),
+            cov_world_world=None if covariance is None else covariance_of(covariance),
+            **texts,
         )
 
     def invert(self, value: Worlds) -> Worlds:
@@ -106,3 +114,10 @@ class WorldsPart(Part):
             return {}
         frames = value.child_world_frame, value.parent_world_frame
         return {"T_world_world": ExtraTransform(T, *frames, covariance)}
+
+    def headline(self, value: Worlds) -> str:
+        """Return where the camera is, and the option for the other place; empty without an arm."""
+        if value.setup not in SETUPS:
+            return ""
+        other = "beside" if value.setup == "hand" else "hand"
+        return f"camera {SETUPS[value.setup]} (--setup {other} if it is {SETUPS[other]})"
