@@ -28,7 +28,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats import files
-from hand_eye_calib.formats.bags import storage
+from hand_eye_calib.formats.bags import folders
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.writer import write_bag, write_streams
 from hand_eye_calib.offline.cli.main import main
@@ -213,7 +213,7 @@ def test_mcap_files_without_parts_of_an_index_are_whole(tmp_path, options):
 def test_without_the_library_mcap_whole_files_are_read(tmp_path, monkeypatch):
     write_bag(tmp_path / "bag", STREAMS)
     whole = bag_making.all_poses(tmp_path / "bag")
-    monkeypatch.setattr(storage, "find_spec", lambda _: None)
+    monkeypatch.setattr(folders, "find_spec", lambda _: None)
     assert bag_making.all_poses(tmp_path / "bag") == whole
     file = bag_making.storage_file(tmp_path / "bag")
     os.truncate(file, file.stat().st_size // 2)

@@ -18,9 +18,9 @@ from hand_eye_calib.core.base.registry import BAG_READINGS
 from hand_eye_calib.core.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags import messages, roles, sources
+from hand_eye_calib.formats.bags.folders import losses_of, open_bags
 from hand_eye_calib.formats.bags.messages import PoseTable, Run
 from hand_eye_calib.formats.bags.sources import Reading, Source
-from hand_eye_calib.formats.bags.storage import losses_of, open_bags
 from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.transforms import TfSource, TfStream
 
@@ -58,7 +58,7 @@ class PoseBag:
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
-        self.files = [file for storage in self._storages for file in storage.files]
+        self.files = [file for storage in self._storages for file in storage.paths]
         types = defaultdict[str, set[str]](set)
         counts = Counter[str]()
         for kind, count in chain(*(storage.counts.items() for storage in self._storages)):
@@ -69,7 +69,7 @@ class PoseBag:
             for name in sorted(types)
         }
         for path in self.paths:
-            inside = [storage for storage in self._storages if path in storage.path.parents]
+            inside = [storage for storage in self._storages if path in storage.paths[0].parents]
             n_present = sum(sum(storage.counts.values()) for storage in inside)
             self._notes += losses_of(path, n_present)
         spans = [each.span_ns for each in self._storages if each.span_ns]
@@ -88,7 +88,7 @@ class PoseBag:
     @property
     def warnings(self) -> list[str]:
         """What could not be read, and poses that cannot be right; complete after reading."""
-        losses = [f"{each.path}: {loss}" for each in self._storages for loss in each.losses]
+        losses = [f"{each.paths[0]}: {loss}" for each in self._storages for loss in each.losses]
         return [*self._notes, *losses]
 
     @property

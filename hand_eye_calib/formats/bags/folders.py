@@ -1,0 +1,222 @@
+"""Find the storage files of a bag, unpack them and open them."""
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterable
+from contextlib import ExitStack, closing, suppress
+from importlib.util import find_spec
+from operator import attrgetter
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.text import listing, share
+from hand_eye_calib.formats import files
+from hand_eye_calib.formats.bags.storage import (
+    REPAIRS,
+    RosbagsFile,
+    Storage,
+    printable_name,
+    reason_of,
+    zstd_module,
+)
+from hand_eye_calib.formats.yaml_files import read_yaml
+
+_EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
+# SQLite stores the newest messages in these files beside a .db3 if the recorder was killed.
+_UNFINISHED = ("-wal", "-journal")
+_METADATA = "metadata.yaml"
+# A message names at most this many missing files.
+_MOST_NAMED = 5
+
+
+def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
+    """Open the storage files of bags; return them in the order of their start.
+
+    Files that are compressed as a whole are unpacked first.
+
+    Raises
+    ------
+    InputError
+        If a path is no bag, or a bag cannot be read.
+    """
+    storages = list[Storage]()
+    for file in [file for path in paths for file in _files_of(path)]:
+        unfinished = _unfinished(file)
+        readable = file
+        loss = ""
+        if file.suffix == ".zstd" or unfinished:
+            folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="hand_eye_calib_"))
+            readable = Path(folder, f"unpacked{_suffix(file)}")
+            if unfinished:
+                _complete(file, unfinished, readable)
+            else:
+                loss = _unpack(file, readable)
+        storage_type: type[Storage] = RosbagsFile
+        if readable.suffix == ".mcap" and find_spec("mcap"):
+            from hand_eye_calib.formats.bags.mcap_file import McapFile
+
+            storage_type = McapFile
+        storage = storage_type([file, *unfinished], readable, opened)
+        if loss:
+            storage.losses.insert(0, loss)
+        storages.append(storage)
+    return sorted(storages, key=attrgetter("span_ns"))
+
+
+def _unfinished(file: Path) -> list[Path]:
+    """Return the files of SQLite beside a .db3 without which messages would be missing."""
+    if file.suffix != ".db3":
+        return []
+    paths = [file.with_name(f"{file.name}{suffix}") for suffix in _UNFINISHED]
+    return [path for path in paths if path.is_file() and path.stat().st_size]
+
+
+def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
+    """Copy a database with its unfinished files, and let SQLite finish the copy.
+
+    The user's folder must not change, but SQLite writes into the folder of a database that it only
+    reads.
+    """
+    try:
+        shutil.copyfile(file, copy)
+        for path in unfinished:
+            shutil.copyfile(path, f"{copy}{path.name.removeprefix(file.name)}")
+        with closing(sqlite3.connect(copy)) as database:
+            database.execute("PRAGMA journal_mode=DELETE").fetchall()
+            database.execute("SELECT count(*) FROM sqlite_master").fetchall()
+    except (OSError, sqlite3.Error) as error:
+        raise InputError(
+            f"cannot read bag {file}: its recorder was stopped, and its newest messages are in "
+            f"{', '.join(path.name for path in unfinished)}, which cannot be added to a copy in "
+            f"{copy.parent.parent} ({reason_of(error)}); set TMPDIR to a folder with more space, "
+            f"or repair the bag with {REPAIRS['.db3']}"
+        ) from error
+
+
+def _unpack(file: Path, target: Path) -> str:
+    """Unpack a file that is compressed as a whole; return a line about damage, or an empty text.
+
+    Everything before the damage is unpacked.
+    """
+    zstd = zstd_module()
+    most_bytes = files.LARGEST_RATIO * file.stat().st_size
+    n_bytes = 0
+    with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
+        try:
+            while piece := packed.read(files.BLOCK_BYTES):
+                n_bytes += unpacked.write(piece)
+                if n_bytes > most_bytes:
+                    raise InputError(
+                        f"cannot read bag {file}: its content unpacks to more than "
+                        f"{files.LARGEST_RATIO} times its size, which is not believable"
+                    )
+        except (EOFError, zstd.ZstdError) as error:
+            return f"its compression is damaged ({reason_of(error)})"
+    return ""
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return the files of a bag that hold messages; a packed file only if it is not unpacked, too.
+
+    Raises
+    ------
+    InputError
+        If there are no such files.
+    """
+    if not path.is_dir():
+        if _suffix(path) and path.is_file():
+            return [path]
+        what = f"{path} is not a bag" if path.exists() else f"no bag at {path}"
+        raise InputError(f"{what}; expected {_EXPECTED}")
+    paths = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
+    if not paths:
+        raise InputError(_no_files(path))
+    return sorted(
+        file for file in paths if file.suffix != ".zstd" or file.with_suffix("") not in paths
+    )
+
+
+def _no_files(folder: Path) -> str:
+    """Explain why a folder without storage files cannot be read."""
+    missing = missing_files(folder).n_messages
+    if missing:
+        return (
+            f"no messages in {folder}: its {_METADATA} lists {_listing(missing)}, missing there; "
+            "copy the whole bag"
+        )
+    advice = "check the path"
+    for subfolder in sorted(file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]):
+        if any(map(_suffix, subfolder.iterdir())):
+            advice = f"give {subfolder}, or all below it with calibrate --batch {folder}"
+            break
+    return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
+
+
+class MissingFiles(NamedTuple):
+    """Files that the metadata of a bag lists and its folder lacks.
+
+    Attributes
+    ----------
+    n_messages : dict of str to int
+        Number of messages of each file by its name; of any type in damaged metadata, None if it is
+        not stated.
+    n_in_bag : int
+        Number of messages of the whole bag; likewise.
+    """
+
+    n_messages: dict[str, Any]
+    n_in_bag: Any
+
+
+def missing_files(folder: Path) -> MissingFiles:
+    """Compare the files that ``metadata.yaml`` lists with those in the folder of a bag."""
+    present = {file.name.removesuffix(".zstd") for file in folder.iterdir()}
+    missing = {}
+    n_in_bag = None
+    with suppress(InputError, AttributeError, TypeError, KeyError):  # no metadata, or damaged
+        metadata = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
+        counts = {file["path"]: file["message_count"] for file in metadata.get("files") or ()}
+        for path in map(str, metadata["relative_file_paths"]):
+            name = printable_name(PurePath(path).name)
+            if name.removesuffix(".zstd") not in present:
+                missing[name] = counts.get(path)
+        n_in_bag = metadata.get("message_count")
+    return MissingFiles(missing, n_in_bag)
+
+
+def _listing(names: Iterable[str]) -> str:
+    listed = [*names]
+    if len(listed) > _MOST_NAMED:
+        listed[_MOST_NAMED:] = [f"{len(listed) - _MOST_NAMED} more"]
+    return listing(listed)
+
+
+def losses_of(path: Path, n_present: int) -> list[str]:
+    """Return a line about the listed files that the folder of a bag lacks; empty if there are none.
+
+    The line states which share of all messages they hold. ``n_present`` is the number of messages
+    in the present files.
+    """
+    if not path.is_dir():
+        return []
+    missing, n_in_bag = missing_files(path)
+    if not missing:
+        return []
+    counts = [count for count in missing.values() if isinstance(count, int)]
+    n_missing = sum(counts)
+    if len(counts) < len(missing):
+        n_missing = max(n_in_bag - n_present, 0) if isinstance(n_in_bag, int) else 0
+    verb = "is" if len(missing) == 1 else "are"
+    line = f"{path}: {_METADATA} lists {_listing(missing)}, which {verb} missing"
+    if n_missing:
+        n_all = n_missing + n_present
+        line += f": {n_missing:,} of {n_all:,} messages ({share(n_missing / n_all)}) are not read"
+    return [f"{line}; copy the whole bag"]
+
+
+def _suffix(file: Path) -> str:
+    """Return .mcap, .db3 or .bag, also for a compressed file; empty for other files."""
+    suffix = PurePath(file.name.removesuffix(".zstd")).suffix
+    return suffix if suffix in REPAIRS else ""

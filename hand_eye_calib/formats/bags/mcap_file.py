@@ -1,0 +1,181 @@
+"""Read an mcap file through the library mcap."""
+
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, suppress
+from io import BufferedReader, BytesIO
+from operator import attrgetter, itemgetter
+from typing import Any
+
+from mcap import records, stream_reader
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from hand_eye_calib.formats import files
+from hand_eye_calib.formats.bags.storage import Message, MessageKind, Storage, kind_of, reason_of
+
+# Record of an mcap chunk: opcode (uint8) and length (uint64).
+_RECORD = struct.Struct("<BQ")
+# Message of an mcap chunk: channel (uint16), sequence number, log time (uint64), publish time.
+_MESSAGE = struct.Struct("<H4xQ8x")
+# Schema of channels that have none, such as some with JSON.
+_NO_SCHEMA = records.Schema(id=0, name="", encoding="", data=b"")
+
+
+class McapFile(Storage):
+    """An .mcap file, read by the library mcap.
+
+    An intact file is read by its index. Otherwise its records are read up to the first damaged
+    one, and the intact records of a chunk that is cut off.
+    """
+
+    def _open(self, opened: ExitStack) -> None:
+        self._stream = _WholeReads(opened.enter_context(self._file.open("rb", buffering=0)))
+        # Indexes of the chunks; empty if the file has no usable index.
+        self._chunks: list[Any] = []
+        try:
+            summary = self._checked_summary()
+        except MemoryError:
+            raise
+        except Exception as error:
+            self._scan(error)
+            return
+        statistics = summary.statistics
+        self._chunks = sorted(summary.chunk_indexes, key=attrgetter("message_start_time"))
+        for key, channel in summary.channels.items():
+            self._add_kind(channel, summary.schemas)
+            self.counts[self._kinds[key]] += statistics.channel_message_counts.get(key, 0)
+        if statistics.message_count:
+            self.span_ns = statistics.message_start_time, statistics.message_end_time
+
+    def _checked_summary(self) -> Any:
+        """Return the summary of the file; raise an error of any kind if it lacks a message."""
+
+        summary: Any = make_reader(self._stream).get_summary()
+        statistics = summary.statistics
+        is_complete = (
+            len(summary.channels) == statistics.channel_count
+            and len(summary.chunk_indexes) == statistics.chunk_count
+            and bool(summary.chunk_indexes) == bool(statistics.message_count)
+        )
+        if not is_complete:
+            raise ValueError("it has no index of its messages")
+        return summary
+
+    def _add_kind(self, channel: Any, schemas: Mapping[int, Any]) -> None:
+
+        schema = schemas.get(channel.schema_id, _NO_SCHEMA)
+        description = (schema.name, channel.message_encoding, schema.encoding, schema.data)
+        self._kinds[channel.id] = kind_of(channel.topic, *description)
+
+    def _scan(self, reason: Exception) -> None:
+        """Count the messages of a file without an index; ``reason`` is why there is none."""
+
+        schemas = {}
+        times_ns = []
+        for record in self._records(self.losses):
+            if isinstance(record, records.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, records.Channel):
+                self._add_kind(record, schemas)
+            elif isinstance(record, records.Message) and record.channel_id in self._kinds:
+                self.counts[self._kinds[record.channel_id]] += 1
+                times_ns.append(record.log_time)
+        if times_ns:
+            self.span_ns = min(times_ns), max(times_ns)
+            seconds = (self.span_ns[1] - self.span_ns[0]) * 1e-9
+            recovered = f"recovered are {len(times_ns)} messages covering {seconds:.1f} s"
+            self.losses = [f"{loss}; {recovered}" for loss in self.losses]
+        elif self.losses:
+            raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
+
+    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
+
+        if not self._chunks:
+            for record in self._records([]):  # `losses` has had its line since the file was opened
+                if isinstance(record, records.Message) and record.channel_id in kinds:
+                    yield kinds[record.channel_id], record.log_time, record.data
+        for index in self._chunks:
+            channels = index.message_index_offsets
+            if not channels or kinds.keys() & channels.keys():
+                messages = _messages_of_chunk(self._content(index.chunk_start_offset), kinds)
+                yield from sorted(messages, key=itemgetter(1))
+
+    def _content(self, start: int) -> bytes:
+        """Return the unpacked records of the chunk at a place in the file."""
+
+        self._stream.seek(start + _RECORD.size)
+        chunk = records.Chunk.read(ReadDataStream(self._stream))
+        stream, size = stream_reader.get_chunk_data_stream(chunk, validate_crc=True)
+        return bytes(stream.read(size))
+
+    def _records(self, losses: list[str]) -> Iterator[Any]:
+        """Iterate over all records up to damage; append a line about the damage to ``losses``."""
+
+        position = self._stream.seek(0)
+        try:
+            for record in StreamReader(self._stream, validate_crcs=True).records:
+                yield record
+                position = self._stream.tell()
+        except MemoryError:
+            raise
+        except Exception as error:
+            losses.append(f"it is cut off or damaged ({reason_of(error)}), the rest is lost")
+            if isinstance(error, EOFError):
+                with suppress(Exception):  # the cut ends the records of the chunk, too
+                    yield from self._records_of_cut_chunk(position)
+
+    def _records_of_cut_chunk(self, position: int) -> Iterator[Any]:
+        """Iterate over the records before the cut in the chunk at a position, if it is a chunk."""
+
+        with self._file.open("rb") as file:
+            file.seek(position)
+            if file.read(_RECORD.size)[0] != Opcode.CHUNK:
+                return
+            chunk = records.Chunk.read(ReadDataStream(file))
+            if chunk.compression == "zstd":
+                zstd = stream_reader.zstandard.ZstdDecompressor().decompressobj()
+                chunk.data = zstd.decompress(chunk.data)
+            elif chunk.compression == "lz4":
+                # Before mcap 1.6, `stream_reader.lz4` is the package instead of its module frame.
+                lz4 = getattr(stream_reader.lz4, "frame", stream_reader.lz4)
+                chunk.data = lz4.LZ4FrameDecompressor().decompress(chunk.data)
+            stream = _WholeReads(BytesIO(chunk.data))
+            yield from StreamReader(stream, skip_magic=True).records
+
+
+def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
+    """Iterate over the messages of some channels in the unpacked records of an mcap chunk.
+
+    The library's own iteration takes several times as long.
+    """
+
+    message_opcode = int(Opcode.MESSAGE)
+    end = 0
+    while end < len(content):
+        opcode, size = _RECORD.unpack_from(content, end)
+        start = end + _RECORD.size
+        end = start + size
+        if end > len(content):
+            raise EOFError("a chunk ends in the middle of a record")
+        if opcode == message_opcode:
+            channel, bag_ns = _MESSAGE.unpack_from(content, start)
+            if channel in kinds:
+                yield kinds[channel], bag_ns, content[start + _MESSAGE.size : end]
+
+
+class _WholeReads(BufferedReader):
+    """A file whose read never returns fewer bytes than requested.
+
+    The library mcap would take fewer bytes for a whole record.
+    """
+
+    def read(self, size: int | None = -1) -> bytes:
+        wanted = size or 0
+        # Before 1.6, the library mcap allocates any length that a damaged file states.
+        data = super().read(size) if wanted < files.LARGEST else b""
+        if len(data) < wanted:
+            raise EOFError("it ends in the middle of a record")
+        return data
