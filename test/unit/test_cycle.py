@@ -109,10 +109,10 @@ def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypat
     told = []
     start_s = module.time.monotonic()
     cycle.ask(lambda *answer: told.append(answer))
-    cycle.tell_who_waits()
+    cycle.answer_overdue()
     assert not told
     monkeypatch.setattr(module.time, "monotonic", lambda: start_s + 30.0)
-    cycle.tell_who_waits()
+    cycle.answer_overdue()
     assert told == [(False, told[0][1])]
     assert told[0][1].startswith("still solving after 20 s")
     cycle._process.answers = lambda: [Answer(0, 0.1, seen(40.0), result())]

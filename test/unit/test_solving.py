@@ -104,7 +104,7 @@ def test_gives_the_same_bits_as_here_job_after_job_whatever_libraries_print(star
             values = [getattr(each.calibration, name) for each in (there, here)]
             np.testing.assert_array_equal(*values, err_msg=f"{name} with {options}")
         assert there.check.findings == here.check.findings
-        assert there.seen.n_poses == here.seen.n_poses == 250
+        assert there.motion.n_poses == here.motion.n_poses == 250
         assert (there.time_offset is None) == ("time_offset" not in options)
         if there.time_offset is not None:
             assert there.time_offset.seconds == work.snapshot().resolved.time_offset.seconds

@@ -3,10 +3,12 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.core.assessment.excitation import what_is_missing
+from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
@@ -37,7 +39,7 @@ from hand_eye_calib.online.live.state import (
 from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks
 
 # Callback with the success of a solve and a line of text about it.
-OnSolved = Callable[[bool, str], None]
+OnSolved: TypeAlias = Callable[[bool, str], None]
 
 # Least time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
@@ -101,18 +103,15 @@ class SolveCycle:
     def restart(self) -> None:
         """Begin a new session without a result."""
         self.result: Calibration | None = None
-        self._result_state: ResultState | None = None
         # Copy of the calibrator that gave the result, and options that its checks set.
         self._solved: tuple[Calibrator, Options] | None = None
         self._solved_at_s = 0.0
         # Motion of the session so far.
-        self._seen = NO_MOTION
+        self._motion = NO_MOTION
         # Failure of the newest solve.
         self._failure: Failure | None = None
-        # Last failure if every solve since the result has failed, and the time of the first
-        # failure (steady time, s).
-        self._failing: Failure | None = None
-        self._failing_since_s = 0.0
+        # Time of the first failure (steady time, s) if every solve since the result has failed.
+        self._failing_since_s: float | None = None
         # Sentences of the reasons that were logged as warnings, by their rules.
         self._warned: dict[str, str] = {}
         # Options that checks of this session set, and the warnings about them.
@@ -137,17 +136,15 @@ class SolveCycle:
         self.checks.follow(config)
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
-        given_before = before.given.difference(_TARGETS)
-        given_now = config.given.difference(_TARGETS)
-        has_other_options = replace(before, **targets) != config or given_before != given_now
-        if result is None or has_other_options:
+        has_only_targets = replace(before, **targets) == config and before.given.difference(
+            _TARGETS
+        ) == config.given.difference(_TARGETS)
+        if result is None or not has_only_targets:
             self.goal.follow(config.targets)
             return
         targets["target_axes"] = parse_targets("target.axes", config.target_axes)
-        result = replace(result, **targets)
-        self.goal.retarget(result, config.targets)
-        self.result = result
-        self._result_state = _state_of(result)
+        self.result = replace(result, **targets)
+        self.goal.retarget(self.result, config.targets)
 
     @property
     def published(self) -> Calibration | None:
@@ -161,24 +158,26 @@ class SolveCycle:
             return Standing.NONE
         if is_refuted(self.result):
             return Standing.REFUTED
-        return Standing.CURRENT if self._failing is None else Standing.OUTDATED
+        return Standing.CURRENT if self._failing_since_s is None else Standing.OUTDATED
 
     @property
     def problem(self) -> str:
         """Reason why the result is refuted or outdated, in one line; empty otherwise."""
         result = self.result
-        failing = self._failing
-        if result is not None and is_refuted(result):
+        failure = self._failure
+        if result is None:
+            return ""
+        if is_refuted(result):
             reason = result.reasons[0]
             remedy = ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
             return f"{reason.sentence}; {reason.what_to_do}{remedy}"
-        if result is None or failing is None:
+        if failure is None or self._failing_since_s is None:
             return ""
         now_s = time.monotonic()
         failing_s = duration(now_s - self._failing_since_s)
         age_s = duration(now_s - self._solved_at_s)
         return (
-            f"every solve has failed for {failing_s}: {failing.what.rstrip('.')}; the result shown "
+            f"every solve has failed for {failing_s}: {failure.what.rstrip('.')}; the result shown "
             f"is {age_s} old, of {result.n_poses} poses"
         )
 
@@ -203,8 +202,8 @@ class SolveCycle:
         if not self.is_solving:
             self._start()
 
-    def tell_who_waits(self) -> None:
-        """Answer callers that have waited too long: the solve goes on. To be called often."""
+    def answer_overdue(self) -> None:
+        """Answer callers that have waited too long; the solve continues. To be called often."""
         long_ago_s = time.monotonic() - ANSWER_WITHIN_S
         for on_solved, since_s in list(self._asked.items()):
             if since_s >= long_ago_s:
@@ -216,7 +215,8 @@ class SolveCycle:
     def start_if_due(self) -> None:
         """Start a solve or a check if there are new poses and the pause after the last is over."""
         now_s = time.monotonic()
-        has_work = self._session.has_new_poses or self._must_check(now_s)
+        must_check = self._is_unchecked and now_s >= self._check_due_s
+        has_work = self._session.has_new_poses or must_check
         if has_work and not self.is_solving and now_s >= self._rest_until_s:
             self._start()
 
@@ -239,10 +239,6 @@ class SolveCycle:
         for answer in self._process.answers():
             self.conclude(answer)
 
-    def _must_check(self, now_s: float) -> bool:
-        """Whether a stream check is due."""
-        return self._is_unchecked and now_s >= self._check_due_s
-
     def _start(self) -> None:
         """Submit a job to the solving process."""
         now_s = time.monotonic()
@@ -250,7 +246,8 @@ class SolveCycle:
         self._is_unchecked |= self._session.has_new_poses
         self._in_flight = tuple(self._asked)
         # A requested result needs up-to-date findings, even if no check is due.
-        if check := self._must_check(now_s) or (self._is_unchecked and bool(self._in_flight)):
+        check = self._is_unchecked and (now_s >= self._check_due_s or bool(self._in_flight))
+        if check:
             self._is_unchecked = False
             self._check_due_s = now_s + _CHECK_PERIOD_S
         self._submitted = self._session.copy_to_solve()
@@ -265,9 +262,8 @@ class SolveCycle:
         # Pause as long as the solve took, so that half of the processor time stays free.
         self._rest_until_s = time.monotonic() + answer.seconds
         # Keep the largest rotation so far: the measured rotation can decrease with more poses.
-        rotation = np.maximum(self._seen.rotation, answer.seen.rotation)
-        self._seen = replace(answer.seen, rotation=rotation)
-        self._failure = answer.failure
+        rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
+        self._motion = replace(answer.motion, rotation=rotation)
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
             self._certain = {**self._certain, **answer.options}
@@ -276,12 +272,12 @@ class SolveCycle:
             self.checks.take(answer.check)
         elif answer.is_checked:
             self._check_due_s = 0.0
+        self._failure = answer.failure
         if answer.failure is not None:
             text = self._report(answer.failure)
             if answer.calibration is None:
-                missing = what_is_missing(self._seen) if self._seen.n_poses else ""
-                self.goal.wait(missing or answer.failure.what)
-                self._keep_result(answer.failure)
+                missing = what_is_missing(self._motion) if self._motion.n_poses else ""
+                self._keep_result(missing or answer.failure.what)
                 return False, text
         assert answer.calibration is not None
         warnings = tuple(dict.fromkeys((*self._option_warnings, *answer.calibration.warnings)))
@@ -292,38 +288,39 @@ class SolveCycle:
             return self._refute(newest)
         if newest.status.failure:
             self._failure = Failure(newest.status.failure)
-            self.goal.wait(f"No usable result: {newest.status.failure}.")
-            self._keep_result(self._failure)
-            return False, self._say(newest)
+            self._keep_result(f"No usable result: {newest.status.failure}.")
+            return False, self._describe(newest)
         return self._take(self._complete(newest))
 
-    def _keep_result(self, failure: Failure) -> None:
-        """Keep the result after a failed solve, and mark it as outdated."""
-        if self._failing is None:
+    def _keep_result(self, advice: str) -> None:
+        """Keep the result after a failed solve, and mark it as outdated.
+
+        The advice becomes the progress of a session without a result.
+        """
+        self.goal.wait(advice)
+        if self._failing_since_s is None:
             self._failing_since_s = time.monotonic()
-        self._failing = failure
 
     def _refute(self, newest: Calibration) -> tuple[bool, str]:
         """Replace the result by a calibration whose prior the motion contradicts.
 
         The earlier result is neither published nor saved any more.
         """
-        self.goal.add(newest, self._seen, self.checks.faults())
+        self.goal.add(newest, self._motion, self.checks.faults())
         self._solved = self._submitted, self._certain
         self._set_result(newest)
-        return False, self._say(newest)
+        return False, self._describe(newest)
 
     def _set_result(self, result: Calibration) -> None:
         """Store the result of the session as current."""
         self.result = result
-        self._result_state = _state_of(result)
         self._solved_at_s = time.monotonic()
-        self._failing = None
+        self._failing_since_s = None
 
     def _take(self, newest: Calibration) -> tuple[bool, str]:
         """Make a usable calibration the session's result, unless the goal keeps a better one."""
         was_done = self.goal.progress.done
-        progress = self.goal.add(newest, self._seen, self.checks.faults())
+        progress = self.goal.add(newest, self._motion, self.checks.faults())
         result = self.goal.best or newest
         if result is newest:
             self._solved = self._submitted, self._certain
@@ -332,35 +329,36 @@ class SolveCycle:
             kept = f"{kept}: {describe(newest)}"
             self._log.info(kept, ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, kept))
-            result = _with_halves_of(newest, result)
-        self._set_result(self._with_findings(result))
+            result = _with_newest_halves(result, newest)
+        result = self._with_findings(result)
+        self._set_result(result)
         if not progress.is_faulty and progress.sentence:
             write = self._log.warning if progress.will_not_get_there else self._log.info
             write(progress.sentence, GOES_ON_S, key=f"now {progress.done}")
         every_s = GOES_ON_S if progress.done == was_done else 0.0
-        is_good = result.status is SolveStatus.OK
-        return is_good, self._say(self._with_findings(result), every_s)
+        return result.status is SolveStatus.OK, self._describe(result, every_s)
 
-    def _say(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
+    def _describe(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
         """Return a line about a calibration with its reasons and warnings, and log new ones.
 
         Reasons are logged only if more motion would not help; before, the progress names what to
         do.
         """
-        text = describe(calibration)
+        texts = [describe(calibration)]
         progress = self.goal.progress
-        self._log.info(text, every_s, key="result")
+        self._log.info(texts[0], every_s, key="result")
         is_final = progress.done or progress.will_not_get_there or calibration.status.failure
-        reasons = []
         for reason in calibration.reasons:
-            reasons.append(f"{reason.sentence}; {reason.what_to_do}")
-            if is_final and not reason.is_finding:  # findings are in the log already
-                self._log.warning(f"{reason.verdict.value}: {reasons[-1]}")
+            text = f"{reason.sentence}; {reason.what_to_do}"
+            texts.append(text)
+            # Findings are in the log already.
+            if is_final and not reason.is_finding:
+                self._log.warning(f"{reason.verdict.value}: {text}")
                 self._warned[reason.rule] = reason.sentence
         rules = {reason.rule for reason in calibration.reasons}
         for rule in self._warned.keys() - rules:
             self._log.info(f"no longer found: {self._warned.pop(rule)}")
-        return "; ".join((text, *reasons, *calibration.warnings))
+        return "; ".join((*texts, *calibration.warnings))
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
         """Return the calibration with the findings of the stream checks.
@@ -406,32 +404,36 @@ class SolveCycle:
         tf_static : tuple of Broadcast and str
             Whether the result is broadcast on /tf_static, and the reason.
         """
-        seen = self._seen
-        state = self._result_state
-        level, text = self._judged(accepts_poses, tf_static)
-        contradictions = self.result.contradictions if self.result is not None else {}
+        motion = self._motion
+        level, text = self._condition(accepts_poses, tf_static)
+        result = None
+        if self.result is not None:
+            result = _state_of(self.result, time.monotonic() - self._solved_at_s)
         return ExtrinsicState(
             level=level,
             text=text,
             is_solving=self.is_solving,
-            n_poses=seen.n_poses,
-            path_m=seen.distance,
-            motion_s=seen.motion_s,
-            has_vehicle_axes=seen.has_vehicle_axes,
-            rotation_deg=dict(zip("xyz", plain(np.degrees(seen.rotation)), strict=True)),
+            n_poses=motion.n_poses,
+            path_m=motion.distance,
+            motion_s=motion.motion_s,
+            has_vehicle_axes=motion.has_vehicle_axes,
+            rotation_deg=dict(zip("xyz", plain(np.degrees(motion.rotation)), strict=True)),
             tf_static=tf_static[0],
             tf_static_reason=tf_static[1],
             standing=self.standing,
             problem=self.problem,
             priors=priors_of(self._session.calibrator.config),
-            contradicted=tuple(contradictions),
-            result=state and replace(state, age_s=time.monotonic() - self._solved_at_s),
+            contradicted=tuple(self.result.contradictions) if self.result else (),
+            result=result,
         )
 
-    def _judged(self, accepts_poses: bool, tf_static: tuple[Broadcast, str]) -> tuple[Level, str]:
+    def _condition(
+        self, accepts_poses: bool, tf_static: tuple[Broadcast, str]
+    ) -> tuple[Level, str]:
         """Return level and text of the gravest condition that applies."""
         result = self.result
         failure = self._failure
+        broadcast, why_refused = tf_static
         if failure is not None and failure.details:
             return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
         if result is not None and self.problem:
@@ -440,14 +442,19 @@ class SolveCycle:
         if not accepts_poses:
             return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
         if result is None:
-            texts = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
-            texts += [failure.what] if failure else []
-            return Level.WARN, "; ".join(texts) or "no result yet"
-        if tf_static[0] is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
-            return Level.WARN, f"publish_tf is refused: {tf_static[1]}"
+            return Level.WARN, self._why_no_result()
+        if broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
+            return Level.WARN, f"publish_tf is refused: {why_refused}"
         if failure is not None:
             return Level.WARN, failure.what
         return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
+
+    def _why_no_result(self) -> str:
+        """Return the gravest finding and the failure of the newest solve."""
+        texts = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
+        if self._failure is not None:
+            texts.append(self._failure.what)
+        return "; ".join(texts) or "no result yet"
 
     def progress_state(
         self, why_not_compared: str, pause: tuple[Level, str] = (Level.OK, "")
@@ -465,19 +472,23 @@ class SolveCycle:
             Severity and reason if no poses arrive; see :func:`pause_of`.
         """
         progress = self.goal.progress
-        result = self.result
-        is_well = self.standing is Standing.CURRENT and not progress.is_faulty
-        may_go_on = is_well and not progress.will_not_get_there
-        comparison = result.comparison if result is not None else None
+        comparison = self.result.comparison if self.result is not None else None
         if comparison is None and why_not_compared:
             comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
-        is_paused = bool(pause[1]) and not progress.done
-        level = Level.OK if may_go_on else Level.WARN
+        needs_change = progress.is_faulty or progress.will_not_get_there
+        is_well = self.standing is Standing.CURRENT and not needs_change
+        level = Level.OK if is_well else Level.WARN
+        pause_level, why_paused = pause
+        is_paused = bool(why_paused) and not progress.done
+        if is_paused:
+            level = max(level, pause_level)
         text = progress.sentence
-        if not progress.is_faulty:
-            text = self.problem or (pause[1] if is_paused else text)
+        if self.problem and not progress.is_faulty:
+            text = self.problem
+        elif is_paused and not progress.is_faulty:
+            text = why_paused
         return ProgressState(
-            level=max(level, pause[0]) if is_paused else level,
+            level=level,
             text=text,
             is_paused=is_paused,
             progress=progress,
@@ -492,16 +503,16 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Lev
     paused = {name: state for name, state in inputs.items() if state.is_paused}
     if not paused:
         return Level.OK, ""
-    level = max(state.level for state in paused.values())
-    longest_s = max(state.silent_s or 0.0 for state in paused.values())
+    level = Level.WARN
+    if len(paused) == len(inputs):
+        level = max(state.level for state in paused.values())
+    remedy = "go on driving, or save" if level is Level.OK else "start its source again"
     streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
-    if len(paused) < len(inputs):
-        level = Level.WARN
-    remedy = "start its source again" if level > Level.OK else "go on driving, or save"
+    longest_s = max(state.silent_s or 0.0 for state in paused.values())
     return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
 
 
-def _with_halves_of(newest: Calibration, kept: Calibration) -> Calibration:
+def _with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
     """Return the kept result with the newest comparison of both halves of the recording."""
     if newest.cross_check is None or kept.cross_check is None:
         return kept
@@ -524,8 +535,8 @@ def priors_of(config: CalibratorConfig) -> dict[str, str]:
     return {axis: text for axis, text in priors.items() if text}
 
 
-def _state_of(result: Calibration) -> ResultState:
-    """Return the diagnostics of a result; its age is filled in later."""
+def _state_of(result: Calibration, age_s: float) -> ResultState:
+    """Return the diagnostics of a result of an age (s)."""
     pose = se3.xyz_rpy(result.T_parent_child)
     sigmas = result.sigmas_printed
     return ResultState(
@@ -540,7 +551,7 @@ def _state_of(result: Calibration) -> ResultState:
         n_poses=result.n_poses,
         time_offset_s=result.time_offset_s,
         scale=result.scale,
-        age_s=0.0,
+        age_s=age_s,
     )
 
 
@@ -548,10 +559,10 @@ def describe(calibration: Calibration) -> str:
     """Return a log line with verdict, pose, standard deviations and amount of data."""
     pose = se3.xyz_rpy(calibration.T_parent_child)
     sigmas = calibration.sigmas_printed
-    xyz = ", ".join(f"{value:.4f}" for value in pose[:3])
-    rpy = ", ".join(f"{value:.3f}" for value in np.degrees(pose[3:]))
-    mm = ", ".join(f"{value:.1f}" for value in 1000 * sigmas[:3]).replace("inf", "unknown")
-    deg = ", ".join(f"{value:.3f}" for value in np.degrees(sigmas[3:])).replace("inf", "unknown")
+    xyz = _listed(pose[:3], 4)
+    rpy = _listed(np.degrees(pose[3:]), 3)
+    mm = _listed(1000 * sigmas[:3], 1)
+    deg = _listed(np.degrees(sigmas[3:]), 3)
     return (
         f"{calibration.headline.rstrip('.')}. "
         f"{calibration.child_frame} in {calibration.parent_frame}: "
@@ -560,3 +571,9 @@ def describe(calibration: Calibration) -> str:
         f": {calibration.n_poses} poses, {calibration.n_pairs} pairs, "
         f"{calibration.n_inliers} inliers"
     )
+
+
+def _listed(values: FloatArray, decimals: int) -> str:
+    """Return numbers with commas; infinity is "unknown"."""
+    texts = [f"{value:.{decimals}f}" for value in values]
+    return ", ".join(texts).replace("inf", "unknown")

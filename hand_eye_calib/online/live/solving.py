@@ -88,7 +88,7 @@ class Answer:
 
     session: int
     seconds: float
-    seen: Excitation = NO_MOTION
+    motion: Excitation = NO_MOTION
     calibration: Calibration | None = None
     time_offset: TimeOffset | None = None
     failure: Failure | None = None
@@ -109,7 +109,7 @@ def answer(job: Job) -> Answer:
         as_sent = with_options(as_came, job.options)
         snapshot = as_sent.resolved
         done = replace(done, time_offset=snapshot.time_offset)
-        done = replace(done, seen=excitation(snapshot.pose_pairs))
+        done = replace(done, motion=excitation(snapshot.pose_pairs))
         done = replace(done, calibration=snapshot.estimate())
     except Exception as error:  # the node reports it
         done = replace(done, failure=_failure(error))

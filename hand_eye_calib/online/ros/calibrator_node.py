@@ -202,7 +202,7 @@ class CalibratorNode(Node):
             self.take_messages()  # which a slow computer has kept waiting
         clock_ns = self.get_clock().now().nanoseconds
         self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
-        self._cycle.tell_who_waits()
+        self._cycle.answer_overdue()
 
     def _why_not_broadcast(self) -> str:
         result = self._cycle.result
