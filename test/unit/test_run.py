@@ -14,7 +14,7 @@ from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.streams import check_lengths
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.run import review, run
-from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Verdict
@@ -171,6 +171,34 @@ def test_good_streams_are_left_alone(streams):
     assert found.snapshot is snapshot
     assert (found.calibration.warnings, found.options) == (plain.warnings, {})
     assert found.calibration.findings == ()
+
+
+@pytest.mark.parametrize(
+    ("is_inverse", "offset_s", "factor", "n_expected"),
+    [
+        (False, 0.0, 1.0, 1),
+        (False, 0.3, 1.0, 1),
+        (False, 0.0, 1000.0, 2),
+        (False, 0.3, 1000.0, 2),
+        (True, 0.3, 1.0, 3),
+    ],
+)
+def test_number_of_solves(streams, monkeypatch, is_inverse, offset_s, factor, n_expected):
+    """The look at the clocks solves only what may be the result."""
+    parent, child, _ = streams
+    if is_inverse:
+        child = written_otherwise(child, REPAIRS[0])
+    child = child.shifted(offset_s).scaled(factor)
+    solved = []
+    estimate = Snapshot.estimate
+
+    def counted_estimate(snapshot, cross_check=None):
+        solved.append(snapshot)
+        return estimate(snapshot, cross_check)
+
+    monkeypatch.setattr(Snapshot, "estimate", counted_estimate)
+    hec.calibrate(parent, child)
+    assert len(solved) == n_expected
 
 
 @pytest.mark.parametrize("checks", [None, True, False])

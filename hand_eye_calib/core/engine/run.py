@@ -23,6 +23,7 @@ from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.checks.hypotheses import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_options
 from hand_eye_calib.core.engine.kinds import kind_of
@@ -44,6 +45,10 @@ _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 
 # Findings whose options are estimated, so that their uncertainty counts.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
+
+# Share of the motion that the fit of streams without wrong conventions leaves unexplained at most,
+# with margin: the checks accept 0.12.
+_MOST_UNEXPLAINED = HOLDS
 
 # A clock rate counts as known if its spread is below this share of the largest time offset.
 _CLEAR_SPREAD = 0.5
@@ -160,6 +165,10 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     # Motions over one time suffice for a first look.
     look = refine_time_offset(*snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S)
     if look.fit is None or abs(look.seconds) - 3.0 * look.sigma_s < MOST_MOVED_S:
+        return None
+    # Streams with wrong conventions or units are solved as given first: the message of a repair
+    # needs that verdict.
+    if look.fit.has_own_unit or look.fit.unexplained > _MOST_UNEXPLAINED:
         return None
     offset = refine_time_offset(*snapshot.streams, look, snapshot.max_gap_s)
     other = replace(snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset)
