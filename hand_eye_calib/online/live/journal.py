@@ -1,5 +1,6 @@
-"""The journal of the live session, written by a thread of its own: a slow or full disk never holds
-up a message.
+"""The journal of the live session.
+
+A thread of its own writes it, so that a slow or full disk never delays a message.
 """
 
 import fcntl
@@ -9,29 +10,35 @@ import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.formats import journal
 from hand_eye_calib.online.live.log import NodeLog
 
-# How often what came in is handed to the disk: what a crash can cost.
+# Period (s) at which poses are written to the disk: a crash loses no more.
 FLUSH_PERIOD_S = 0.25
 
-# Batches that may wait for a disk that does not answer: a minute.
-_MOST_WAITING = 240
+# Batches of poses that wait at most for a disk that does not answer: one minute.
+_MAX_WAITING = 240
 
-# Stream, stamp (ns), position and quaternion.
-_Pose = tuple[str, int, Sequence[float], Sequence[float]]
+# Stream, stamp (ns), position (m) and quaternion (x, y, z, w).
+_Pose: TypeAlias = tuple[str, int, Sequence[float], Sequence[float]]
 
 
 def lock_directory(directory: Path) -> int | None:
-    """Keep a directory, made if need be, for this process, until the descriptor is closed or the
-    process ends. None if it cannot be written: the journal will say so.
+    """Make a directory and lock it for this process.
+
+    Returns
+    -------
+    int or None
+        Descriptor that has the lock until it is closed, or until the process ends. None if the
+        directory cannot be made: the journal reports that.
 
     Raises
     ------
     ConfigError
-        If another node has it.
+        If another node has locked the directory.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -47,28 +54,36 @@ def lock_directory(directory: Path) -> int | None:
             "choose another directory"
         ) from None
     except OSError:
-        pass  # a disk that takes no lock
+        # Some disks have no locks.
+        pass
     return descriptor
 
 
 class SessionJournal:
-    """Takes poses in the executor's thread, writes them in its own, which writes to the log too.
-    What cannot be written ends the journal until the next session; ``error`` says why. Poses that
-    the engine has taken are appended to ``poses``.
+    """Journal that receives poses in the thread of the executor and writes them in its own thread.
+
+    The first failure to write ends the journal until the next session.
 
     Parameters
     ----------
     directory : path
     about : callable
-        Gives what is known of each stream: options, topic, frame, origin.
+        Returns options, topic, frame and origin of each stream.
     log : NodeLog
     resumed : Journal, optional
-        The session in the directory goes on; otherwise it is kept aside.
+        The session in the directory, if it is continued. Otherwise a session there is kept aside.
+
+    Attributes
+    ----------
+    poses : list
+        Poses to write, to be appended by the caller.
+    error : str
+        Reason why the journal cannot be written; empty otherwise.
 
     Raises
     ------
     ConfigError
-        If another node has the directory above.
+        If another node uses the directory above.
     """
 
     def __init__(
@@ -85,30 +100,30 @@ class SessionJournal:
         self._about = about
         self.poses: list[_Pose] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
-        # In the thread; None while it cannot be written.
+        # Used by the thread only; None while the journal cannot be written.
         self._writer: journal.JournalWriter | None = None
         self._jobs.put(partial(self._open, about(), resumed))
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
     def flush(self) -> None:
-        """Hand what is new to the thread; to be called often."""
+        """Pass new poses on to the thread; to be called often."""
         poses = self.poses
         self.poses = []
-        if self._jobs.qsize() > _MOST_WAITING and not self.error:
+        if self._jobs.qsize() > _MAX_WAITING and not self.error:
             self._give_up("the disk does not answer")
         elif not self.error:
             self._jobs.put(partial(self._write, poses, self._about()))
 
     def begin(self) -> None:
-        """Start a new session without poses; the one so far is kept aside."""
+        """Start a new session without poses, and keep the present one aside."""
         self.flush()
         self.error = ""
         self._jobs.put(self._close)
         self._jobs.put(partial(self._open, self._about()))
 
     def stop(self, timeout_s: float) -> None:
-        """Write what is left and end the thread, unless the disk keeps it busy."""
+        """Write the last poses and end the thread, but wait no longer than ``timeout_s``."""
         self.flush()
         self._jobs.put(self._close)
         self._jobs.put(None)
@@ -117,7 +132,7 @@ class SessionJournal:
             os.close(self._lock)
 
     def _give_up(self, reason: str) -> None:
-        """Leave the files as they are."""
+        """Write no more, and leave the files as they are."""
         self.error = reason
         self._log.warning(
             f"cannot write the session journal in {self.directory}: {reason}; going on without it "
@@ -127,21 +142,23 @@ class SessionJournal:
     # ------------------------------------------------------------ in the thread
 
     def _run(self) -> None:
-        while (work := self._jobs.get()) is not None:
+        while (job := self._jobs.get()) is not None:
             try:
-                work()
-            except Exception as error:  # a defect, too: the node must say so and go on
+                job()
+            # The node reports defects, too, and continues without a journal.
+            except Exception as error:
                 self._writer = None
-                what = str(error) if isinstance(error, OSError) else repr(error)
-                self._give_up(getattr(error, "strerror", None) or what)
+                reason = str(error) if isinstance(error, OSError) else repr(error)
+                self._give_up(getattr(error, "strerror", None) or reason)
 
     def _open(self, about: journal.About, resumed: journal.Journal | None = None) -> None:
         if resumed is None and journal.is_used(self.directory):
-            poses = journal.count_poses(self.directory)
-            if poses != 0:  # not the empty one of a node that was started in vain
-                what = "" if poses is None else f" ({poses} poses)"
+            n_poses = journal.count_poses(self.directory)
+            # An empty journal is that of a node that received nothing: overwrite it.
+            if n_poses != 0:
+                count = "" if n_poses is None else f" ({n_poses} poses)"
                 aside = journal.keep_aside(self.directory)
-                self._log.info(f"the session before this one{what} is kept in {aside}")
+                self._log.info(f"the session before this one{count} is kept in {aside}")
         self._writer = journal.JournalWriter(self.directory, about, resumed=resumed)
 
     def _write(self, poses: list[_Pose], about: journal.About) -> None:

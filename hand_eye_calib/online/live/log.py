@@ -1,4 +1,4 @@
-"""The node's log: what differs in its numbers only is not written again and again."""
+"""The log of the node: lines that differ only in their numbers are written once."""
 
 import re
 import time
@@ -6,19 +6,20 @@ from typing import Any
 
 from hand_eye_calib.core.base.errors import printable
 
-# A warning or an error is written once for each reason: in a session, and in so many seconds.
+# Time (s) within which a warning or an error is not written again, unless a new session begins.
 ONCE_S = 1800.0
 
-# What goes on, such as a result that becomes better, is written so often (s).
+# Time (s) within which news of a process that goes on, such as a better result, is not repeated.
 GOES_ON_S = 60.0
 
 _NUMBERS = re.compile(r"[\d.,+-]+")
 
 
 class NodeLog:
-    """Writes to a ROS logger, whose own throttle cannot tell two topics apart. The methods take a
-    text, and how often it may be written: texts that differ in their numbers only are the same, and
-    so are all with the same ``key``.
+    """Log with a throttle by text; the throttle of a ROS logger does not distinguish two topics.
+
+    The methods take a text and the time (s) within which it is not written again. Texts that differ
+    only in their numbers are the same, and so are all texts with the same ``key``.
     """
 
     def __init__(self, logger: Any) -> None:
@@ -26,26 +27,26 @@ class NodeLog:
         self._written_at_s: dict[str, float] = {}
 
     def restart(self) -> None:
-        """Begin a new session, in which everything may be said again."""
+        """Begin a new session, in which every text may be written again."""
         self._written_at_s.clear()
 
-    # rclpy ties a place in the code to its severity: each method writes by itself.
+    # rclpy ties a line of code to one severity, so every method calls the logger itself.
     def debug(self, text: str) -> None:
-        """Write what somebody looks for who has asked for it."""
+        """Write a detail for whoever looks for a fault."""
         self._logger.debug(_escaped(text))
 
     def info(self, text: str, every_s: float = 0.0, key: str = "") -> None:
-        """Write what a person may want to know."""
+        """Write news that require no action."""
         if self._is_due(f"info {key or text}", every_s):
             self._logger.info(_escaped(text))
 
     def warning(self, text: str, every_s: float = ONCE_S, key: str = "") -> None:
-        """Write what a person should look at."""
+        """Write a fault that a person should look at."""
         if self._is_due(f"warning {key or text}", every_s):
             self._logger.warning(_escaped(text))
 
     def error(self, text: str) -> None:
-        """Write what went wrong, once."""
+        """Write a failure."""
         if self._is_due(f"error {text}", ONCE_S):
             self._logger.error(_escaped(text))
 
@@ -53,11 +54,12 @@ class NodeLog:
         key = _NUMBERS.sub("", text)
         now_s = time.monotonic()
         is_due = now_s - self._written_at_s.get(key, -float("inf")) >= every_s
+        # The number of lines in memory is bounded.
         if is_due and len(self._written_at_s) < 10_000:
             self._written_at_s[key] = now_s
         return is_due
 
 
 def _escaped(text: str) -> str:
-    """Text of one or more lines without other control characters."""
+    """Return a text whose only control characters are line ends."""
     return "\n".join(map(printable, text.split("\n")))

@@ -1,4 +1,4 @@
-"""The process that writes the pages of a session beside the node."""
+"""The process beside the node that writes the pages of a session."""
 
 import os
 import pickle
@@ -9,7 +9,7 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError, printable
 from hand_eye_calib.core.base.registry import SESSION_PAGES
 from hand_eye_calib.core.engine.session_result import SessionResult
 
-# Priority of the process that solves. With 15 it took half a minute beside busy programs.
+# Priority of the process. With 15 the pages took half a minute beside busy programs.
 _NICENESS = 3
 
 

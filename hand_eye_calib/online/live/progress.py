@@ -1,4 +1,4 @@
-"""How far a session is from its goal, as a part of its result."""
+"""Progress of a session towards its goal, as a part of its result."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,8 +6,17 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, kw_only=True)
 class AxisProgress:
-    """One axis against its target, m or rad, and the seconds of motion like that so far until it is
-    known: infinite if it is unobservable.
+    """Progress of one axis towards its target.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation (m or rad).
+    target : float
+        Standard deviation that is wanted (m or rad).
+    seconds_left : float
+        Time of similar motion until the target is reached (s); infinite if the motion does not
+        observe the axis.
     """
 
     sigma: float
@@ -17,19 +26,20 @@ class AxisProgress:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a session is from its goal.
+    """Progress of a session towards its goal.
 
     Attributes
     ----------
     sentence : str
-        What to do now, for a person next to the robot.
+        Next step of the person who moves the robot.
     done : bool
+        Whether the goal is reached.
     is_faulty : bool
-        The streams cannot be calibrated with.
+        Whether the streams have faults that make a calibration impossible.
     limiting_axis : str
-        The axis that is farthest from its target; empty if there is none, or no result.
+        Axis that is farthest from its target; empty without such an axis or without a result.
     will_not_get_there : bool
-        More of this motion is of no use for the limiting axis.
+        Whether more of the present motion is useless for the limiting axis.
     axes : mapping of str to AxisProgress
     """
 

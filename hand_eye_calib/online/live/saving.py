@@ -1,10 +1,9 @@
-"""Saves the session's result: files at once, report and rig by a process of their own."""
+"""Saving of the session's result: files at once, report and rig in a process of their own."""
 
 import pickle
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
 
 from hand_eye_calib.core.base.config import NodeConfig
 from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, NotEnoughDataError
@@ -17,25 +16,32 @@ from hand_eye_calib.online.live.session import LiveSession, output_path
 from hand_eye_calib.online.live.solving import start
 from hand_eye_calib.online.live.state import SavedState, Standing
 
-_REPORT = "from hand_eye_calib.online.live.pages import write_session; write_session()"
+_PAGES = "from hand_eye_calib.online.live.pages import write_session; write_session()"
 
 
 class Saver:
-    """Saves results; those of an earlier session in the same directory are kept once. The process
-    that writes report and rig outlives the node; there is one at a time, as the newest counts.
-    ``state`` is the newest save of this session.
+    """Saves the result of the session, and keeps the files of an earlier session once.
+
+    The process that writes report and rig may end after the node. A newer save ends it, because
+    only the newest result counts.
+
+    Attributes
+    ----------
+    state : SavedState or None
+        Newest save of this session.
     """
 
     def __init__(self, session: LiveSession, cycle: SolveCycle, log: NodeLog) -> None:
+        self.state: SavedState | None = None
         self._session = session
         self._cycle = cycle
         self._log = log
+        # Directory whose earlier results are kept already.
         self._earlier_kept_in = ""
         self._process: subprocess.Popen[bytes] | None = None
-        self.state: SavedState | None = None
 
     def save(self, options: NodeConfig) -> tuple[bool, str]:
-        """Write the result files; whether that worked, and one line about it, which is logged."""
+        """Write the result files; return whether that worked, and a line of text, also logged."""
         try:
             text = self._save(options)
         except (OSError, HandEyeCalibError) as error:
@@ -47,49 +53,55 @@ class Saver:
 
     def _save(self, options: NodeConfig) -> str:
         directory = options.output_directory
-        result = self._cycle.result_to_save()
-        snapshot = self._cycle.snapshot()
         if not directory:
             raise ConfigError("set the parameter output_directory to a directory")
+        result = self._cycle.result_to_save()
+        snapshot = self._cycle.snapshot()
         if result is None or snapshot is None:
             raise NotEnoughDataError("there is no result yet")
-        # A check may have been certain of other options.
-        inputs = self._session.calibrator.inputs(self._session.topics)
-        inputs |= {"options": snapshot.config.to_options()}
         result = result.with_part("goal", self._cycle.goal.progress)
+        inputs = self._session.calibrator.inputs(self._session.topics)
+        # A check may have set other options than the user.
+        inputs["options"] = snapshot.config.to_options()
         path = output_path(directory)
         if self._earlier_kept_in != directory:
             keep_earlier_results(path)
         self._earlier_kept_in = directory
-        if self._process is not None:  # it writes the result too, an older one
+        # The process of an earlier save writes files of an older result.
+        if self._process is not None:
             self._process.kill()
             self._process.wait()
         save_result(result, path, inputs)
         where = str(path.resolve())
-        said = result.headline
+        text = result.headline
         if self._cycle.standing is Standing.OUTDATED:
-            said = f"{said}; {self._cycle.problem}"
-        text = f"result saved to {where}: {said}"
+            text = f"{text}; {self._cycle.problem}"
         verdict = result.verdict.value
-        self.state = SavedState(directory=where, at_s=time.time(), text=said, verdict=verdict)
+        self.state = SavedState(directory=where, at_s=time.time(), text=text, verdict=verdict)
+        text = f"result saved to {where}: {text}"
         engines = self._session.engines
-        others = {name: each.snapshot() for name, each in engines.items() if name != "child"}
+        others = {name: engine.snapshot() for name, engine in engines.items() if name != "child"}
+        files = ["report.html"] if options.report else []
+        if others:
+            files.append("rig/")
+        if not files:
+            return text
         session = SessionResult(result, snapshot, inputs, options.report, others)
-        files = ["report.html"] * options.report + ["rig/"] * bool(others)
-        return f"{text}; {self._write(where, session, files)}" if files else text
+        return f"{text}; {self._write_pages(where, session, listing(files))}"
 
-    def _write(self, directory: str, result: SessionResult, files: Sequence[str]) -> str:
-        """Start to write report and rig, which takes milliseconds; returns a sentence about that.
+    def _write_pages(self, directory: str, session: SessionResult, files: str) -> str:
+        """Start the process that writes report and rig; return a sentence about the files.
 
-        The result is handed over in a file that has no name: nobody else can change it, and no
-        pipe has to be waited for at the end of the node.
+        The start takes milliseconds. A file without a name passes the result on: no other program
+        can change it, and the end of the node need not wait for a pipe.
         """
         self._process = None
         try:
             with tempfile.TemporaryFile() as file:
-                pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
+                pickle.dump(session, file, pickle.HIGHEST_PROTOCOL)
                 file.seek(0)
-                self._process = start(_REPORT, directory, stdin=file, stdout=subprocess.DEVNULL)
-        except OSError as error:  # a full temporary directory, or no process can be started
-            return f"{listing(files)} cannot be written: {error.strerror}"
-        return f"{listing(files)} follow{'s' * (len(files) == 1)}"
+                self._process = start(_PAGES, directory, stdin=file, stdout=subprocess.DEVNULL)
+        # The temporary directory is full, or no process can be started.
+        except OSError as error:
+            return f"{files} cannot be written: {error.strerror}"
+        return f"{files} follow" if " and " in files else f"{files} follows"

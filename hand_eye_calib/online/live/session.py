@@ -18,7 +18,7 @@ from hand_eye_calib.online.live.state import GRACE_S, JournalState, Level
 
 
 class LiveSession:
-    """The engines that take the poses, and the journal that keeps them on disk, if there is one.
+    """The engines that accept the poses, and the journal that stores the accepted poses on disk.
 
     Parameters
     ----------
@@ -30,26 +30,30 @@ class LiveSession:
     Attributes
     ----------
     engines : dict of str to Calibrator
-        By child sensor: that of "child", and those of further ones, each with the parent.
+        Engine of each child sensor with the parent: "child", and the further child sensors.
     number : int
-        Rises with every new session; a result of another number is out of date.
+        Number of the session, which grows with every new session. A result of another number is
+        out of date.
     topics : dict of str to str
-        Where the poses of each stream come from, for the journal.
+        Topic of each stream, for the journal.
     journal : SessionJournal or None
-        Takes the poses that the engines have taken.
     """
 
     def __init__(self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()) -> None:
         self.engines = Calibrators(child=Calibrator(config))
-        self.engines |= {name: Calibrator(_of_other(config)) for name in others}
+        for name in others:
+            self.engines[name] = Calibrator(_for_other_child(config))
         self.number = 0
         self.topics: dict[str, str] = {}
-        self._is_solved = True
-        self._n_solved = 0
+        self.journal: SessionJournal | None = None
         self._log = log
+        # Whether the poses are solved; the monitor of the mount only takes the pairs.
+        self._is_solved = True
+        # Number of poses of the last solve.
+        self._n_solved = 0
+        # Options with what the streams measure, by their message types.
         self._measures: Document = {}
         self._origins: dict[str, LocalOrigin] = {}
-        self.journal: SessionJournal | None = None
 
     @property
     def calibrator(self) -> Calibrator:
@@ -58,54 +62,67 @@ class LiveSession:
 
     @property
     def has_new_poses(self) -> bool:
-        """Whether a solve would have something new to go by: poses or options."""
+        """Whether there are poses or options that no solve has used."""
         return self._is_solved and self._n_poses() > self._n_solved
 
     def copy_to_solve(self) -> Calibrator:
-        """The engine as it is now; its poses are no longer new."""
+        """Return a copy of the engine, and count its poses as solved."""
         self._n_solved = self._n_poses()
         return deepcopy(self.calibrator)
 
     def watch_only(self, limits: BufferLimits | None) -> None:
-        """Never solve, and keep few poses: somebody takes the pairs as they are made. With None,
-        calibrate again.
+        """Never solve, and store few poses, because the caller takes the pairs as they are made.
+
+        Parameters
+        ----------
+        limits : BufferLimits or None
+            Limits of the buffers; None to calibrate again.
         """
         self._is_solved = limits is None
-        made = Calibrator(self.calibrator.config, limits or BufferLimits())
-        self.engines = Calibrators(child=made)
+        engine = Calibrator(self.calibrator.config, limits or BufferLimits())
+        self.engines = Calibrators(child=engine)
         self._n_solved = 0
 
     def set_measures(self, stream: str, measures: str) -> None:
-        """Take what a stream measures, as its message type says, one of config.MEASURES.
+        """Set what a stream measures, by its message type.
+
+        Parameters
+        ----------
+        stream : str
+        measures : str
+            One of ``config.MEASURES``.
 
         Raises
         ------
         ConfigError
-            If nothing can be done with that, or with what the other stream measures.
+            If the session cannot use such a stream, or not beside the other stream.
         """
-        if measures != "poses" and (stream not in STREAMS or not self._is_solved):
+        is_pair = stream in STREAMS
+        if measures != "poses" and not (is_pair and self._is_solved):
             raise ConfigError(f"a rig and monitor take poses; {stream} has {measures}")
         name = f"{stream}_measures"
-        if stream in STREAMS and self._measures.get(name, "poses") != measures:
-            measured = self._measures | {name: measures}
-            _ = replace(self.calibrator.config, **measured).measured  # or it raises
-            self._measures = measured
-            self.reconfigure(self.calibrator.config)
+        if not is_pair or self._measures.get(name, "poses") == measures:
+            return
+        options = {**self._measures, name: measures}
+        # Raises an error for an impossible combination.
+        _ = replace(self.calibrator.config, **options).measured
+        self._measures = options
+        self.reconfigure(self.calibrator.config)
 
     def origin(self, stream: str) -> LocalOrigin:
-        """Where the latitudes and longitudes of a stream count from, also after a restart."""
+        """Return the local origin of a stream's latitudes and longitudes; resumed if possible."""
         return self._origins.setdefault(stream, LocalOrigin())
 
     def reconfigure(self, config: CalibratorConfig) -> None:
-        """Put other options in force; the poses stay, and are to be solved again."""
+        """Apply other options; the poses stay and will be solved again."""
         for name, engine in self.engines.items():
             if name != "child":
-                engine.reconfigure(_of_other(config))
+                engine.reconfigure(_for_other_child(config))
         self.calibrator.reconfigure(replace(config, **self._measures))
         self._n_solved = 0
 
     def reset(self) -> None:
-        """Forget everything and begin a new session; the journal of the old one is kept aside."""
+        """Drop all poses and begin a new session; the journal of the old session is kept aside."""
         for engine in self.engines.values():
             engine.reset()
         self.number += 1
@@ -119,8 +136,13 @@ class LiveSession:
     # -------------------------------------------------------------- journal
 
     def start_journal(self, options: NodeConfig, is_first: bool = False) -> None:
-        """Write a journal from now on, if the options want one; at the start of the node, when the
-        session on disk may go on, and when it goes over to calibrating.
+        """Write a journal from now on, unless the options switch it off.
+
+        Parameters
+        ----------
+        options : NodeConfig
+        is_first : bool
+            Whether the node has just started, so that it may resume the session on disk.
 
         Raises
         ------
@@ -139,35 +161,37 @@ class LiveSession:
             self.journal = SessionJournal(directory, self._about, self._log, resumed)
 
     def flush_journal(self) -> None:
-        """Hand what came in to the disk; to be called often."""
+        """Write new poses to the disk; to be called often."""
         if self.journal is not None:
             self.journal.flush()
 
     def stop_journal(self) -> None:
-        """Write what is left, and leave the directory to others."""
+        """Write the last poses, and unlock the directory."""
         if self.journal is not None:
             self.journal.stop(GRACE_S)
             self.journal = None
 
     def journal_state(self, options: NodeConfig) -> JournalState:
-        """Whether a crash would lose the session."""
+        """Return the diagnostics of the journal."""
         journal = self.journal
         level = Level.OK
         text = "the session is being written"
         if journal is not None and journal.error:
             level = Level.ERROR
-            text = f"cannot write the journal: {journal.error}; "
-            text += "save the result: a crash would lose the session"
-        elif journal is None:
+            text = (
+                f"cannot write the journal: {journal.error}; "
+                "save the result: a crash would lose the session"
+            )
+        elif journal is None and options.journal == "off":
             text = "off"
-            if options.journal != "off":
-                level = Level.WARN
-                text = "off: the node began without output_directory"
+        elif journal is None:
+            level = Level.WARN
+            text = "off: the node began without output_directory"
         directory = str(journal.directory) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:
-        """The session in a directory, which goes on; None if there is none that can."""
+        """Return the session in a directory to continue it; None if that is impossible."""
         if not has_session(directory):
             self._log.info(f"no session to resume in {directory}: a new one begins")
             return None
@@ -186,35 +210,45 @@ class LiveSession:
         return journal
 
     def _about(self) -> dict[str, Document]:
-        """Options, topics, frames and origins (rad, rad, m), for whoever reads the journal."""
+        """Return topic, options, frames and origin (rad, rad, m) of each stream."""
         config = self.calibrator.config
-        of_all = {"options": config.to_options(), "given": sorted(config.given)}
+        options = config.to_options()
         about: dict[str, Document] = {}
         for stream in ("parent", *self.engines):
             own_stream, engine = self.engines.takers(stream)[0]
             origin = self._origins.get(stream, LocalOrigin()).geodetic
-            known: Document = {
-                "frame": engine.frame(own_stream),
-                "world": engine.world(own_stream),
-                "origin": [*(origin or ())],
+            about[stream] = {
+                "topic": self.topics.get(stream, ""),
+                "options": options,
+                "given": sorted(config.given),
             }
-            known = {name: each for name, each in known.items() if each}
-            about[stream] = {"topic": self.topics.get(stream, ""), **of_all, **known}
+            if frame := engine.frame(own_stream):
+                about[stream]["frame"] = frame
+            if world := engine.world(own_stream):
+                about[stream]["world"] = world
+            if origin:
+                about[stream]["origin"] = [*origin]
         return about
 
 
-def _of_other(config: CalibratorConfig) -> CalibratorConfig:
-    """The options for a further child sensor: what is set for the child in numbers is not its."""
-    of_child = {each.name for each in fields(config) if each.name.startswith(("prior_", "child_"))}
-    numbers = ("time_offset", "scale")
-    of_child |= {name for name in numbers if not isinstance(getattr(config, name), str)}
-    return replace(config, given=config.given - of_child, **defaults_of(of_child))
+def _for_other_child(config: CalibratorConfig) -> CalibratorConfig:
+    """Return the options for a further child sensor: defaults for all values of the child."""
+    names = {item.name for item in fields(config) if item.name.startswith(("prior_", "child_"))}
+    for name in ("time_offset", "scale"):
+        # A text such as "estimate" holds for all child sensors.
+        if not isinstance(getattr(config, name), str):
+            names.add(name)
+    return replace(config, given=config.given - names, **defaults_of(names))
 
 
 def output_path(directory: str, base: Path | None = None) -> Path:
-    """The path of an output directory, ``~`` expanded. Raises ConfigError for an unknown user, and
-    if it is neither ``base`` nor below it: any participant may set it while the node runs, and must
-    not write elsewhere.
+    """Return the path of an output directory, with ``~`` expanded.
+
+    Raises
+    ------
+    ConfigError
+        If the user of ``~`` is unknown, or if the path is neither ``base`` nor below it. Any
+        participant may set the directory while the node runs, but must not write elsewhere.
     """
     try:
         path = Path(directory).expanduser()

@@ -1,13 +1,13 @@
-"""The state of the node as one document: published as JSON, and the source of ``/diagnostics`` and
-of what ``watch`` shows.
+"""The state of the node as one document.
 
-All values are in SI units. Mappings by axis have x, y, z, roll, pitch and yaw; None stands for what
-is not known.
+It is published as JSON, and ``/diagnostics`` and ``watch`` are made from it. All values are in SI
+units. Mappings by axis have x, y, z, roll, pitch and yaw. None stands for an unknown value.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
+from typing import TypeAlias
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.plain import plain
@@ -15,25 +15,27 @@ from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.progress import Progress
 
-# The node says how it is so often (s). A disk, a solve under way and who listens may each hold up
-# its end for so long (s).
+# Period (s) at which the node publishes its state.
 REPORT_PERIOD_S = 1.0
+
+# Longest time (s) for which a disk, a running solve or a slow listener delays the end of the node.
 GRACE_S = 0.4
 
-# Who asks for a solve has an answer within so long (s), also where others use the processor.
+# Time (s) within which a request for a solve is answered, even on a busy computer.
 ANSWER_WITHIN_S = 20.0
 
-AxisValues = Mapping[str, float | None]
+AxisValues: TypeAlias = Mapping[str, float | None]
 
 
 def by_axis(values: FloatArray) -> AxisValues:
-    """Values (6,) by axis."""
+    """Return values (6,) by axis; None for those that are not finite."""
     return dict(zip(AXES, plain(values), strict=True))
 
 
 class Level(IntEnum):
-    """As of diagnostic_msgs/DiagnosticStatus: WARN if a person should act, ERROR if something is
-    broken.
+    """Level of diagnostic_msgs/DiagnosticStatus.
+
+    WARN if a person should act, ERROR if something is broken.
     """
 
     OK = 0
@@ -42,7 +44,7 @@ class Level(IntEnum):
 
 
 class Broadcast(Enum):
-    """What is done about ``/tf_static``."""
+    """Whether the result is broadcast on ``/tf_static``."""
 
     OFF = "off"
     WAITING = "not yet"
@@ -51,7 +53,7 @@ class Broadcast(Enum):
 
 
 class Standing(Enum):
-    """Whether the session's result still holds.
+    """Validity of the session's result.
 
     OUTDATED: every solve since has failed. REFUTED: the motion contradicts a prior, or the streams
     are faulty; such a result is not published.
@@ -65,7 +67,7 @@ class Standing(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One part of the node: what it says, and whether a person should act."""
+    """One part of the node: its condition in words, and whether a person should act."""
 
     level: Level
     text: str
@@ -73,8 +75,15 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultState:
-    """The session's result. ``pose`` has x, y, z (m), roll, pitch, yaw (rad) as they are printed,
-    None if an axis is not determined.
+    """The session's result.
+
+    Attributes
+    ----------
+    pose, pose_sigma : mapping of str to float or None
+        x, y, z (m), roll, pitch, yaw (rad) and their standard deviations as printed; None for an
+        axis that is not determined.
+    age_s : float
+        Time since the solve (s).
     """
 
     parent_frame: str
@@ -93,11 +102,28 @@ class ResultState:
 
 @dataclass(frozen=True, kw_only=True)
 class ExtrinsicState(Part):
-    """The solver, what has been seen of the motion, and the result if there is one. The sensors
-    moved for ``motion_s``; ``has_vehicle_axes`` if the parent sensor moves along its x and turns
-    about its z, as on a vehicle (REP 103). ``problem`` is why the result is outdated or refuted.
-    ``priors`` are the priors that are set, by axis; ``contradicted`` are the axes of those that the
-    motion contradicts.
+    """Solver, motion of the session, and result.
+
+    Attributes
+    ----------
+    path_m : float
+        Length of the path (m).
+    motion_s : float
+        Time for which the sensors have moved (s).
+    has_vehicle_axes : bool
+        Whether the parent sensor moves along its x axis and turns about its z axis, as on a vehicle
+        (REP 103).
+    rotation_deg : mapping of str to float
+        Rotation of the parent sensor about x, y and z (deg).
+    tf_static, tf_static_reason
+        Whether the result is broadcast, and the reason if it is not.
+    problem : str
+        Reason why the result is outdated or refuted; empty otherwise.
+    priors : mapping of str to str
+        Priors that are set, by axis.
+    contradicted : tuple of str
+        Axes whose prior the motion contradicts.
+    result : ResultState or None
     """
 
     is_solving: bool
@@ -117,10 +143,16 @@ class ExtrinsicState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressState(Part):
-    """How far the session is from its goal; the text says what to do now. Standard deviations are
-    along and about the axes of the parent sensor's frame. The session is paused while poses do not
-    come in, before its goal. The comparison of the result with what is installed is only a sentence
-    while it cannot be made.
+    """Progress of the session towards its goal; the text is the next step of a person.
+
+    Attributes
+    ----------
+    is_paused : bool
+        Whether poses do not arrive although the goal is not reached.
+    progress : Progress
+        Its standard deviations are along and about the axes of the parent sensor's frame.
+    comparison : Comparison or None
+        Comparison with the installed transform; only a sentence while it is impossible.
     """
 
     is_paused: bool = False
@@ -130,9 +162,22 @@ class ProgressState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class InputState(Part):
-    """What an input has delivered. ``lost`` messages were published and never arrived, None if the
-    middleware does not tell. ``publishers`` of its topic are there, None for transforms. The input
-    is paused if it has delivered poses, but none for ``silent_s``.
+    """The messages of one input.
+
+    Attributes
+    ----------
+    messages, poses_taken : int
+        Received messages, and poses that the engine has accepted.
+    refused : mapping of str to int
+        Refused messages, by reason.
+    lost : int or None
+        Messages that were published and never arrived; None if the middleware does not count.
+    longest_gap_s : float
+        Longest interval between two stamps (s).
+    publishers : int or None
+        Publishers of the topic; None for transforms.
+    is_paused : bool
+        Whether poses have come, but none for ``silent_s`` (s).
     """
 
     topic: str
@@ -149,7 +194,7 @@ class InputState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ChecksState(Part):
-    """Findings of the stream checks; ``age_s`` is None before the first one."""
+    """Findings of the stream checks; ``age_s`` is None before the first check."""
 
     age_s: float | None = None
     findings: tuple[str, ...] = ()
@@ -164,8 +209,17 @@ class JournalState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class MountState(Part):
-    """A mount that is watched: the alarm's shift since a stamp, and the shift that ten minutes of
-    motion would show, None if none would.
+    """A monitored mount.
+
+    Attributes
+    ----------
+    shift, shift_sigma : mapping of str to float or None
+        Shift of the alarm and its standard deviation, by axis.
+    visible_10min : mapping of str to float or None
+        Smallest shift that ten minutes of motion would reveal, by axis; None if no shift would be
+        revealed.
+    since_ns, newest_ns : int or None
+        Stamps at which the shift began, and of the newest motion (ns).
     """
 
     is_learning: bool = False
@@ -179,7 +233,7 @@ class MountState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class SavedState:
-    """Where the result was saved, when (seconds since 1970), its headline and its verdict."""
+    """Directory, time (seconds since 1970), headline and verdict of a saved result."""
 
     directory: str
     at_s: float
@@ -189,9 +243,19 @@ class SavedState:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeState:
-    """Everything that the node, by its fully qualified name, says of itself. A node that watches
-    the mount has no result, progress, checks and journal, and only it has a mount. The inputs are
-    by name: parent, child, child2 and so on. ``saved`` is the newest save of the session.
+    """The whole state of the node.
+
+    A node that monitors the mount has ``mount`` in place of ``extrinsic``, ``progress``, ``checks``
+    and ``journal``.
+
+    Attributes
+    ----------
+    node : str
+        Fully qualified name of the node.
+    inputs : mapping of str to InputState
+        By name: parent, child, child2 and so on.
+    saved : SavedState or None
+        Newest saved result of the session.
     """
 
     node: str
@@ -215,10 +279,15 @@ class NodeState:
         return self.extrinsic.standing if self.extrinsic else Standing.NONE
 
     def parts(self) -> Iterator[tuple[str, Part]]:
-        """The parts that there are, by the names that ``/diagnostics`` has for them."""
-        before = {"extrinsic": self.extrinsic, "progress": self.progress, "mount": self.mount}
-        after = {"stream checks": self.checks, "journal": self.journal}
-        inputs = {f"{name} input": each for name, each in self.inputs.items()}
-        for name, part in (before | inputs | after).items():
+        """Yield the parts of the node, by their names on ``/diagnostics``."""
+        parts = {
+            "extrinsic": self.extrinsic,
+            "progress": self.progress,
+            "mount": self.mount,
+            **{f"{name} input": state for name, state in self.inputs.items()},
+            "stream checks": self.checks,
+            "journal": self.journal,
+        }
+        for name, part in parts.items():
             if part is not None:
                 yield name, part
