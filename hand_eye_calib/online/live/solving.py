@@ -1,8 +1,8 @@
-"""The process beside the node's that solves: what it is sent, what it answers, and both ends.
+"""The solving process beside the node: its jobs, its answers, and both ends of its pipes.
 
-A thread that solves would share the interpreter with the callbacks: on a slow machine their latency
-rises to a second. The process imports the engine and nothing of ROS. Messages are pickles: both
-ends are the same program, and nobody else has the pipes.
+A solve in a thread would share the interpreter with the callbacks: on a slow machine their latency
+rises to a second. The process imports the engine and nothing of ROS. Jobs and answers are pickles,
+which is safe because both ends are the same program, and no other program has the pipes.
 """
 
 import contextlib
@@ -36,17 +36,17 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.state import GRACE_S
 
-# Not `-m`: its classes would belong to the module __main__, which the node does not have.
+# Not `-m`: the classes would belong to the module __main__, which the node does not have.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
 
-# Other programs have twice the share of a processor. With more, a solve takes minutes beside busy
-# ones; the latency of the node's callbacks is the same with any.
+# Priority of the process: other programs get twice its share of a processor. With a higher value a
+# solve takes minutes beside busy programs; the latency of the callbacks is the same with any value.
 _NICENESS = 3
 
-# A job that has taken this long (s) hangs: live sessions are solved in seconds.
+# Time (s) after which a job counts as hung: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
 
-# Fewest poses of a stream, not paired yet, that are checked as they came in.
+# Fewest poses of a stream, not paired yet, for a check of its received poses.
 _FEWEST_RAW = 200
 
 NO_MOTION = excitation(PosePairs.empty())
@@ -54,8 +54,16 @@ NO_MOTION = excitation(PosePairs.empty())
 
 @dataclass(frozen=True)
 class Failure:
-    """An error as one line. ``details`` are for the log, and only of a defect; ``is_early`` if
-    there is too little data.
+    """An error.
+
+    Attributes
+    ----------
+    what : str
+        The error in one line.
+    details : str
+        Text for the log; only if the error is a defect of the program.
+    is_early : bool
+        Whether there is too little data.
     """
 
     what: str
@@ -65,9 +73,20 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """Poses to solve, and perhaps their streams to check, in a session of this number, with options
-    that an earlier check was certain of. They come as the calibrator had them: making trajectories
-    of them would hold up the node's callbacks.
+    """Poses to solve.
+
+    The process makes the trajectories, because that would delay the callbacks of the node.
+
+    Attributes
+    ----------
+    session : int
+        Number of the session.
+    calibrator : Calibrator
+        Copy of the engine.
+    check : bool
+        Whether to check the streams, too.
+    options : Options
+        Options that an earlier check has set.
     """
 
     session: int
@@ -78,12 +97,28 @@ class Job:
 
 @dataclass(frozen=True)
 class Answer:
-    """How a job ended, after how many seconds: with a calibration, and how the sensors have been
-    seen to move, or with a failure; with both if only the check has failed.
+    """Result of a job: a calibration or a failure, or both if only the check has failed.
 
-    ``is_checked`` if a check was asked for: its result is None if the motion is too short or has
-    too little rotation to tell. The result is one with the options that it is certain of, and
-    ``messages`` say so.
+    Attributes
+    ----------
+    session : int
+        Number of the session.
+    seconds : float
+        Duration of the job (s).
+    motion : Excitation
+        Motion of the sensors.
+    calibration : Calibration or None
+        With the options that the check has set.
+    time_offset : TimeOffset or None
+    failure : Failure or None
+    is_checked : bool
+        Whether the job has requested a check.
+    check : CheckResult or None
+        None if the motion is too short for a check, or has too little rotation.
+    options : Options
+        Options that the check has set.
+    messages : tuple of str
+        Sentences about these options.
     """
 
     session: int
@@ -99,44 +134,52 @@ class Answer:
 
 
 def answer(job: Job) -> Answer:
-    """Solve, then check if the job asks for it. If the check is certain of other options, the
-    calibration is the one with these.
+    """Solve, then check the streams if the job requests it.
+
+    The calibration has the options that the check has set.
     """
     start_s = time.monotonic()
-    done = Answer(job.session, 0.0, is_checked=job.check)
+    result = Answer(job.session, 0.0, is_checked=job.check)
+    # The node reports all errors.
     try:
-        as_came = job.calibrator.snapshot()
-        as_sent = with_options(as_came, job.options)
-        snapshot = as_sent.resolved
-        done = replace(done, time_offset=snapshot.time_offset)
-        done = replace(done, motion=excitation(snapshot.pose_pairs))
-        done = replace(done, calibration=snapshot.estimate())
-    except Exception as error:  # the node reports it
-        done = replace(done, failure=_failure(error))
+        received = job.calibrator.snapshot()
+        configured = with_options(received, job.options)
+        snapshot = configured.resolved
+        result = replace(result, time_offset=snapshot.time_offset)
+        result = replace(result, motion=excitation(snapshot.pose_pairs))
+        result = replace(result, calibration=snapshot.estimate())
+    except Exception as error:
+        result = replace(result, failure=_failure(error))
     try:
-        if job.check and can_check(*as_came.streams):
-            if done.calibration is None:
-                done = replace(done, check=check(as_sent))
-            else:
-                run = review(done.calibration, as_sent, job.options)
-                done = replace(
-                    done, check=run.check, options=dict(run.options), messages=run.messages
-                )
-                if run.options:
-                    done = replace(done, calibration=run.calibration)
-    except Exception as error:  # the node reports it
-        done = replace(done, failure=done.failure or _failure(error))
-    if done.check is not None:
-        done = replace(done, check=with_raw_findings(done.check, as_came))
-    return replace(done, seconds=time.monotonic() - start_s)
+        if job.check and can_check(*received.streams):
+            result = _checked(result, configured, job.options)
+    except Exception as error:
+        result = replace(result, failure=result.failure or _failure(error))
+    if result.check is not None:
+        result = replace(result, check=with_raw_findings(result.check, received))
+    return replace(result, seconds=time.monotonic() - start_s)
+
+
+def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
+    """Return the answer with a stream check, and with the calibration that the check chooses."""
+    if result.calibration is None:
+        return replace(result, check=check(snapshot))
+    run = review(result.calibration, snapshot, options)
+    return replace(
+        result,
+        check=run.check,
+        options=dict(run.options),
+        messages=run.messages,
+        calibration=run.calibration if run.options else result.calibration,
+    )
 
 
 def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
-    """Add the errors of the newest poses as they came in, if the older ones are paired.
+    """Add errors in the newest poses as they were received, if older poses are paired already.
 
-    A check of a session sees the pairs, of which one stream is interpolated: poses of two sources
-    that alternate do not show there. Of 232 windows of right recordings, none has such an error;
-    one in 15 has jumps enough for a warning, which is left to the check of the pairs.
+    A check of a session uses the pairs, for which one stream is interpolated. Interpolation hides
+    poses of two sources that alternate. None of 232 windows of sound recordings has such an error;
+    1 of 15 has enough jumps for a warning, which is left to the check of the pairs.
     """
     if not len(snapshot.kept):
         return result
@@ -146,14 +189,14 @@ def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
         if len(trajectory) < _FEWEST_RAW or trajectory.duration_s < MIN_DURATION_S / 2:
             continue
         if config.measured == "poses":
-            of_stream = check_stream(trajectory, stream, config.max_gap)
+            raw_findings = check_stream(trajectory, stream, config.max_gap)
         else:
-            # Without positions of both, those of the other are no measurements.
+            # Unless both streams have positions, the positions of a stream are no measurements.
             scale = 1.0 if config.measured == "positions" else 0.0
-            of_stream = check_positions(trajectory.scaled(scale), stream, config.max_gap)
-        seen = {(finding.code, finding.stream) for finding in findings}
-        for finding in answered(of_stream, config):
-            if finding.makes_unusable and (finding.code, finding.stream) not in seen:
+            raw_findings = check_positions(trajectory.scaled(scale), stream, config.max_gap)
+        keys = {(finding.code, finding.stream) for finding in findings}
+        for finding in answered(raw_findings, config):
+            if finding.makes_unusable and (finding.code, finding.stream) not in keys:
                 findings.append(finding)
     return replace(result, findings=gravest_first(findings))
 
@@ -169,9 +212,9 @@ def _failure(error: Exception) -> Failure:
 
 
 def main() -> None:
-    """Answer jobs until the standard input ends, which it does with the node, however that ends."""
+    """Answer jobs until standard input ends, which the end of the node causes in any case."""
     os.nice(_NICENESS)
-    # What a library prints goes to standard error instead of the pipe.
+    # A library may print: that goes to standard error, not into the pipe.
     outgoing = os.fdopen(os.dup(1), "wb")
     os.dup2(sys.stderr.fileno(), 1)
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
@@ -179,12 +222,12 @@ def main() -> None:
     while True:
         pickle.dump(answer(jobs.get()), outgoing, pickle.HIGHEST_PROTOCOL)
         outgoing.flush()
-        # The arrays of a job are in cycles: memory grew by half of itself in 60 solves.
+        # References to the arrays of a job form cycles: memory grew by a half in 60 solves.
         gc.collect()
 
 
 def _receive(jobs: "queue.SimpleQueue[Job]") -> None:
-    """Read jobs in a thread: the end of the node must be noticed during a long solve too."""
+    """Read jobs in a thread, so that the end of the node also ends a long solve."""
     try:
         while True:
             jobs.put(pickle.load(sys.stdin.buffer))
@@ -196,8 +239,9 @@ def _receive(jobs: "queue.SimpleQueue[Job]") -> None:
 
 
 def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Popen[bytes]":
-    """Run Python code with the same modules as here, in a group of its own, which Ctrl-C in the
-    terminal leaves alone.
+    """Run Python code with the modules of this process.
+
+    The new process has a group of its own, so that Ctrl-C in the terminal does not reach it.
     """
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
@@ -209,16 +253,16 @@ def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Po
 
 
 class SolvingProcess:
-    """Answers one job at a time in another process.
+    """A process that answers one job at a time.
 
-    The process is started at once and again when it has died, or was killed because it hung; the
-    job in hand has failed then. It ends with this one, however this one ends. The threads here only
-    wait for the pipes.
+    The process starts at once. It starts again after it has died or has been killed because it
+    hung; its job has failed then. The end of the node ends it in any case. The threads in this
+    class only wait for the pipes.
 
     Parameters
     ----------
     on_answer : callable
-        Called in another thread when an answer is ready; one call may stand for two.
+        Called in another thread when an answer is ready; one call may stand for two answers.
     command : str
         Python code that the process runs.
     """
@@ -229,60 +273,67 @@ class SolvingProcess:
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._is_stopping = False
         self._start()
+        # Only a thread that was started can be joined.
         self._thread = threading.Thread()
-        self._thread.start()  # so that it can be waited for
+        self._thread.start()
 
     def submit(self, job: Job) -> None:
-        """Send a job, once the one before is answered."""
-        # A daemon: a pipe that hangs must not keep the node alive.
+        """Send a job; the last job must have been answered."""
+        # A daemon, because a pipe that hangs must not delay the end of the node.
         self._thread = threading.Thread(target=self._run, args=(job,), name="solving", daemon=True)
         self._thread.start()
 
     def answers(self) -> list[Answer]:
-        """The answers that nobody has taken, in order."""
+        """Return and remove the answers, in order."""
         return [self._answers.get() for _ in range(self._answers.qsize())]
 
     def stop(self, timeout_s: float) -> None:
-        """Wait for the job in hand, then end the process whatever it does."""
+        """Wait up to ``timeout_s`` for the current job, then kill the process."""
         self._is_stopping = True
         self._thread.join(timeout_s)
         self._process.kill()
-        self._thread.join(GRACE_S)  # its pipe has ended
+        # The pipe of the thread has ended.
+        self._thread.join(GRACE_S)
         self._process.communicate()
 
     def _start(self) -> None:
         self._process = start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def _run(self, job: Job) -> None:
-        to: Any = self._process.stdin
-        back: Any = self._process.stdout
-        found = None
-        began_s = time.monotonic()
+        to_process: Any = self._process.stdin
+        from_process: Any = self._process.stdout
+        result = None
+        start_s = time.monotonic()
         killer = threading.Timer(HANGS_AFTER_S, self._process.kill)
         killer.daemon = True
         killer.start()
         with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
-            pickle.dump(job, to, pickle.HIGHEST_PROTOCOL)
-            to.flush()
-            found = pickle.load(back)
+            pickle.dump(job, to_process, pickle.HIGHEST_PROTOCOL)
+            to_process.flush()
+            result = pickle.load(from_process)
         killer.cancel()
-        if found is None and self._is_stopping:
-            return
-        hangs = time.monotonic() - began_s >= HANGS_AFTER_S
-        self._answers.put(found or Answer(job.session, 0.0, failure=self._restart(hangs)))
+        if result is None:
+            if self._is_stopping:
+                return
+            has_hung = time.monotonic() - start_s >= HANGS_AFTER_S
+            result = Answer(job.session, 0.0, failure=self._restart(has_hung))
+        self._answers.put(result)
         if not self._is_stopping:
             self._on_answer()
 
-    def _restart(self, hangs: bool) -> Failure:
-        """Start the process again, which has died or was killed; returns how it ended."""
+    def _restart(self, has_hung: bool) -> Failure:
+        """Start the process again after its end, and return how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE_S)
         self._process.kill()
         self._process.communicate()
         code = self._process.returncode
-        cause = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-        if hangs:
+        if has_hung:
             cause = f"had no answer after {HANGS_AFTER_S:g} s and was killed"
+        elif code < 0:
+            cause = f"was ended by {signal.Signals(-code).name}"
+        else:
+            cause = f"ended with {code}"
         self._start()
         if self._is_stopping:
             self._process.kill()
