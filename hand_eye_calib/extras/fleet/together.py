@@ -223,7 +223,7 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
             least = min(dof.sigma for dof in known)
             covariance[axis, axis] = max(covariance[axis, axis], least**2)
     covariance = turned(T[:3, :3].T, covariance)
-    assessed = combined(T, covariance, None, unknown_directions(covariance))
+    assessed = combined(T, covariance, unknown_directions(covariance))
     observability = tuple(
         replace(dof, verdict=DofVerdict.PRIOR) if dof.name in by_prior else dof
         for dof in assessed.observability
