@@ -1,13 +1,14 @@
-"""From streams of which one gives only a part of its poses to a calibration.
+"""Calibration from streams of which one measures only a part of its poses.
 
-Positions beside poses: the lever arm. By convention the sensor that measures positions has the axes
-of the other one; the rotation is out of reach. Rotations, or angular rates: the rotation, and the
-bias of a gyroscope. The adaptive estimator sees trajectories that never leave their origins: what
-it finds for the rotation does not depend on the rest. Of both: the time offset.
+- Positions beside poses: the lever arm l and the time offset are estimated. By convention the
+  sensor that measures positions has the axes of the other one. The rotation is unobservable.
+- Rotations or angular rates: the rotation R, the time offset and the bias b of a gyroscope are
+  estimated, from ``w_p(t) = R (w_c(t + d) - b)``. The adaptive estimator gets trajectories that
+  never leave their origins, because its rotation does not depend on the positions.
 """
 
 import contextlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -30,38 +31,75 @@ from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.extras.partial import positions as of_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
 
-# Shares of the path, or of the rotation, that stay unexplained. Of one body it is 0.05 of the path
-# at most, of two 0.5 and more.
+# Share of the path of positions above which it is suspect that the poses do not explain it: at most
+# 0.05 if both are of one body.
 _SUSPECT_PATH = 0.1
+# Share of the path above which both streams are unrelated: 0.5 and more if they are of two bodies.
 _UNRELATED_PATH = 0.3
+# The same share of the rotation, for rotations and rates.
 _UNRELATED_ROTATION = 0.5
 
-# Poses between the ends of the motions that tell how much of the rotation is explained; the
-# quantile of their angles above which they count.
+# Poses between the ends of the motions that show how much of the rotation is explained.
 _SPAN = 10
+# Quantile of the rotation angles above which motions count: a sensor may stand still for long.
 _TURNING = 0.75
 
-# Rates in degrees instead of radians are off by that factor, within this share of it.
+# Rates in degrees instead of radians have a ratio within this share of 57.3.
 _UNIT_WITHIN = 0.2
 
-# A scale mends a path if it leaves less than this share of what remains without it.
+# A scale explains a path if it reduces the unexplained share below this factor.
 _MENDED_PATH = 0.5
 
-# A scale between the streams must exceed so many of its standard deviations, and the data must
-# know it better than the expectation of the model (share of the information).
+# A scale between the streams is reported above this many standard deviations.
 _SCALE_SIGMAS = 5.0
+# Least share of the information on the scale that comes from the data, not from the prior.
 _SHOWN_SCALE = 0.5
+# Smallest scale to divide by.
 _LEAST_SCALE = 1e-3
 
-# Standard deviation (m) along each axis of where the frame of an odometry is, and of where an
-# antenna or a prism measures.
+# Standard deviation (m) along each axis of the point that a sensor measures: the frame of an
+# odometry, the centre of an antenna or a prism.
 _POINT_M = 0.005
 
 
+@dataclass(frozen=True)
+class _Paths:
+    """Poses (N, 4, 4) and positions (N, 3) at the same stamps (N,).
+
+    ``is_child`` is whether the child measures the positions.
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    positions: FloatArray
+    is_child: bool
+
+    def solve(self, with_scale: bool) -> of_positions.LeverArmSolution:
+        """Estimate the lever arm, and the scale if asked for."""
+        return of_positions.solve(self.stamps_ns, self.poses, self.positions, with_scale)
+
+    def unexplained_share(self, solution: of_positions.LeverArmSolution) -> float:
+        """Return the share of the path of the positions that a lever arm does not explain."""
+        return of_positions.unexplained_share(
+            self.poses, self.positions, solution.lever_arm, solution.scale
+        )
+
+    def child_scale(self, scale: float) -> float:
+        """Return the scale of the child for a scale of the positions."""
+        return scale if self.is_child else 1.0 / scale
+
+
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
-    """Solve and assess synchronised poses and positions, on one clock: a result without frame names
-    whose rotation is the identity, and unknown. Of the sensor that measures positions, orientations
-    are not looked at. The poses already have the time offset of the options, in seconds.
+    """Solve and assess synchronised poses and positions.
+
+    The result has no frame names. Its rotation is the identity, and unknown.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock: the time offset of the options is applied already. The orientations of the
+        sensor that measures positions are ignored.
+    config : CalibratorConfig
 
     Raises
     ------
@@ -69,37 +107,35 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         If no lever arm explains the positions.
     """
     stamps_ns = pose_pairs.stamps_ns
-    is_child = config.child_measures == "positions"
-    given = config.given_scale
-    of_parent = pose_pairs.Ts_pw_p
-    of_child = pose_pairs.child_scaled(given).Ts_cw_c
-    poses, measured = (of_parent, of_child) if is_child else (of_child, of_parent)
-    positions = measured[:, :3, 3]
-    with_scale = config.scale in ("auto", "estimate")
+    Ts_pw_p = pose_pairs.Ts_pw_p
+    Ts_cw_c = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
+    if config.child_measures == "positions":
+        sign = 1.0
+        paths = _Paths(stamps_ns, Ts_pw_p, Ts_cw_c[:, :3, 3], is_child=True)
+        allowance = _allowance(paths, config.parent_kind, config.child_kind)
+    else:
+        sign = -1.0
+        paths = _Paths(stamps_ns, Ts_cw_c, Ts_pw_p[:, :3, 3], is_child=False)
+        allowance = _allowance(paths, config.child_kind, config.parent_kind)
     try:
-        solution = of_positions.solve(stamps_ns, poses, positions, with_scale)
+        solution = paths.solve(config.scale in ("auto", "estimate"))
     except np.linalg.LinAlgError:
         raise InputError(
             "no lever arm fits these positions: they jump, or belong to another body; compare both "
             "paths"
         ) from None
-    sign = 1.0 if is_child else -1.0
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
-    assessment = covariance.assess_lever_arm(poses, solution, T, solution.covariance)
+    assessment = covariance.assess_lever_arm(paths.poses, solution, T, solution.covariance)
     fused = fuse(assessment, config.prior())
-    is_scale_given = "scale" in config.given
-    findings = _of_path(solution, fused, stamps_ns, poses, positions, is_child, is_scale_given)
-    scale = solution.scale if is_child else 1.0 / solution.scale
-    # What does not explain the positions has no time offset either.
-    is_usable = not any(each.makes_unusable for each in findings)
-    offset_s = float(config.time_offset) + (sign * solution.time_offset_s if is_usable else 0.0)
-    kinds = config.parent_kind, config.child_kind
-    of_poses, of_antenna = kinds if is_child else kinds[::-1]
-    allowance = _allowance(stamps_ns, poses, of_poses, of_antenna)
+    findings = _check_path(solution, fused, paths, "scale" in config.given)
+    offset_s = float(config.time_offset)
+    if not any(found.makes_unusable for found in findings):
+        offset_s += sign * solution.time_offset_s
+    scale = paths.child_scale(solution.scale)
     return estimation.calibration_of(
         solution,
         fused,
-        _steps(solution, stamps_ns, poses, positions),
+        _step_residuals(solution, paths),
         stamps_ns,
         config,
         reference="increments",
@@ -109,15 +145,13 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         covariance_allowance=fused.allowance(allowance),
         time_offset_s=offset_s,
         time_offset_sigma_s=solution.time_offset_sigma_s,
-        scale=given * scale,
+        scale=config.given_scale * scale,
         scale_sigma=solution.scale_sigma * scale**2,
         findings=findings,
     )
 
 
-def _allowance(
-    stamps_ns: IntArray, poses: FloatArray, kind_of_poses: str, kind_of_positions: str
-) -> FloatArray:
+def _allowance(paths: _Paths, kind_of_poses: str, kind_of_positions: str) -> FloatArray:
     """Return the covariance (6, 6) of errors that no recording shows.
 
     The point that each sensor measures is uncertain, unless the positions are exact. An odometry
@@ -127,97 +161,85 @@ def _allowance(
     if kind_of_positions != "exact":
         variance += _POINT_M**2
     if kind_of_poses != "exact":
-        speed_m_s = covariance.usual_speed(stamps_ns, poses[:, :3, 3])
+        speed_m_s = covariance.usual_speed(paths.stamps_ns, paths.poses[:, :3, 3])
         variance += (covariance.FLOOR_TRAVEL_S * speed_m_s) ** 2
     return variance * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
-def _steps(
-    solution: of_positions.LeverArmSolution,
-    stamps_ns: IntArray,
-    poses: FloatArray,
-    positions: FloatArray,
-) -> Residuals:
-    """Residuals of the steps between positions, along the axes of the sensor with poses."""
-    steps = np.diff(poses[:, :3, :3] @ solution.lever_arm + poses[:, :3, 3], axis=0)
+def _step_residuals(solution: of_positions.LeverArmSolution, paths: _Paths) -> Residuals:
+    """Residuals of the distances between positions, along the steps of the sensor with poses."""
+    rotations = paths.poses[:, :3, :3]
+    steps = np.diff(rotations @ solution.lever_arm + paths.poses[:, :3, 3], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    excess = lengths - np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    excess = lengths - np.linalg.norm(np.diff(paths.positions, axis=0), axis=1)
     along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
+    is_outlier = solution.jumps | solution.spikes[1:]
     return Residuals(
-        translation=se3.times(np.swapaxes(poses[:-1, :3, :3], 1, 2), along),
+        translation=se3.times(np.swapaxes(rotations[:-1], 1, 2), along),
         rotation=np.zeros((len(steps), 3)),
-        weights=(~(solution.jumps | solution.spikes[1:])).astype(float),
-        start_ns=stamps_ns[:-1],
-        end_ns=stamps_ns[1:],
+        weights=(~is_outlier).astype(float),
+        start_ns=paths.stamps_ns[:-1],
+        end_ns=paths.stamps_ns[1:],
     )
 
 
-def _other_units(
-    scale: float,
-    sigma: float,
-    stamps_ns: IntArray,
-    poses: FloatArray,
-    positions: FloatArray,
-    is_child: bool,
-) -> Finding | None:
-    """The finding that the positions or the odometry are in other units, or None. ``is_child`` if
-    the positions are the child's.
-    """
-    odometry = Trajectory(stamps_ns, poses)
-    antenna = Trajectory.from_positions(stamps_ns, positions)
-    if is_child:
-        return in_other_units(scale, sigma, odometry, antenna)
-    return in_other_units(scale, sigma, antenna, odometry)
-
-
-def _of_path(
+def _check_path(
     solution: of_positions.LeverArmSolution,
     fused: covariance.Assessment,
-    stamps_ns: IntArray,
-    poses: FloatArray,
-    positions: FloatArray,
-    is_child: bool,
+    paths: _Paths,
     is_scale_given: bool,
 ) -> tuple[Finding, ...]:
-    """A finding if the path of the positions is not that of the odometry, or in other units."""
-    share = of_positions.unexplained_share(poses, positions, solution.lever_arm, solution.scale)
+    """Detect positions in other units, of another scale, or on another path than the odometry."""
+    share = paths.unexplained_share(solution)
     if share < _SUSPECT_PATH:
-        expected = solution.model.tuning.of_positions[3]
-        return () if is_scale_given else _of_scale(solution, expected, is_child)
+        if is_scale_given:
+            return ()
+        return _check_scale(solution, solution.model.tuning.of_positions[3], paths)
     axes = fused.observability[:3]
-    is_known = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
-    is_near = is_known and share < _UNRELATED_PATH
+    is_observed = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
+    is_near = is_observed and share < _UNRELATED_PATH
     with contextlib.suppress(np.linalg.LinAlgError):
-        scaled = of_positions.solve(stamps_ns, poses, positions, True)
-        left = of_positions.unexplained_share(poses, positions, scaled.lever_arm, scaled.scale)
-        scale = scaled.scale if is_child else 1.0 / scaled.scale
-        sigma = scaled.scale_sigma * (scale / scaled.scale)
-        unit = _other_units(scale, sigma, stamps_ns, poses, positions, is_child)
-        if unit and not is_near and left < _UNRELATED_PATH:
+        scaled = paths.solve(True)
+        unexplained = paths.unexplained_share(scaled)
+        unit = _check_units(scaled, paths)
+        if unit and not is_near and unexplained < _UNRELATED_PATH:
             return (unit,)
-        if not is_scale_given and left < min(_SUSPECT_PATH, _MENDED_PATH * share):
-            return _of_scale(scaled, scaled.model.tuning.any_scale, is_child)
+        if not is_scale_given and unexplained < min(_SUSPECT_PATH, _MENDED_PATH * share):
+            return _check_scale(scaled, scaled.model.tuning.any_scale, paths)
     share = min(share, 1.0)
     severity = Severity.WARNING if is_near else Severity.ERROR
     text = f"{share:.0%} of the motion of the positions is not that of the odometry"
     return (finding("unrelated", severity=severity, share=share, text=text),)
 
 
-def _of_scale(
-    solution: of_positions.LeverArmSolution, expected: float, is_child: bool
-) -> tuple[Finding, ...]:
-    """A finding if one stream's lengths differ from the other's by more than an odometry may have.
+def _check_units(solution: of_positions.LeverArmSolution, paths: _Paths) -> Finding | None:
+    """Detect positions or an odometry in another unit of length."""
+    scale = paths.child_scale(solution.scale)
+    sigma = solution.scale_sigma * (scale / solution.scale)
+    odometry = Trajectory(paths.stamps_ns, paths.poses)
+    antenna = Trajectory.from_positions(paths.stamps_ns, paths.positions)
+    if paths.is_child:
+        return in_other_units(scale, sigma, odometry, antenna)
+    return in_other_units(scale, sigma, antenna, odometry)
 
-    The model expects a scale near 1 within ``expected``. That expectation is taken out.
+
+def _check_scale(
+    solution: of_positions.LeverArmSolution, prior_sigma: float, paths: _Paths
+) -> tuple[Finding, ...]:
+    """Detect a scale between the streams that is larger than the error of an odometry.
+
+    The model has a prior of 1 with ``prior_sigma`` for the scale. It is removed here.
     """
-    shown = 1.0 - (solution.scale_sigma / expected) ** 2
+    shown = 1.0 - (solution.scale_sigma / prior_sigma) ** 2
     if shown < _SHOWN_SCALE:
         return ()
     excess = (solution.scale - 1.0) / shown
     sigma = solution.scale_sigma / shown**0.5
-    scale = 1.0 + excess if is_child else 1.0 / max(1.0 + excess, _LEAST_SCALE)
     if abs(excess) < _SCALE_SIGMAS * sigma:
         return ()
+    scale = 1.0 + excess
+    if not paths.is_child:
+        scale = 1.0 / max(scale, _LEAST_SCALE)
     differs = graded("scale", "child", scale - 1.0, scale=scale, sigma=sigma * scale**2)
     return (differs,) if differs else ()
 
@@ -225,22 +247,26 @@ def _of_scale(
 def estimate_rotation(
     pose_pairs: PosePairs, config: CalibratorConfig, cross_check: bool = True
 ) -> Calibration:
-    """Solve and assess synchronised rotations on one clock.
+    """Solve and assess synchronised rotations.
 
-    The result has no frame names, and a translation of zero, which is unknown: positions do not
-    count. The poses already have the time offset of the options, in seconds. With a
-    ``cross_check`` the result is compared with DNLO's answers from the same rotations.
+    The result has no frame names. Its translation is zero, and unknown.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        On one clock: the time offset of the options is applied already. Positions are ignored.
+    config : CalibratorConfig
+    cross_check : bool
+        Whether to compare the result with DNLO's answers from the same rotations.
     """
-    Ts_pw_p, as_read = (
-        se3.from_rotation_translation(Ts[:, :3, :3], np.zeros((len(Ts), 3)))
-        for Ts in (pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
-    )
     stamps_ns = pose_pairs.stamps_ns
+    Ts_pw_p = _rotations_of(pose_pairs.Ts_pw_p)
+    as_read = _rotations_of(pose_pairs.Ts_cw_c)
     has_rates = "rates" in (config.parent_measures, config.child_measures)
-    solution, Ts_cw_c = _rotation(stamps_ns, Ts_pw_p, as_read, has_rates)
-    findings = _of_rotation(Ts_pw_p, Ts_cw_c, solution.T_parent_child)
+    solution, Ts_cw_c = _solve_rotation(stamps_ns, Ts_pw_p, as_read, has_rates)
+    findings = _check_rotation(Ts_pw_p, Ts_cw_c, solution.T_parent_child)
     if findings and has_rates:
-        findings = _rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
+        findings = _check_rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
     rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
     solved = estimation.Solved(
         solution=solution,
@@ -256,18 +282,24 @@ def estimate_rotation(
     floor = estimation.floor_of(solved, rotations, config) * np.repeat([0.0, 1.0], 3)
     solved = replace(solved, floor=floor)
     checked = estimation.cross_checked(solved, config, rotations) if cross_check else None
-    rate_bias = _rate_bias(solution, config) if has_rates else None
     result = replace(checked or solved.calibration(), findings=findings)
-    return result.with_part("rate_bias", rate_bias) if rate_bias else result
+    if not has_rates:
+        return result
+    return result.with_part("rate_bias", _rate_bias(solution, config))
 
 
-def _rotation(
+def _rotations_of(Ts: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) with the same rotations and zero translations."""
+    return se3.from_rotation_translation(Ts[:, :3, :3], np.zeros(3))
+
+
+def _solve_rotation(
     stamps_ns: IntArray, Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, has_rates: bool
 ) -> tuple[adaptive_estimator.AdaptiveSolution, FloatArray]:
-    """The solution, and the child's poses without the bias of the rates.
+    """Estimate the rotation; return the solution, and the child's poses without a rate bias.
 
-    The noise is fitted to increments of up to some seconds. What a bias does to these is linear
-    only for what is left of it after a first solve.
+    The noise is fitted to increments of up to some seconds. Their change by a bias is linear only
+    for a small bias, so a first solve removes most of it.
     """
     solve = partial(adaptive_estimator.solve, stamps_ns, Ts_pw_p, is_clock_free=True)
     if not has_rates:
@@ -281,9 +313,9 @@ def _rotation(
 
 
 def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: CalibratorConfig) -> RateBias:
-    """The bias of the rates, in the axes of the sensor that has it.
+    """Return the bias of the rates, in the axes of the sensor that has it.
 
-    Of two gyroscopes only the difference of the biases shows, the child's less the parent's.
+    Two gyroscopes reveal only the difference of their biases, the child's less the parent's.
     """
     bias, sigmas = solution.rate_bias
     of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
@@ -295,16 +327,17 @@ def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: Calibrator
     return RateBias(of=of, rad_per_s=tuple(bias.tolist()), sigma=tuple(sigmas.tolist()))
 
 
-def _of_rotation(
+def _check_rotation(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, T_parent_child: FloatArray
 ) -> tuple[Finding, ...]:
-    """A finding if the rotations of one stream do not explain those of the other."""
+    """Detect rotations of one stream that do not explain those of the other."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
-    left = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)
-    turned = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
-    most = turned >= np.quantile(turned, _TURNING)  # a sensor may stand still for long
-    share = float(np.median(left[most]) / max(float(np.median(turned[most])), 1e-12))
+    residuals = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)
+    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    is_turning = angles >= np.quantile(angles, _TURNING)
+    usual_angle = float(np.median(angles[is_turning]))
+    share = float(np.median(residuals[is_turning]) / max(usual_angle, 1e-12))
     if share < _UNRELATED_ROTATION:
         return ()
     share = min(share, 1.0)
@@ -312,19 +345,20 @@ def _of_rotation(
     return (finding("unrelated", share=share, text=text),)
 
 
-def _rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:
-    """A finding if the rates of one stream are in degrees and those of the other in radians."""
-    of_parent, of_child = (
-        max(float(np.quantile(se3.rotation_angle(Ts[:, :3, :3]), _TURNING)), 1e-12)
-        for Ts in (steps.Ts_parenti_parentj, steps.Ts_childi_childj)
-    )
+def _check_rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:
+    """Detect rates of one stream in degrees per second and of the other in radians."""
+    ratio = _large_angle(steps.Ts_childi_childj) / _large_angle(steps.Ts_parenti_parentj)
     stream = "child"
-    ratio = of_child / of_parent
-    degrees = float(np.degrees(1.0))
     if config.child_measures != "rates":
+        ratio = _large_angle(steps.Ts_parenti_parentj) / _large_angle(steps.Ts_childi_childj)
         stream = "parent"
-        ratio = of_parent / of_child
+    degrees = float(np.degrees(1.0))
     if min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0)) >= _UNIT_WITHIN:
         return ()
     unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
     return (finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as),)
+
+
+def _large_angle(motions: FloatArray) -> float:
+    """Return a large rotation angle (rad) of motions (K, 4, 4), above zero."""
+    return max(float(np.quantile(se3.rotation_angle(motions[:, :3, :3]), _TURNING)), 1e-12)

@@ -1,17 +1,21 @@
 """Lever arm of a sensor that measures only positions: a GNSS antenna, the prism of a total station.
 
-Each pose has a latent rotation of the sensor in the world of the positions. It may be anything, but
-changes from pose to pose as the odometry of the other sensor says, up to its drift. This is the
-state space of the adaptive estimator (:mod:`~hand_eye_calib.core.noise.state_space`) with a white
-rotation error without bounds. The rotations are updated from the positions until they settle. The
-sensor's frame has the axes of the other sensor by convention: ``X = (I, l)``. The search starts
-from windows of the recording, each aligned by itself.
+The odometry of the other sensor has the poses (R_i, t_i). The measured positions are
+
+    q_i = W_i (R_i l + t_i) + o_i + white noise
+
+with the lever arm l and the pose (W_i, o_i) of the odometry's world in the world of the positions,
+which drifts. The orientations Q_i = W_i R_i are latent: their error is white without bounds, and
+they change from pose to pose as the odometry does, up to its drift. This is the state space of the
+adaptive estimator (:mod:`~hand_eye_calib.core.noise.state_space`, docs/adaptive.md) for X = (I, l).
+The orientations are updated from the positions until they settle. The search starts from windows of
+the recording, each aligned on its own.
 
 Errors that act like a lever arm are parameters beside it, with the prior of usual sensors: a scale
 and a direction of the odometry's path, and a time offset. The response of positions to acceleration
-is in the covariance only: on recorded drones even its sign depends on the frequency. A drone tilts
-to accelerate, so that positions with a response kappa (s^2), as smoothed ones have, move the
-vertical lever arm by kappa g.
+is only in the covariance: on recorded drones even its sign depends on the frequency. A drone tilts
+to accelerate. Positions with a response kappa (s^2), for instance smoothed ones, move the vertical
+lever arm by kappa g.
 """
 
 from __future__ import annotations
@@ -45,45 +49,45 @@ from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
 
-# A parameter that poses do not have: what the positions less the odometry are per m/s^2 of
-# acceleration (s^2). It is not solved with those in the model.
+# Index of a parameter that poses do not have: response of the positions less the odometry to
+# acceleration (s^2). It is not solved with the other parameters.
 RESPONSE = increments.N_SYSTEMATIC
 
-# Log variance (rad^2) of orientations that may be anything.
+# Log variance (rad^2) of orientations without bounds.
 _ANY_ROTATION = math.log(100.0)
 
-# Most steps of the start, which ends if the lever arm moves by less (m). Where the motion does not
-# show the lever arm, it is drawn to zero by this share of the information of an axis.
+# Largest number of steps of the start.
 _START_STEPS = 50
+# The start ends if the lever arm changes by less than this (m).
 _START_SETTLED_M = 1e-6
+# Prior information for a lever arm of zero at the start, as a share of that of an axis: for motion
+# that does not reveal the lever arm.
 _DRAWN = 1e-6
 
-# Parts of a recording whose paths are compared by themselves.
+# Number of parts of a recording whose paths are compared on their own.
 _PATH_PARTS = 10
 
+# Parameters that are solved with the lever arm.
 _SHARED = [increments.SCALE, *increments.BIAS, increments.TIME]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeverArmSolution(ModelSolution):
-    """A lever arm and what it rests on.
+    """A lever arm with its noise model.
 
     Attributes
     ----------
     lever_arm : (3,) array
         m, in the axes of the sensor with poses.
     covariance : (3, 3) array
-        Under the model, misfit accounted for.
-    response : (float, float)
-        What positions less odometry are per m/s^2 of acceleration, s^2, and its sigma.
-    worse : (N,) bool array
-        Positions that are left out, for those around are far less precise than the best.
+        Covariance under the model, with the misfit.
+    imprecise : (N,) bool array
+        Positions that are left out, because their neighbourhood is far less precise than the best.
     """
 
     lever_arm: FloatArray
     covariance: FloatArray
-    response: tuple[float, float]
-    worse: BoolArray
+    imprecise: BoolArray
 
     def describe(self, stamps_ns: IntArray) -> Noise:
         """Return the noise in numbers and in words, as of an AdaptiveSolution."""
@@ -94,14 +98,15 @@ class LeverArmSolution(ModelSolution):
             f"each position is off by {white} per axis, and the odometry drifts by {drift} from "
             "one to the next"
         ]
-        if self.worse.any():
-            share = f"{self.worse.mean():.0%} of the positions"
+        if self.imprecise.any():
+            share = f"{self.imprecise.mean():.0%} of the positions"
             sentences.append(f"{share} are far less precise, and are left out")
-        response, sigma = 1e3 * np.array(self.response)
-        if abs(response) > PLAIN_SIGMAS * sigma:
+        response_mm = -1e3 * self.parameters[RESPONSE]
+        sigma_mm = 1e3 * self.parameter_sigmas[RESPONSE]
+        if abs(response_mm) > PLAIN_SIGMAS * sigma_mm:
             sentences.append(
-                f"the positions answer to acceleration by {response:.1f} +/- {sigma:.1g} mm per "
-                "m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
+                f"the positions answer to acceleration by {response_mm:.1f} +/- {sigma_mm:.1g} mm "
+                "per m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
             )
         sentences += self.events(stamps_ns)
         return Noise(
@@ -137,10 +142,11 @@ def solve(
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     Ts = se3.from_rotation_translation(rotations, scale * positions)
     streams = increments.Streams(stamps_s, Ts_pw_p, Ts)
-    state = _State.first(streams, lever_arm, with_scale, tuning)
+    state = _State.initial(streams, lever_arm, with_scale, tuning)
     for number in range(tuning.rounds):
         if number in tuning.fits:
-            state = state.fitted(("body", "world") if number == tuning.fits[0] else ())
+            is_first_fit = number == tuning.fits[0]
+            state = state.fitted(("body", "world") if is_first_fit else ())
         posterior = Posterior(state.space(), state.levels)
         if number + 1 in tuning.fits[1:]:
             state = state.with_outliers(posterior)
@@ -152,17 +158,33 @@ def solve(
         converged = number > tuning.fits[-1] and is_settled
         if converged:
             break
-        state = state.moved(posterior, step)
+        state = state.after(posterior, step)
     return _solution(state, posterior, converged, scale)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _State:
-    """State of the search. The child's poses are its ``positions`` (N, 3), bridged where they
-    are left out, with the orientations known so far. ``X`` is (I, l). ``parameters`` are (9,); the
-    lever arm and those that are asked for are known to ``sigmas`` (9,) beforehand. ``boost`` (n,)
-    are factors of the walk's variance, above 1 at jumps; those around positions that are ``worse``
-    (N,) are far less precise than the best.
+    """State of the search.
+
+    Attributes
+    ----------
+    positions : (N, 3) array
+    streams : Streams
+        The child's poses are the positions with the current orientations. Positions that are left
+        out are bridged.
+    X : (4, 4) array
+        (I, l).
+    sigmas : (9,) array
+        Prior standard deviations of the lever arm and the parameters.
+    parameters : (9,) array
+    model : NoiseModel
+    levels : (m,) array
+    outliers : Outliers
+    walk_factors : (n,) array
+        Factors of the walk's variance, above 1 at jumps.
+    imprecise : (N,) bool array
+        Positions whose neighbourhood is far less precise than the best.
+    tuning : Tuning
     """
 
     positions: FloatArray
@@ -173,19 +195,19 @@ class _State:
     model: NoiseModel
     levels: FloatArray
     outliers: Outliers
-    boost: FloatArray
-    worse: BoolArray
+    walk_factors: FloatArray
+    imprecise: BoolArray
     tuning: Tuning
 
     @classmethod
-    def first(
+    def initial(
         cls,
         streams: increments.Streams,
         lever_arm: FloatArray,
         with_scale: bool,
         tuning: Tuning,
     ) -> _State:
-        """State at the beginning."""
+        """Return the state at the start of the search."""
         stamps_s = streams.stamps_s
         n = len(streams) - 1
         sigmas = np.array(tuning.of_positions)
@@ -202,29 +224,30 @@ class _State:
             model=NoiseModel((), "sensors", interval_s, duration_s, tuning),
             levels=np.zeros(0),
             outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
-            boost=np.ones(n),
-            worse=np.zeros(n + 1, dtype=bool),
+            walk_factors=np.ones(n),
+            imprecise=np.zeros(n + 1, dtype=bool),
             tuning=tuning,
         )
         residuals = state.linearised().columns[:, :, -1]
         squares = (residuals[:, :3] ** 2).sum(axis=1)
-        around = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
-        worse = _worse(np.concatenate(around), tuning, LOWEST_VARIANCE)
-        levels = rough_levels(residuals, worse[1:] | worse[:-1], tuning)
+        square_of_position = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
+        imprecise = _imprecise(np.concatenate(square_of_position), tuning, LOWEST_VARIANCE)
+        levels = rough_levels(residuals, imprecise[1:] | imprecise[:-1], tuning)
         levels[ROTATION] = _ANY_ROTATION
         levels[WALK_ROTATION] = tuning.rotation_walk[1]
-        streams = bridged(streams, state.X, worse)
-        return replace(state, streams=streams, levels=levels, worse=worse)
+        streams = bridged(streams, state.X, imprecise)
+        return replace(state, streams=streams, levels=levels, imprecise=imprecise)
 
     @property
     def left_out(self) -> BoolArray:
-        """(N,) which positions are no evidence."""
-        return self.outliers.spikes | self.worse
+        """Positions (N,) that are no evidence."""
+        return self.outliers.spikes | self.imprecise
 
     @property
     def course(self) -> increments.Course:
-        """Of the sensor with poses, at the lever arm: free of the noise of the positions, but in
-        their world.
+        """Course of the lever arm's end by the odometry, in the world of the positions.
+
+        It has no noise of the positions.
         """
         streams = self.streams
         course = increments.course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
@@ -237,65 +260,67 @@ class _State:
         )
 
     def linearised(self) -> increments.Linearisation:
-        """Increments between poses, with the columns of the lever arm and of the parameters."""
-        course = self.course
-        moving = _accelerations(self.streams, self.X, self.tuning)
+        """Linearise increments between poses by the lever arm and the parameters."""
+        accelerations = _accelerations(self.streams, self.X, self.tuning)
         linearisation = increments.linearise(
-            self.streams, course, self.X, self.parameters[:RESPONSE], _SHARED
+            self.streams, self.course, self.X, self.parameters[:RESPONSE], _SHARED
         )
-        answering = se3.times(linearisation.adjoints, moving[:-1]) - moving[1:]
-        columns = np.insert(linearisation.columns, -1, answering, axis=2)
+        response = se3.times(linearisation.adjoints, accelerations[:-1]) - accelerations[1:]
+        columns = np.insert(linearisation.columns, -1, response, axis=2)
         return replace(linearisation, columns=np.delete(columns, [3, 4, 5], axis=2))
 
     def space(self, model: NoiseModel | None = None) -> StateSpace:
-        """State space of all poses: without a rotation to estimate, with orientations that may be
-        anything, and with a walk that is the odometry's.
+        """Return the state space of all poses.
+
+        It has no rotation to estimate, orientations without bounds, and the odometry's walk.
         """
         values = np.r_[self.X[:3, 3], self.parameters[[*_SHARED, RESPONSE]]]
-        known = known_products(range(len(values)), values, self.sigmas**-2.0, len(values) + 1)
+        prior = known_products(range(len(values)), values, self.sigmas**-2.0, len(values) + 1)
         space = (model or self.model).state_space(
             self.streams,
             self.linearised(),
             self.course.twists,
             self.X,
             np.where(self.left_out, 0.0, 1.0),
-            np.zeros(len(self.boost), dtype=bool),
-            known,
+            np.zeros(len(self.walk_factors), dtype=bool),
+            prior,
         )
         to_child = se3.adjoint(se3.inverse(self.X))
         return replace(
             space,
-            relative=space.relative * self.boost,
+            relative=space.relative * self.walk_factors,
             white=(TRANSLATIONS[None], ROTATIONS[None]),
             walk=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
         )
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
-        """State space of as many poses as noise levels need."""
+        """Return the state space of as many poses as noise levels need."""
         kept = sample(len(self.streams), self.tuning)
         if kept is None:
             return self.space(model)
         jumps = self.outliers.across(kept, self.tuning.longest_gap).jumps
-        return replace(
+        subset = replace(
             self,
             streams=self.streams[kept],
             outliers=Outliers(jumps, self.outliers.spikes[kept]),
-            boost=np.where(jumps, self.boost.max(), 1.0),
-            worse=self.worse[kept],
-        ).space(model)
+            walk_factors=np.where(jumps, self.walk_factors.max(), 1.0),
+            imprecise=self.imprecise[kept],
+        )
+        return subset.space(model)
 
     def fitted(self, kinds: tuple[str, ...] = ()) -> _State:
-        """With noise levels fitted, and with an error of the positions that lasts, of one of these
-        kinds, if the data ask for it.
+        """Return the state with fitted noise levels.
+
+        A lasting error of the positions, of one of these kinds, is added if the data ask for it.
         """
         tuning = self.tuning
-        prior = _prior(self.model, self.levels)
+        prior = _level_prior(self.model, self.levels)
         fit, _ = reml.fit(self.sampled_space(), self.levels, prior, tuning)
         best = replace(self, levels=fit.levels)
         loss = fit.loss - tuning.least_gain
         for kind in kinds:
             model, levels = self.model.with_lasting(((kind, "translation"),), fit.levels)
-            prior = _prior(model, levels)
+            prior = _level_prior(model, levels)
             rival, _ = reml.fit(self.sampled_space(model), levels, prior, tuning)
             if rival.loss < loss:
                 best = replace(self, model=model, levels=rival.levels)
@@ -303,25 +328,32 @@ class _State:
         return best
 
     def with_outliers(self, posterior: Posterior) -> _State:
-        """With jumps, which are large steps of the walk, positions wrong by themselves, and
-        positions left out if those around are clearly worse than the rest.
+        """Return the state with detected jumps, outliers and imprecise positions.
+
+        Jumps are large steps of the walk; outliers are single wrong positions.
         """
         of_walk, of_white = innovations(posterior, self.left_out)
         tuning = self.tuning
         outliers = judged(self.outliers, of_walk, of_white, tuning)
-        boost = np.where(outliers.jumps, np.maximum(tuning.jump_factor * of_walk, self.boost), 1.0)
-        states = posterior.states_after(posterior.normal.step)[:, :3]
+        jump_factors = np.maximum(tuning.jump_factor * of_walk, self.walk_factors)
+        errors = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
-        path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], states)
+        path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], errors)
         spread = posterior.factor.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
-        worse = _worse(((self.positions - path) ** 2 + spread).sum(axis=1), tuning, drift)
-        Ts_cw_c[:, :3, 3] = np.where(worse[:, None], path, self.positions)
-        streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
-        return replace(self, outliers=outliers, boost=boost, streams=streams, worse=worse)
+        squares = ((self.positions - path) ** 2 + spread).sum(axis=1)
+        imprecise = _imprecise(squares, tuning, drift)
+        Ts_cw_c[:, :3, 3] = np.where(imprecise[:, None], path, self.positions)
+        return replace(
+            self,
+            outliers=outliers,
+            walk_factors=np.where(outliers.jumps, jump_factors, 1.0),
+            streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
+            imprecise=imprecise,
+        )
 
-    def moved(self, posterior: Posterior, step: FloatArray) -> _State:
-        """After a step, with the orientations that the positions ask for."""
+    def after(self, posterior: Posterior, step: FloatArray) -> _State:
+        """Return the state after a step, with the orientations that the positions ask for."""
         turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
@@ -329,27 +361,30 @@ class _State:
         parameters = self.parameters.copy()
         X[:3, 3] += step[:3]
         parameters[_SHARED] += step[3:]
-        return replace(
-            self,
-            streams=replace(self.streams, Ts_cw_c=Ts_cw_c),
-            X=X,
-            parameters=parameters,
-        )
+        streams = replace(self.streams, Ts_cw_c=Ts_cw_c)
+        return replace(self, streams=streams, X=X, parameters=parameters)
 
 
-def _worse(squares: FloatArray, tuning: Tuning, least: float) -> BoolArray:
-    """Which positions (N,) are clearly worse than the best quarter, by the squared errors (N,) of
-    those around, and than the least square: the odometry's drift from one position to the next.
+def _imprecise(squares: FloatArray, tuning: Tuning, least: float) -> BoolArray:
+    """Detect positions (N,) in neighbourhoods far less precise than the best quarter.
+
+    Parameters
+    ----------
+    squares : (N,) array
+        Squared errors, m^2.
+    tuning : Tuning
+    least : float
+        Least usual square (m^2): the odometry's drift from one position to the next.
     """
     window = np.ones(min(tuning.neighbours, len(squares)))
-    around = np.convolve(squares, window, mode="same")
+    sums = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
-    usual = max(float(np.quantile(around / counts, 0.25)), least)
-    return np.asarray(around > tuning.worse * usual * counts)
+    usual = max(float(np.quantile(sums / counts, 0.25)), least)
+    return np.asarray(sums > tuning.worse * usual * counts)
 
 
-def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
-    """What is known of log levels beforehand, for a search from these."""
+def _level_prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
+    """Prior of the log levels for a search from these levels."""
     prior = model.prior(levels)
     prior.lower[ROTATION] = prior.upper[ROTATION] = _ANY_ROTATION
     lowest, _, highest = model.tuning.rotation_walk
@@ -361,23 +396,23 @@ def _prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
 def _solution(
     state: _State, posterior: Posterior, converged: bool, first_scale: float
 ) -> LeverArmSolution:
+    """Return the solution of the last round, scaled by the scale of the start."""
     normal = NormalEquations(_solved(posterior.products))
-    n_evidence = len(state.boost) - int(state.left_out.sum())
+    n_evidence = len(state.walk_factors) - int(state.left_out.sum())
     misfit = float(normal.cost) / max(3 * n_evidence - 3 - len(_SHARED), 1)
-    # With the answer to acceleration, and by what it would move the lever arm.
-    whole = posterior.normal
-    covariance = max(misfit, 1.0) * whole.covariance
-    shift = (whole.step[:-1] - normal.step)[:3]
+    # The covariance includes the response to acceleration, and the shift by its estimate.
+    with_response = posterior.normal
+    covariance = max(misfit, 1.0) * with_response.covariance
+    shift = (with_response.step[:-1] - normal.step)[:3]
     sigmas = np.zeros(RESPONSE + 1)
     parameters = state.parameters.copy()
     sigmas[[*_SHARED, RESPONSE]] = np.sqrt(np.diag(covariance)[3:])
-    parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], whole.step[-1]]
-    # Errors that last for a share of the recording do so for all of it, too: X takes their mean.
+    parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], with_response.step[-1]]
+    # An error that lasts for a share of the recording may last for all of it: X absorbs its mean.
     lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
     return LeverArmSolution(
         lever_arm=state.X[:3, 3] + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
-        response=(float(-parameters[RESPONSE]), float(sigmas[RESPONSE])),
         parameters=parameters,
         parameter_sigmas=sigmas,
         scale=first_scale * (1.0 + float(parameters[increments.SCALE])),
@@ -386,7 +421,7 @@ def _solution(
         time_offset_sigma_s=float(sigmas[increments.TIME]),
         model=state.model,
         levels=state.levels,
-        worse=state.worse,
+        imprecise=state.imprecise,
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
         part_products=_solved(posterior.part_products()),
@@ -397,14 +432,16 @@ def _solution(
 
 
 def _solved(products: FloatArray) -> FloatArray:
-    """The products (..., 9, 9) of what the lever arm is solved with, and of the residuals."""
-    rows = [*range(3 + len(_SHARED)), products.shape[-1] - 1]
-    return products[..., rows, :][..., rows]
+    """Products (..., 9, 9) of the lever arm, the parameters solved with it, and the residuals."""
+    response = 3 + len(_SHARED)
+    return np.delete(np.delete(products, response, axis=-2), response, axis=-1)
 
 
 def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -> FloatArray:
-    """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes, from steps on
-    either side of each pose, whose own noise is not in them; zero beside gaps and at the ends.
+    """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes.
+
+    They come from steps on either side of each pose, without the noise of the pose itself. They are
+    zero beside gaps and at the ends.
     """
     path = (streams.Ts_pw_p @ X)[:, :3, 3]
     stamps_s = streams.stamps_s
@@ -425,15 +462,22 @@ def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -
 def _start(
     Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool, window: int
 ) -> tuple[FloatArray, float, FloatArray]:
-    """The lever arm (3,) and the scale, if it is asked for, that fit windows best, of which bad
-    ones count less; and the rotations (N, 3, 3) of the other sensor in the world of the positions,
-    window by window.
+    """Fit windows of the recording, each aligned on its own, with robust weights.
+
+    Returns
+    -------
+    lever_arm : (3,) array
+    scale : float
+        1 unless asked for.
+    rotations : (N, 3, 3) array
+        Of the other sensor in the world of the positions, window by window.
     """
     lever_arm = np.zeros(3)
     scale = 1.0
-    whole = Ts_pw_p[:, :3, :3], Ts_pw_p[:, :3, 3], positions
     size = min(window, len(positions))
-    axes, path, measured = (_windows(values, size) for values in whole)
+    axes = _windows(Ts_pw_p[:, :3, :3], size)
+    path = _windows(Ts_pw_p[:, :3, 3], size)
+    measured = _windows(positions, size)
     information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
     for _ in range(_START_STEPS):
         predicted = axes @ lever_arm + path
@@ -442,30 +486,45 @@ def _start(
         if with_scale:
             products = (rotated * predicted).sum(axis=(1, 2))
             squares = (rotated**2).sum(axis=(1, 2))
-            shares = np.divide(products, squares, np.zeros_like(products), where=squares > 0.0)
+            scales = np.divide(products, squares, np.zeros_like(products), where=squares > 0.0)
             # Paths that do not move have no scale.
-            scale = float(np.median(shares)) or 1.0
+            scale = float(np.median(scales)) or 1.0
         residuals = scale * rotated - path
         errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
         weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
-        pulled = np.einsum("n,nkij,nki->j", weights, axes, residuals)
-        before = lever_arm
-        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), pulled)
-        if np.abs(lever_arm - before).max() < _START_SETTLED_M:
+        score = np.einsum("n,nkij,nki->j", weights, axes, residuals)
+        previous = lever_arm
+        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), score)
+        if np.abs(lever_arm - previous).max() < _START_SETTLED_M:
             break
-    of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
-    return lever_arm, scale, turns[of_pose] @ Ts_pw_p[:, :3, :3]
+    window_of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
+    return lever_arm, scale, turns[window_of_pose] @ Ts_pw_p[:, :3, :3]
 
 
 def unexplained_share(
     Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray, scale: float
 ) -> float:
-    """Share of the path of positions (N, 3) that the poses (N, 4, 4) and a lever arm do not
-    explain, in tenths of the recording, each aligned by itself; 1 if nothing moves.
+    """Return the share of the path of positions that poses and a lever arm do not explain.
+
+    The share is the median over tenths of the recording, each aligned on its own.
+
+    Parameters
+    ----------
+    Ts_pw_p : (N, 4, 4) array
+    positions : (N, 3) array
+    lever_arm : (3,) array
+    scale : float
+        Of the positions.
+
+    Returns
+    -------
+    float
+        1 if nothing moves.
     """
     predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
     size = max(len(positions) // _PATH_PARTS, min(_PATH_PARTS, len(positions)))
-    expected, measured = (_windows(path, size) for path in (predicted, scale * positions))
+    expected = _windows(predicted, size)
+    measured = _windows(scale * positions, size)
     residuals = measured @ _rotations(measured, expected) - expected
     usual_residual = np.median((residuals**2).sum(axis=(1, 2)))
     usual_path = np.median((measured**2).sum(axis=(1, 2)))
@@ -473,12 +532,12 @@ def unexplained_share(
 
 
 def _windows(values: FloatArray, size: int) -> FloatArray:
-    """Values (N, ...) of windows of a size, (n, size, ...), each less its mean."""
+    """Values (n, size, ...) of windows of values (N, ...), each less its mean."""
     whole = len(values) // size * size
     windows = values[:whole].reshape(-1, size, *values.shape[1:])
     return windows - windows.mean(axis=1, keepdims=True)
 
 
 def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of windows, centred."""
+    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of centred windows."""
     return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))
