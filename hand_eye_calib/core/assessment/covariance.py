@@ -312,7 +312,7 @@ def combined(T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatA
     whole = known @ covariance @ known + scaled @ scaled.T
     rotation = T_parent_child[:3, :3]
     sigmas = sigmas_in_parent(rotation, whole)
-    unknown_shares = ((np.kron(np.eye(2), rotation) @ unknown) ** 2).sum(axis=1)
+    unknown_shares = ((se3.on_both(rotation) @ unknown) ** 2).sum(axis=1)
     sigmas = np.where(unknown_shares > _HIDDEN_SHARE, np.inf, sigmas)
     return Assessment(T_parent_child, whole, tuple(map(judged, AXES, sigmas.tolist())))
 
@@ -327,7 +327,7 @@ def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
     ]
     if not any(is_hidden):
         return assessment
-    in_parent = np.kron(np.eye(2), assessment.T_parent_child[:3, :3])
+    in_parent = se3.on_both(assessment.T_parent_child[:3, :3])
     return _without(assessment, in_parent[is_hidden].T)
 
 

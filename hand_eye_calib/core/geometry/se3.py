@@ -397,15 +397,22 @@ _LOCKED_COSINE = 1e-4
 
 
 def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances (..., 6, 6) along and about axes that rotations (..., 3, 3) turn theirs to.
+    """Rotate covariances (..., 6, 6) of (rho, phi) by rotations (..., 3, 3).
 
-    Of a pose they are as ROS messages carry them (REP-103): the engine's error xi = (rho, phi) in
-    ``T_parent_child @ exp(xi)`` moves the child's origin by ``R rho``, to first order, and rotates
-    the child by ``R phi`` about the parent's axes through that origin. There is no lever arm.
+    The result is along and about the parent's axes, as ROS messages carry covariances (REP 103):
+    an error xi = (rho, phi) in ``T_parent_child @ exp(xi)`` moves the child's origin by ``R rho``,
+    to first order, and rotates the child by ``R phi`` about the parent's axes through this origin.
+    There is no lever arm.
     """
+    both = on_both(rotation)
+    return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
+
+
+def on_both(rotation: FloatArray) -> FloatArray:
+    """Matrices (..., 6, 6) that rotate rho and phi by the same rotations (..., 3, 3)."""
     both = np.zeros((*np.shape(rotation)[:-2], 6, 6))
     both[..., :3, :3] = both[..., 3:, 3:] = rotation
-    return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
+    return both
 
 
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
