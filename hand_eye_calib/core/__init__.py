@@ -2,12 +2,20 @@
 
 from typing import Any
 
-from hand_eye_calib.core.base.registry import KINDS
+from hand_eye_calib.core.base.registry import KINDS, MEASURES, OUT_OF_REACH, Measure
 
 
 def register() -> None:
-    """Register two streams of poses as a kind of data."""
+    """Register two streams of poses as a kind of data, and what messages and files contain."""
     KINDS["poses"] = _poses
+    MEASURES["poses"] = Measure("poses")
+    MEASURES["positions"] = Measure(
+        "positions", "positions determine a lever arm only beside poses of the other sensor"
+    )
+    MEASURES["rotations"] = Measure("rotations")
+    MEASURES["rates"] = Measure("rotations")
+    OUT_OF_REACH["rotations"] = ("x", "y", "z")
+    OUT_OF_REACH["positions"] = ("roll", "pitch", "yaw")
 
 
 def _poses() -> Any:

@@ -14,15 +14,21 @@ import hand_eye_calib as hec
 from hand_eye_calib.extras import EXTRAS
 from hand_eye_calib.offline.cli.main import main
 
-# Run without the finder of an editable install, which would find the deleted folder elsewhere.
-WITHOUT = """
-import importlib.util
-import json
+# Without the finder of an editable install, which would find the deleted folder elsewhere.
+WITHOUT_FINDER = """
 import sys
 
 sys.meta_path[:] = [
     finder for finder in sys.meta_path if "__editable__" not in getattr(finder, "__module__", "")
 ]
+"""
+
+WITHOUT = (
+    WITHOUT_FINDER
+    + """
+import importlib.util
+import json
+
 import hand_eye_calib as hec
 
 extra = sys.argv[1]
@@ -41,6 +47,7 @@ if sys.argv[3:]:
         code = end.code
     assert code in (1, 2), code
 """
+)
 
 # What needs an extra, and the one line that says so without it.
 SAMPLE = ["sample:lidar.tum", "sample:camera.tum"]
@@ -139,18 +146,83 @@ def run(arguments):
 '''
 
 
-def test_a_new_extra_is_a_folder_and_a_line(tmp_path):
-    copy = copy_of_the_package(tmp_path)
+def run_with_toy(folder, source, command):
+    """Run Python with a copy of the package that has one extra more."""
+    copy = copy_of_the_package(folder)
     (copy / "extras" / "toy").mkdir()
-    (copy / "extras" / "toy" / "__init__.py").write_text(TOY)
+    (copy / "extras" / "toy" / "__init__.py").write_text(source)
     table = copy / "extras" / "__init__.py"
     text = table.read_text(encoding="utf-8")
     table.write_text(text.replace("EXTRAS = (\n", 'EXTRAS = (\n    "toy",\n'), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-m", PACKAGE, "toy", "one", "two"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+    return subprocess.run(
+        [sys.executable, *command],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(folder)},
         capture_output=True,
         text=True,
     )
+
+
+def test_a_new_extra_is_a_folder_and_a_line(tmp_path):
+    done = run_with_toy(tmp_path, TOY, ["-m", PACKAGE, "toy", "one", "two"])
     assert (done.stdout, done.stderr) == ("2\n", "")
+
+
+TOY_KIND = '''
+"""Poses whose heights mean nothing, such as those of a localisation on a map."""
+
+from hand_eye_calib.core.base.registry import KINDS, MEASURES, OUT_OF_REACH, Measure
+
+
+def register():
+    MEASURES["flat"] = Measure("flat")
+    OUT_OF_REACH["flat"] = ("z",)
+    KINDS["flat"] = _flat
+
+
+def _flat():
+    from dataclasses import replace
+
+    from hand_eye_calib.core.engine import poses
+    from hand_eye_calib.core.engine.estimation import solve_poses
+    from hand_eye_calib.core.engine.kinds import Kind
+    from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S
+
+    def solve(snapshot, cross_check):
+        solved = solve_poses(snapshot.pose_pairs, snapshot.config, snapshot.time_offset)
+        return replace(solved, measured="flat").calibration(("z",))
+
+    allowed = {"method": ("auto", "adaptive"), "prior_z": ("",)}
+    return Kind(solve, poses.check, MOST_MOVED_S, allowed, has_conventions=True)
+'''
+
+USE_TOY_KIND = """
+import hand_eye_calib as hec
+from hand_eye_calib.core.geometry import se3
+
+drive = hec.simulate(0, poses=300)
+late = drive.child.shifted(-0.3)
+inverse = hec.Trajectory(late.stamps_ns, se3.inverse(late.poses))
+for child in (late, inverse):
+    result = hec.calibrate(drive.parent, child, child_measures="flat")
+    error = abs(result.T_parent_child - drive.T_parent_child)[:2, 3].max()
+    print(result.measured, result.out_of_reach, result.hidden, result.status.value)
+    print(error < 0.05, abs(result.time_offset_s - 0.3) < 0.01, result.verdict.value)
+    print([text for text in result.warnings if "solved with" in text.lower()] != [])
+for options in ({"method": "dnl"}, {"prior": {"z": (1.0, 0.1)}}, {"parent_measures": "rates"}):
+    try:
+        hec.calibrate(drive.parent, late, child_measures="flat", **options)
+    except hec.HandEyeCalibError as error:
+        print(error)
+"""
+
+
+def test_a_new_kind_of_data_is_a_folder_and_a_line(tmp_path):
+    done = run_with_toy(tmp_path, TOY_KIND, ["-c", WITHOUT_FINDER + USE_TOY_KIND])
+    assert done.stderr == ""
+    *of_streams, method, prior, other = done.stdout.splitlines()
+    assert of_streams == ["flat ('z',) [] ok", "True True USE", "True"] * 2
+    both = "the parent measures poses, the child flat"
+    assert method == f"method dnl needs poses of both sensors; {both}"
+    assert prior == f"prior_z 1.0+/-0.1 needs poses of both sensors; {both}"
+    assert other.startswith("these streams have no result in common; the parent measures rates")

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 import hand_eye_calib.core.base.text as text
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import OptionSet, option
+from hand_eye_calib.core.base.registry import MEASURES
 
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 # As of formats/layouts.yaml.
@@ -20,7 +21,6 @@ EXPORT_FORMATS = (
     *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),
     *("easy_handeye2", "opencv", "numpy"),
 )
-MEASURES = ("poses", "positions", "rotations", "rates")
 PAIR_BY = ("time", "row", "name")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
@@ -292,24 +292,25 @@ class CalibratorConfig(OptionSet):
 
     @property
     def measured(self) -> str:
-        """What both sensors measure together: poses, rotations or positions.
+        """Kind of data that both streams make together: poses, rotations, positions or another.
 
         Raises
         ------
         ConfigError
-            If that is nothing: positions without poses.
+            If the streams make none together, such as positions without poses.
         """
-        found = {self.parent_measures, self.child_measures} - {"auto", "poses"}
-        if not found:
+        words = [word for word in (self.parent_measures, self.child_measures) if word != "auto"]
+        partial = [MEASURES[word] for word in words if word != "poses"]
+        if not partial:
             return "poses"
-        if "positions" not in found:
-            return "rotations"
-        if found != {"positions"} or self.parent_measures == self.child_measures:
-            raise ConfigError(
-                "positions determine a lever arm only beside poses of the other sensor; the parent "
-                f"measures {self.parent_measures}, the child {self.child_measures}"
-            )
-        return "positions"
+        kinds = {measure.kind for measure in partial}
+        reasons = [measure.needs_poses for measure in partial if measure.needs_poses]
+        if len(kinds) == 1 and not (reasons and len(partial) == 2):
+            return kinds.pop()
+        reason = reasons[0] if reasons else "these streams have no result in common"
+        raise ConfigError(
+            f"{reason}; the parent measures {self.parent_measures}, the child {self.child_measures}"
+        )
 
     def require_poses(self, what: str) -> None:
         """Check that both sensors measure whole poses.

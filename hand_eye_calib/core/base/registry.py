@@ -71,6 +71,21 @@ class Route(NamedTuple):
     run: Callable[[Any, Callable[[Any], Any]], int]
 
 
+class Measure(NamedTuple):
+    """What a stream may measure.
+
+    Attributes
+    ----------
+    kind : str
+        Name in ``KINDS`` of the kind of data that the stream makes together with poses.
+    needs_poses : str
+        Why the other stream must be of poses; empty if it need not be.
+    """
+
+    kind: str
+    needs_poses: str = ""
+
+
 class ExtraRule(NamedTuple):
     """A rule of the verdict that an extra adds, see ``core/results/verdict.py``.
 
@@ -132,6 +147,12 @@ TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a tar
 #: Readers of trajectory files of other programs. Called with the path, the bytes, and the options;
 #: return None for a file of another format.
 FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")
+
+#: What a stream may measure: the values of the options ``parent_measures`` and ``child_measures``.
+MEASURES: Registry[Measure] = Registry("measure")
+
+#: Axes that a kind of data has no information about, by the name of the kind; missing for none.
+OUT_OF_REACH: Registry[tuple[str, ...]] = Registry("kind of streams")
 
 #: Functions that return a kind of data (:class:`hand_eye_calib.core.engine.kinds.Kind`), by what
 #: both sensors measure together.

@@ -24,6 +24,7 @@ from hand_eye_calib.core.assessment.rocking import rocking_axis
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, require_backend
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.stats import MEDIAN_NORMAL, median
 from hand_eye_calib.core.base.text import parse_targets
 from hand_eye_calib.core.geometry.se3 import deviation
@@ -35,7 +36,6 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, mot
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.core.results.records import (
     AXES,
-    OUT_OF_REACH,
     AxisScatter,
     CrossCheck,
     Residuals,
@@ -154,7 +154,7 @@ def calibration_of(
     are named before the other warnings.
     """
     dofs = fused.observability
-    silent = OUT_OF_REACH[fields.get("measured", "poses")]
+    silent = OUT_OF_REACH.get(fields.get("measured", "poses"), ())
     open_axes = {dof.name for dof in dofs if dof.verdict is DofVerdict.UNOBSERVABLE}
     status = SolveStatus.UNOBSERVABLE if open_axes.difference(silent) else SolveStatus.OK
     if not solution.converged:

@@ -10,8 +10,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.config import MEASURES
 from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 

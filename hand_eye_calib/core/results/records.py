@@ -23,9 +23,6 @@ TRANSLATIONS = ("x", "y", "z")
 ROTATIONS = ("roll", "pitch", "yaw")
 AXES = (*TRANSLATIONS, *ROTATIONS)
 
-# Axes that streams say nothing about, by what they measure together.
-OUT_OF_REACH = {"poses": (), "rotations": TRANSLATIONS, "positions": ROTATIONS}
-
 
 class SolveStatus(str, Enum):
     """How a solve ended. Only an OK result may be used as it is.

@@ -9,6 +9,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent, sigmas_rpy
@@ -304,6 +305,6 @@ class Result:
     @property
     def out_of_reach(self) -> tuple[str, ...]:
         """Axes that streams of this kind say nothing about, and no prior either."""
-        silent = records.OUT_OF_REACH.get(self.measured, ())
+        silent = OUT_OF_REACH.get(self.measured, ())
         unknown = self.unobservable()
         return tuple(axis for axis in silent if axis in unknown)

@@ -117,8 +117,8 @@ class PoseBag:
         return sorted({f"{each.world_frame}:{each.sensor_frame}" for _, each in first})
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
-        """What a source measures, one of config.MEASURES: what is wanted of it, or what messages of
-        its type are for; a ConfigError if they do not have what is wanted.
+        """What a source measures, one of registry.MEASURES: what is wanted of it, or what messages
+        of its type are for; a ConfigError if they do not have what is wanted.
         """
         topic, _, fields = str(source).partition("?")
         if "=" in fields:

@@ -50,7 +50,7 @@ class Table:
     the others, from 0, ``n_rows`` counts all, ``first_left_out`` is the line of the first.
 
     ``path`` is what messages call it, ``names`` are those of all columns. ``measures`` says what
-    to read, one of config.MEASURES, "twists" for velocities, or "auto", which becomes what the
+    to read, one of registry.MEASURES, "twists" for velocities, or "auto", which becomes what the
     columns are; ``expected`` is what a row should be, for messages. Found are the column of each
     quantity (``at``), such as "x" or "qw", those of the stamp (``stamp_at``) by what they are
     (``stamp_names``), and the ``units`` of quantities and of "t" in the names.

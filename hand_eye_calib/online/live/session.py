@@ -90,7 +90,7 @@ class LiveSession:
         ----------
         stream : str
         measures : str
-            One of ``config.MEASURES``.
+            One of ``registry.MEASURES``.
 
         Raises
         ------
