@@ -15,6 +15,7 @@ from hand_eye_calib.formats.bags.messages import (
     Run,
     unpack_poses,
 )
+from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.storage import MessageKind
 
 ENCODINGS = ("cdr", "ros1")
@@ -84,7 +85,7 @@ def test_poses_at_once_whether_their_frames_are_alike_or_not(encoding, message_t
     if encoding == "cdr":  # one by one, as the node does
         read = unpacking.MessageReader(message_type, "poses")
         stamps, worlds, sensors, *values = zip(*map(read, messages), strict=True)
-        table = unpacking.PoseTable.of(stamps, np.hstack(values), worlds, sensors)
+        table = PoseTable.of(stamps, np.hstack(values), worlds, sensors)
         assert_unpacked(table, drawn, message_type)
 
 

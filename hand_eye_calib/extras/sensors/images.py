@@ -14,6 +14,7 @@ from hand_eye_calib.extras.sensors.target_images import (
     read_camera,
 )
 from hand_eye_calib.formats.bags import messages
+from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.sources import Reading
 
@@ -73,9 +74,9 @@ class ImageReading(Reading):
                 self._bag_ns.append(bag_ns)
                 self._frame = printable(frame_name(message.header.frame_id))
 
-    def table(self) -> messages.PoseTable:
+    def table(self) -> PoseTable:
         found = self._finder.found()
         self.notes.append(f"{self.topics[0]}: {found}")
         poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
-        table = messages.PoseTable.of(self._stamps_ns, poses, "target", self._frame)
+        table = PoseTable.of(self._stamps_ns, poses, "target", self._frame)
         return self._stamped(table.recorded(self.stream, self._bag_ns))

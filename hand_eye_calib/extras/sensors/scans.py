@@ -26,7 +26,8 @@ from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import InputError, printable, required
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.formats.bags.messages import PoseTable, Run, ns_of
+from hand_eye_calib.formats.bags.messages import Run, ns_of
+from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.sources import Reading
 from hand_eye_calib.formats.npz import read_arrays
 

@@ -16,7 +16,8 @@ from std_srvs.srv import Trigger
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import HandEyeCalibError
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.formats.bags.messages import PoseTable, transform_of
+from hand_eye_calib.formats.bags.messages import transform_of
+from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.online.ros.conversions import LATCHED, to_time
 
 # Nothing is lost on the way to a subscription that is reliable too.

@@ -1,4 +1,4 @@
-"""Bags that a pattern with ``*`` or a folder stands for."""
+"""Find the bags that a folder, or a pattern with ``*``, stands for."""
 
 from glob import glob, has_magic
 from pathlib import Path
@@ -6,36 +6,49 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.formats import remote
 
-_BAGS = (".bag", ".mcap", ".db3")
+_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def matching(pattern: str) -> list[str]:
-    """The bags that a pattern stands for, or a ConfigError; a bag stands for itself, another folder
-    for all bags below it. ``**`` finds bags alone.
+    """Return the bags that a pattern stands for.
+
+    A bag stands for itself, and any other folder for all bags below it. ``**`` skips files that are
+    no bags, and files inside bags.
+
+    Raises
+    ------
+    ConfigError
+        If there is none.
     """
-    found = [pattern]
-    if not remote.is_url(pattern) and _is_folder_of_bags(Path(pattern)):
-        pattern = str(Path(pattern) / "**")
-    if remote.is_url(pattern):  # a question mark begins its query
-        found = remote.expanded(pattern) if "*" in pattern else found
-    elif has_magic(pattern) and not Path(pattern).exists():
-        found = sorted(glob(pattern, recursive=True))
-        if "**" in pattern:
-            found = [each for each in found if _is_recording(Path(each))]
-    if not found:
+    if remote.is_url(pattern):  # a question mark begins the query of a URL
+        paths = remote.expanded(pattern) if "*" in pattern else [pattern]
+    else:
+        if _is_folder_of_bags(Path(pattern)):
+            pattern = str(Path(pattern) / "**")
+        paths = _local_bags(pattern)
+    if not paths:
         raise ConfigError(f"no bag matches {pattern}")
-    return found
+    return paths
+
+
+def _local_bags(pattern: str) -> list[str]:
+    if not has_magic(pattern) or Path(pattern).exists():
+        return [pattern]
+    paths = sorted(glob(pattern, recursive=True))
+    if "**" in pattern:
+        paths = [path for path in paths if _is_recording(Path(path))]
+    return paths
 
 
 def _is_folder_of_bags(path: Path) -> bool:
-    """Whether a path is a folder that is no bag itself."""
+    """Return whether a path is a folder that is no bag itself."""
     return path.is_dir() and not any(
-        file.name == "metadata.yaml" or file.suffix in _BAGS for file in path.iterdir()
+        file.name == "metadata.yaml" or file.suffix in _SUFFIXES for file in path.iterdir()
     )
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a path is a bag, and not a file of one."""
+    """Return whether a path is a bag, and not a file inside a bag."""
     if path.is_dir():
         return (path / "metadata.yaml").exists()
-    return path.suffix in _BAGS and not (path.parent / "metadata.yaml").exists()
+    return path.suffix in _SUFFIXES and not (path.parent / "metadata.yaml").exists()

@@ -1,11 +1,10 @@
-"""Reading the poses of two streams from bags."""
+"""Read the poses of two streams from bags."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -19,13 +18,14 @@ from hand_eye_calib.core.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags import messages, roles, sources
 from hand_eye_calib.formats.bags.folders import losses_of, open_bags
-from hand_eye_calib.formats.bags.messages import PoseTable, Run
+from hand_eye_calib.formats.bags.messages import Run
+from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.sources import Reading, Source
+from hand_eye_calib.formats.bags.storage import MessageKind
 from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.transforms import TfSource, TfStream
 
-# A topic with fewer poses is not one of the two sensors: goals and initial poses are published
-# once.
+# A topic with fewer poses is no sensor: goals and initial poses are published once.
 _FEWEST_POSES = 3
 
 
@@ -41,14 +41,31 @@ class TopicInfo(NamedTuple):
 
 
 class PoseBag:
-    """One bag, or several of one recording, opened for reading; a context manager. They are read in
-    the order of their times; those that were recorded at the same time are merged.
+    """Context manager that reads one bag, or several bags of one recording.
 
-    An InputError if there is no bag or it cannot be read. ``files`` are all that are read,
-    ``topics`` are in the order of their names, ``start_ns`` and ``end_ns`` the bag times of the
-    first and last message, if there are any. ``shown`` passes on runs of messages, and may show how
-    far they are; it takes the runs, the number of all messages, what is being done, and what gives
-    the size of a run.
+    The bags are read in the order of their times. Bags that were recorded at the same time are
+    merged.
+
+    Parameters
+    ----------
+    *paths : str or Path
+
+    Attributes
+    ----------
+    files : list of Path
+        All files that are read.
+    topics : dict of str to TopicInfo
+        In the order of their names.
+    start_ns, end_ns : int or None
+        Bag times of the first and the last message; None without messages.
+    shown : callable
+        Passes on runs of messages, and may show the progress. It takes the runs, the number of all
+        messages, the text of the step, and a function that returns the size of a run.
+
+    Raises
+    ------
+    InputError
+        If a path is no bag, or a bag cannot be read.
     """
 
     def __init__(self, *paths: str | Path) -> None:
@@ -59,22 +76,25 @@ class PoseBag:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
         self.files = [file for storage in self._storages for file in storage.paths]
-        types = defaultdict[str, set[str]](set)
-        counts = Counter[str]()
-        for kind, count in chain(*(storage.counts.items() for storage in self._storages)):
-            types[kind.topic].add(kind.type)
-            counts[kind.topic] += count
-        self.topics = {
-            name: TopicInfo(name, "" if len(types[name]) > 1 else types[name].pop(), counts[name])
-            for name in sorted(types)
-        }
+        self.topics = self._all_topics()
         for path in self.paths:
-            inside = [storage for storage in self._storages if path in storage.paths[0].parents]
-            n_present = sum(sum(storage.counts.values()) for storage in inside)
+            n_present = 0
+            for storage in self._storages:
+                if path in storage.paths[0].parents:
+                    n_present += storage.counts.total()
             self._notes += losses_of(path, n_present)
-        spans = [each.span_ns for each in self._storages if each.span_ns]
-        self.start_ns = min((first for first, _ in spans), default=None)
-        self.end_ns = max((last for _, last in spans), default=None)
+        times_ns = [time_ns for storage in self._storages for time_ns in storage.span_ns]
+        self.start_ns = min(times_ns, default=None)
+        self.end_ns = max(times_ns, default=None)
+
+    def _all_topics(self) -> dict[str, TopicInfo]:
+        topics: dict[str, TopicInfo] = {}
+        for storage in self._storages:
+            for kind, count in storage.counts.items():
+                before = topics.get(kind.topic, TopicInfo(kind.topic, kind.type, 0))
+                type_ = kind.type if kind.type == before.type else ""
+                topics[kind.topic] = TopicInfo(kind.topic, type_, before.count + count)
+        return dict(sorted(topics.items()))
 
     def __enter__(self) -> Self:
         return self
@@ -87,13 +107,15 @@ class PoseBag:
 
     @property
     def warnings(self) -> list[str]:
-        """What could not be read, and poses that cannot be right; complete after reading."""
-        losses = [f"{each.paths[0]}: {loss}" for each in self._storages for loss in each.losses]
-        return [*self._notes, *losses]
+        """Lines about unread parts and wrong poses; complete after reading."""
+        warnings = [*self._notes]
+        for storage in self._storages:
+            warnings += [f"{storage.paths[0]}: {loss}" for loss in storage.losses]
+        return warnings
 
     @property
     def duration_s(self) -> float:
-        """Time from the first message to the last; 0 if there is none."""
+        """Time from the first message to the last; 0 without messages."""
         return ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
 
     # ---- topics
@@ -102,38 +124,56 @@ class PoseBag:
         return f"The bag has {', '.join(map(str, self.topics.values())) or 'no topics'}"
 
     def type_of(self, source: Source) -> str:
-        """Message type of a topic; empty for frames, and for what is not there."""
+        """Return the message type of a topic; empty for frames and for missing topics."""
         return self.topics[source].type if source in self.topics else ""
 
-    def _of_transforms(self) -> list[str]:
+    def _tf_topics(self) -> list[str]:
         return [topic.name for topic in self.topics.values() if topic.type in messages.TF_TYPES]
 
     def edges_on(self, topic: str) -> list[str]:
-        """Pairs of frames, ``parent:child``, in the first messages of a topic, if these are
-        transforms. An InputError if they cannot be read.
+        """Return pairs of frames, ``parent:child``, in the first messages of a topic.
+
+        Empty if the messages are no transforms. Raises InputError if they cannot be read.
         """
-        runs = self.runs([topic] if self.topics[topic].type in messages.TF_TYPES else [])
-        first = next((run.transforms() for run in runs), ())
-        return sorted({f"{each.world_frame}:{each.sensor_frame}" for _, each in first})
+        if self.type_of(topic) not in messages.TF_TYPES:
+            return []
+        first_run = next(self.runs([topic]), None)
+        if first_run is None:
+            return []
+        edges = {f"{edge.world_frame}:{edge.sensor_frame}" for _, edge in first_run.transforms()}
+        return sorted(edges)
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
-        """What a source measures, one of registry.MEASURES: what is wanted of it, or what messages
-        of its type are for; a ConfigError if they do not have what is wanted.
+        """Return the quantity that a source measures, one of registry.MEASURES.
+
+        Parameters
+        ----------
+        source : Source
+        wanted : str
+            A quantity, or "auto" for the usual one of the message type.
+
+        Raises
+        ------
+        ConfigError
+            If the messages do not measure the wanted quantity.
         """
         topic, _, fields = str(source).partition("?")
-        if "=" in fields:
-            usual = sources.FieldReading("", topic, fields).measures
-            if usual != "poses" and wanted not in ("auto", usual):
-                raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
-            return usual if wanted == "auto" else wanted
-        return messages.measured_as(self.type_of(source), wanted, source)
+        if "=" not in fields:
+            return messages.measured_as(self.type_of(source), wanted, source)
+        usual = sources.FieldReading("", topic, fields).measures
+        if wanted == "auto":
+            return usual
+        if usual not in ("poses", wanted):
+            raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
+        return wanted
 
     def check(self, source: Source) -> None:
-        """Raise InputError, with the topics that are there, for a topic without poses, and for
-        frames of a bag without transforms.
+        """Raise InputError, with the topics of the bag, if a source cannot be read.
+
+        This is the case for a topic without poses, and for frames if the bag has no transforms.
         """
         if isinstance(source, TfSource):
-            if not self._of_transforms():
+            if not self._tf_topics():
                 raise InputError(f"no transforms in {self}. {self._listing()}")
             return
         topic, _, fields = source.partition("?")
@@ -142,18 +182,25 @@ class PoseBag:
             if part not in self.topics:
                 raise InputError(f"no topic {part} in {self}. {self._listing()}")
         if len(parts) > 1:
-            for part, wanted in zip(parts, ("positions", "rotations"), strict=True):
-                self.measured(part, wanted)
-        elif not fields and (type_ := self.type_of(topic)) not in messages.MESSAGE_TYPES:
-            hint = "name its fields, TOPIC?t=header.stamp,x=..."
-            if type_ in messages.TF_TYPES:
-                hint = "name two of its frames instead, as odom:lidar"
-            elif type_ in messages.IMAGE_TYPES:
-                hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
-            raise InputError(
-                f"topic {source} of {self} is of type {type_ or 'several types'}, which is not "
-                f"read as it is; {hint}. {self._listing()}"
-            )
+            self.measured(parts[0], "positions")
+            self.measured(parts[1], "rotations")
+        elif not fields:
+            self._check_type(topic)
+
+    def _check_type(self, topic: str) -> None:
+        """Raise InputError if messages of a topic need more than the topic's name to be read."""
+        type_ = self.type_of(topic)
+        if type_ in messages.MESSAGE_TYPES:
+            return
+        hint = "name its fields, TOPIC?t=header.stamp,x=..."
+        if type_ in messages.TF_TYPES:
+            hint = "name two of its frames instead, as odom:lidar"
+        elif type_ in messages.IMAGE_TYPES:
+            hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
+        raise InputError(
+            f"topic {topic} of {self} is of type {type_ or 'several types'}, which is not read as "
+            f"it is; {hint}. {self._listing()}"
+        )
 
     def select(
         self,
@@ -161,55 +208,82 @@ class PoseBag:
         child: Source | None = None,
         frames: Mapping[str, str] | None = None,
     ) -> tuple[Source, Source]:
-        """Choose the sources of the parent's and the child's poses; an InputError if one that is
-        named cannot be used, both are the same, or there is a choice to make. With neither named,
-        the bag has exactly two topics of poses, or of paths if there are no others; the parent is
-        the one whose name has the word parent, base or lidar, or the first by name. If ``frames``
-        name the sensors of "parent" or "child", the topics are chosen by these names.
+        """Choose the sources of the parent's and the child's poses.
+
+        Without names, the bag must have exactly two topics of poses, or of paths if there are no
+        others. The parent is the topic whose name has the word parent, base or lidar, or the first
+        by name.
+
+        Parameters
+        ----------
+        parent, child : Source, optional
+            Sources as the user names them.
+        frames : mapping of str to str, optional
+            Frames of the sensors of "parent" or "child". The names of frames choose the topics.
+
+        Raises
+        ------
+        InputError
+            If a named source cannot be used, both are the same, or the choice is not unique.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
             self.check(source)
-        if len(named) == 2 and named[0] == named[1]:
+        if len(named) == 2 and parent == child:
             raise InputError(
                 f"parent and child topic are both {parent}; name two topics. {self._listing()}"
             )
-        free = [topic for name, topic in self.topics.items() if name not in named]
+        if parent and child:
+            return parent, child
+        topics = self._unique_topics(2 - len(named), named)
+        if parent:
+            return parent, topics[0]
+        if child:
+            return topics[0], child
+        frames = frames or {}
+        sensors = {}
+        if any(frames.values()):
+            sensors = {topic: self.sensor_frame(topic) for topic in topics}
+        parent_topic, child_topic = roles.parent_and_child(topics, frames, sensors)
+        return parent_topic, child_topic
+
+    def _unique_topics(self, count: int, used: Collection[Source]) -> list[str]:
+        """Return the only topics of poses beside the used ones; an InputError if not ``count``."""
+        free = [topic for topic in self.topics.values() if topic.name not in used]
         poses = [topic for topic in free if topic.type in messages.POSE_TYPES]
         moving = [topic for topic in poses if topic.count >= _FEWEST_POSES]
         paths = [topic for topic in free if topic.type == messages.PATH_TYPE]
-        wanted = 2 - len(named)
-        choices = [topics for topics in (poses, moving, moving + paths) if len(topics) == wanted]
-        if wanted and not choices:
-            found = sorted({edge for name in self.topics for edge in self.edges_on(name)})
-            raise InputError(
-                "name the topics of poses with --parent-topic and --child-topic, or frames as "
-                f"odom:lidar. {self._listing()}"
-                + (f". Transforms are {', '.join(found)[:LONGEST_NAME]}" if found else "")
-            )
-        chosen = [topic.name for topic in choices[0]] if wanted else []
-        if wanted == 2:
-            is_named = any((frames or {}).values())
-            sensors = {topic: self.sensor_frame(topic) for topic in chosen if is_named}
-            chosen = roles.parent_and_child(chosen, frames or {}, sensors)
-        return parent or chosen.pop(0), child or chosen.pop(0)
+        for topics in (poses, moving, moving + paths):
+            if len(topics) == count:
+                return [topic.name for topic in topics]
+        edges = sorted({edge for topic in self.topics for edge in self.edges_on(topic)})
+        text = (
+            "name the topics of poses with --parent-topic and --child-topic, or frames as "
+            f"odom:lidar. {self._listing()}"
+        )
+        if edges:
+            text += f". Transforms are {', '.join(edges)[:LONGEST_NAME]}"
+        raise InputError(text)
 
     def sensor_frame(self, topic: str) -> str:
-        """Frame of the sensor of a topic of poses, as its first message names it; empty if none."""
+        """Return the sensor's frame in the first message of a topic of poses; empty if none."""
+        type_ = self.type_of(topic)
+        if type_ not in messages.POSE_TYPES:
+            return ""
         run = next(self.runs([topic]), None)
-        kind = self.topics[topic].type
-        if run is None or kind not in messages.POSE_TYPES:
+        if run is None:
             return ""
         try:
-            table = messages.unpack_poses(run.messages[:1], kind, run.kind.is_ros1)
+            table = messages.unpack_poses(run.messages[:1], type_, run.kind.is_ros1)
         except messages.MALFORMED as error:
             raise run.unreadable(error) from error
         return table.sensor_frames[0] or ""
 
     def _parts_of(self, topic: str) -> list[str]:
-        """The topics of positions and of orientations of ``/fix+/imu``; otherwise the topic."""
+        """Return the topics of positions and orientations of ``/fix+/imu``; else the topic."""
         parts = topic.split("+")
-        return parts if topic not in self.topics and len(parts) == 2 and all(parts) else [topic]
+        is_joined = topic not in self.topics and len(parts) == 2 and all(parts)
+        return parts if is_joined else [topic]
 
     # ---- poses
 
@@ -221,21 +295,30 @@ class PoseBag:
         measures: Mapping[str, str] | None = None,
         stamps: Mapping[str, str] | None = None,
     ) -> PoseTable:
-        """The poses of one or two streams in the order of the bag's time; an InputError if the bag
-        is damaged, or the transforms do not lead from one frame to the other. Up to ``max_gap_s``
-        is interpolated between two transforms of a chain; ``measures`` are what the topics of
-        "parent" and "child" are read as, see :meth:`measured`; ``stamps`` are where their stamps
-        come from, "header" or "receive".
+        """Read the poses of one or two streams in the order of bag time.
+
+        Parameters
+        ----------
+        parent, child : Source
+        max_gap_s : float
+            Longest time between two transforms of a chain that is interpolated.
+        measures : mapping of str to str, optional
+            Quantities that the topics of "parent" and "child" are read as, see :meth:`measured`.
+        stamps : mapping of str to str, optional
+            Origin of the stamps of "parent" and "child": "header" or "receive".
+
+        Raises
+        ------
+        InputError
+            If the bag is damaged, or the transforms do not connect the frames.
         """
-        measures = measures or {}
-        wanted = {"parent": parent} | ({"child": child} if child else {})
-        readings = [
-            self._reading(stream, source, measures.get(stream, "auto"), max_gap_s)
-            for stream, source in wanted.items()
-        ]
+        readings = [self._reading("parent", parent, measures or {}, max_gap_s)]
+        if child:
+            readings.append(self._reading("child", child, measures or {}, max_gap_s))
+        topics: set[str] = set()
         for reading in readings:
             reading.use_stamps((stamps or {}).get(reading.stream, "header"))
-        topics = {topic for reading in readings for topic in reading.topics}
+            topics.update(reading.topics)
         count = sum(self.topics[topic].count for topic in topics)
         runs = self.runs(topics)
         for run in self.shown(runs, count, f"reading {self}", lambda run: len(run.messages)):
@@ -243,39 +326,62 @@ class PoseBag:
                 if run.kind.topic in reading.topics:
                     reading.take(run)
         tables = [reading.table() for reading in readings]
-        self._notes += [note for reading in readings for note in reading.notes]
+        for reading in readings:
+            self._notes += reading.notes
         return PoseTable.joined(tables)
 
-    def _reading(self, stream: str, source: Source, measures: str, max_gap_s: float) -> Reading:
+    def _reading(
+        self, stream: str, source: Source, measures: Mapping[str, str], max_gap_s: float
+    ) -> Reading:
+        """Return the reader of a source."""
         if isinstance(source, TfSource):
-            self.static_frames.route(*source)  # or it raises
-            of_tree = TfStream(source, max_gap_s, self.static_frames)
-            return sources.TransformReading(stream, of_tree, self._of_transforms())
+            self.static_frames.route(*source)  # raises InputError if the frames are not connected
+            tf_stream = TfStream(source, max_gap_s, self.static_frames)
+            return sources.TransformReading(stream, tf_stream, self._tf_topics())
         topic, _, fields = source.partition("?")
         if ":" in fields and "=" not in fields:
             return BAG_READINGS["images of a target"](self, stream, topic, fields)
         type_ = self.type_of(topic)
         row = messages.MESSAGE_TYPES.get(type_)
-        if fields := fields or (row.fields if row else ""):
+        if row:
+            fields = fields or row.fields
+        if fields:
             return sources.FieldReading(stream, topic, fields)
         if row and row.unpack:
-            return sources.TopicReading(stream, topic, type_, self.measured(source, measures))
+            wanted = self.measured(source, measures.get(stream, "auto"))
+            return sources.TopicReading(stream, topic, type_, wanted)
         if type_ == messages.PATH_TYPE:
             return sources.PathReading(stream, topic)
         if type_ == messages.POINTS_TYPE:
             return BAG_READINGS[type_](self, stream, topic, fields)
-        fixes, turns = self._parts_of(topic)
+        fixes, rotations = self._parts_of(topic)
         return sources.JoinedReading(
             sources.TopicReading(stream, fixes, self.type_of(fixes), "positions"),
-            sources.TopicReading(stream, turns, self.type_of(turns), "rotations"),
+            sources.TopicReading(stream, rotations, self.type_of(rotations), "rotations"),
         )
 
     def trajectory(
         self, source: Source, measures: str = "auto", stamps: str = "header"
     ) -> tuple[Trajectory, list[str]]:
-        """The trajectory of one source in the order of stamps, of those with equal stamps the
-        first, and what a person should know; ``measures`` as of :meth:`measured`, ``stamps`` as of
-        :meth:`poses`. An InputError if the bag or a pose cannot be read.
+        """Read the trajectory of one source in the order of stamps; the first of equal stamps.
+
+        Parameters
+        ----------
+        source : Source
+        measures : str
+            Quantity that the source is read as, see :meth:`measured`.
+        stamps : {"header", "receive"}
+
+        Returns
+        -------
+        Trajectory
+        list of str
+            Notes for the user.
+
+        Raises
+        ------
+        InputError
+            If the bag or a pose cannot be read.
         """
         self.check(source)
         poses = self.poses(source, measures={"parent": measures}, stamps={"parent": stamps})
@@ -293,38 +399,44 @@ class PoseBag:
 
     @cached_property
     def static_frames(self) -> FrameTree:
-        """The frames of the bag and their static transforms; of repeated ones the last. As in tf2,
-        one that is no pose is left out. An InputError if they form no tree or are damaged.
+        """Frames of the bag and their static transforms; the last of repeated ones.
+
+        Transforms that are no poses are skipped, as in tf2. Raises InputError if the frames form no
+        tree, or a message is damaged.
         """
         tree = FrameTree("the bag's transforms")
         notes = {}
-        for run in self.runs(self._of_transforms()):
-            is_fixed = run.kind.topic.endswith("tf_static")
+        for run in self.runs(self._tf_topics()):
+            is_static = run.kind.topic.endswith("tf_static")
             for _, (_, parent, frame, *values) in run.transforms():
                 try:
-                    pose = checked_pose(*values) if is_fixed else None
+                    pose = checked_pose(*values) if is_static else None
                 except InputError as error:
                     notes[frame] = f"transform {parent}:{frame} was left out: {error}"
                 else:
-                    tree.add(parent, frame or "", pose, is_fixed)
+                    tree.add(parent, frame or "", pose, is_static)
         self._notes += notes.values()
         return tree
 
     # ---- messages
 
     def runs(self, topics: Collection[str]) -> Iterator[Run]:
-        """Messages of some topics, many of a kind at once: in the order of bag time, or one file
-        after the other if they were recorded at the same time.
+        """Iterate over messages of some topics in the order of bag time, many of a kind at once.
+
+        Files that were recorded at the same time follow each other.
         """
-        for block in chain.from_iterable(each.blocks(topics) for each in self._storages):
-            for kind in {id(each): each for each, _, _ in block}.values():
-                data = [data for each, _, data in block if each is kind]
-                bag_ns = [bag_ns for each, bag_ns, _ in block if each is kind]
-                yield Run(kind, data, _bag_times(bag_ns))
+        for storage in self._storages:
+            for block in storage.blocks(topics):
+                rows_of = defaultdict[MessageKind, list[tuple[int, bytes]]](list)
+                for kind, bag_ns, data in block:
+                    rows_of[kind].append((bag_ns, data))
+                for kind, rows in rows_of.items():
+                    times_ns = _bag_times([bag_ns for bag_ns, _ in rows])
+                    yield Run(kind, [data for _, data in rows], times_ns)
 
 
 def _bag_times(bag_ns: Sequence[int]) -> IntArray:
-    """Return times as int64 (N,); a damaged bag may have times beyond, which get its limits."""
+    """Return times as int64 (N,); times out of range, in a damaged bag, become its limits."""
     try:
         return np.array(bag_ns, dtype=np.int64)
     except OverflowError:

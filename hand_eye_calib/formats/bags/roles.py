@@ -1,6 +1,5 @@
-"""Which of two topics of poses is the parent, and which the child."""
+"""Decide which of two topics of poses is the parent, and which the child."""
 
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 
@@ -8,17 +7,19 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.exports import role_of
 
-# Words of a topic's name that say which stream it is, the likeliest parent first.
+# Words in the name of a topic that mark its stream, the likeliest parent first.
 _WORDS = ("parent", "base", "lidar", "", "child")
 
-# Words that many frames have in common.
-_OF_ALL = {"link", "frame", "sensor", "optical", "base"}
+# Words that many frames share.
+_COMMON_WORDS = {"link", "frame", "sensor", "optical", "base"}
 
-# What speaks for a frame's name being that of a topic: the messages have the same name; the words
-# of both are the same; both are sensors of one kind. The messages have no name: more than another.
+# Scores of a topic for a frame that the user names. The messages name the same frame.
 _SAME_NAME = 8.0
+# Each word that the frame shares with the topic, or with the frame of its messages.
 _SAME_WORD = 2.0
+# The frame and the topic name sensors of one kind.
 _SAME_KIND = 1.0
+# The messages name no frame, which is better than another name.
 _NO_NAME = 0.5
 
 
@@ -31,30 +32,30 @@ def parent_and_child(
     ----------
     topics : sequence of 2 str
     frames : mapping of str to str
-        Frames of the sensors of "parent" and "child" as the user names them; empty if not named.
+        Frames of the sensors of "parent" and "child" as the user names them; empty without name.
     sensors : mapping of str to str
-        Frame of the sensor of each topic as its messages name it; empty if they do not.
+        Frame of the sensor in the messages of each topic; empty without name.
 
     Raises
     ------
     InputError
-        If the user names a frame, and nothing says which topic it belongs to.
+        If the user names a frame that fits both topics equally well.
     """
     by_words = sorted(topics, key=_parent_first)
     named = {stream: frame for stream, frame in frames.items() if frame}
     if not named:
         return by_words
-    scores = {
-        order: sum(
-            _match(named[stream], topic, sensors.get(topic, ""))
-            for stream, topic in zip(("parent", "child"), order, strict=True)
-            if stream in named
-        )
-        for order in itertools.permutations(topics)
-    }
-    (best, most), (_, less) = sorted(scores.items(), key=lambda item: -item[1])
-    if most > less:
-        return [*best]
+    scores = []
+    for order in ([*topics], [*topics[::-1]]):
+        topic_of = dict(zip(("parent", "child"), order, strict=True))
+        score = 0.0
+        for stream, frame in named.items():
+            topic = topic_of[stream]
+            score += _match(frame, topic, sensors.get(topic, ""))
+        scores.append((score, order))
+    (worst, _), (best, best_order) = sorted(scores)
+    if best > worst:
+        return best_order
     if any({"parent", "child"} & words_of(topic) for topic in topics):
         return by_words
     names = " and ".join(named.values())
@@ -65,13 +66,13 @@ def parent_and_child(
 
 
 def _match(frame: str, topic: str, sensor: str) -> float:
-    """How much speaks for the frame being that of the sensor of a topic."""
+    """Return the score of a frame for being that of the sensor of a topic."""
     score = 0.0
     if sensor == frame:
         score += _SAME_NAME
     elif not sensor:
         score += _NO_NAME
-    shared = (words_of(frame) - _OF_ALL) & (words_of(topic) | words_of(sensor))
+    shared = (words_of(frame) - _COMMON_WORDS) & (words_of(topic) | words_of(sensor))
     score += _SAME_WORD * len(shared)
     role = role_of(frame)
     if role and role in (role_of(topic), role_of(sensor)):
@@ -80,7 +81,8 @@ def _match(frame: str, topic: str, sensor: str) -> float:
 
 
 def _parent_first(topic: str) -> tuple[int, str]:
-    """Sorts the likelier parent first: by name, then alphabetically."""
+    """Return a key that sorts the likelier parent first: by its words, then by name."""
     words = {*re.split(r"[/_]+", topic.lower()), ""}
-    word = "child" if "child" in words else next(each for each in _WORDS if each in words)
-    return _WORDS.index(word), topic
+    if "child" in words:
+        return _WORDS.index("child"), topic
+    return min(rank for rank, word in enumerate(_WORDS) if word in words), topic

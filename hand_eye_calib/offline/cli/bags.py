@@ -11,7 +11,7 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.engine.calibrator import Calibrator, Calibrators
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.formats.bags.messages import PoseTable
+from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.sources import Source, source_of
 from hand_eye_calib.formats.trajectory_files.dates import seconds

@@ -1,0 +1,72 @@
+"""Poses of streams in columns, as bags have them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable(Columns):
+    """N poses of streams in the order of bag time.
+
+    Attributes
+    ----------
+    streams : (N,) object array
+        "parent" or "child"; empty before the stream is known.
+    stamps_ns : (N,) int64 array
+        Header stamps.
+    world_frames, sensor_frames : (N,) object array
+        Names of frames; None if the message type does not carry them.
+    poses : (N, 7) array
+        x y z qx qy qz qw, m. Messages that are no poses have their unpacked values instead.
+    bag_ns : (N,) int64 array
+        Times at which the messages were recorded.
+    """
+
+    streams: NDArray[np.object_]
+    stamps_ns: IntArray
+    world_frames: NDArray[np.object_]
+    sensor_frames: NDArray[np.object_]
+    poses: FloatArray
+    bag_ns: IntArray
+
+    @classmethod
+    def of(cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None) -> Self:
+        """Make a table without stream names whose stamps (N,) are the bag times, too.
+
+        ``world`` and ``sensor`` are one frame for all poses, or (N,).
+        """
+        stamps_ns = np.array(stamps_ns, dtype=np.int64)
+
+        def column(value: Any) -> NDArray[np.object_]:
+            return np.broadcast_to(np.array(value, dtype=object), stamps_ns.shape)
+
+        frames = column(world), column(sensor)
+        return cls(column(""), stamps_ns, *frames, np.asarray(poses), stamps_ns)
+
+    def recorded(self, stream: str, bag_ns: Any) -> Self:
+        """Return the table with the name of its stream and the bag times (N,) of its poses."""
+        streams = np.full(len(self), stream, dtype=object)
+        return replace(self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64))
+
+    @classmethod
+    def joined(cls, tables: Iterable[Self]) -> Self:
+        """Return the rows of one or more tables in the order of bag time."""
+        table = cls.concatenate(*tables)
+        return table[np.argsort(table.bag_ns, kind="stable")]
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of one stream in the order of stamps; the first of equal stamps."""
+        stamps_ns, first = np.unique(self.stamps_ns, return_index=True)
+        poses = self.poses[first]
+        sensor_frame = self.sensor_frames[first[0]] or ""
+        world_frame = self.world_frames[first[0]]
+        return Trajectory.from_quat_xyzw(
+            stamps_ns, poses[:, :3], poses[:, 3:], sensor_frame, world_frame
+        )
