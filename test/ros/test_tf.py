@@ -157,7 +157,7 @@ class TestNode:
         child = calibration.child_frame
         robot(("base_link", child))
         self.frames_of_new_listener(peer, listen, child)
-        broadcaster.look(calibration, "")
+        broadcaster.update(calibration, "")
         told, why = broadcaster.state
         assert told is Broadcast.REFUSED
         assert why.startswith(f"{child} has the parent base_link on /tf_static")
@@ -167,12 +167,12 @@ class TestNode:
         self, peer, robot, listen, broadcaster, calibration, capfd
     ):
         child = calibration.child_frame
-        broadcaster.look(calibration, "")
+        broadcaster.update(calibration, "")
         assert self.frames_of_new_listener(peer, listen, child) == {child}
         robot(("base_link", child))
 
         def is_refused():
-            broadcaster.look(calibration, "")
+            broadcaster.update(calibration, "")
             return broadcaster.state[0] is Broadcast.REFUSED
 
         peer.spin_until(is_refused, "the refusal")
@@ -181,16 +181,16 @@ class TestNode:
     def test_what_is_done_but_may_not_be_broadcast_is_refused_and_withdrawn(
         self, broadcaster, calibration
     ):
-        broadcaster.look(calibration, "")
+        broadcaster.update(calibration, "")
         assert broadcaster.state == (Broadcast.ON, "")
         faulty = "the streams are faulty"
-        broadcaster.look(calibration, faulty)
+        broadcaster.update(calibration, faulty)
         assert broadcaster.state == (Broadcast.WAITING, faulty)
         dofs = [*calibration.observability_measured]
         dofs[2] = dataclasses.replace(dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf)
-        broadcaster.look(dataclasses.replace(calibration, observability_measured=tuple(dofs)), "")
+        broadcaster.update(dataclasses.replace(calibration, observability_measured=tuple(dofs)), "")
         assert broadcaster.state == (Broadcast.REFUSED, "z not determined")
-        broadcaster.look(dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), "")
+        broadcaster.update(dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), "")
         assert broadcaster.state[0] is Broadcast.REFUSED
         assert broadcaster.state[1].startswith("DO NOT USE: the solver did not converge")
 

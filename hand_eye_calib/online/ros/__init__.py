@@ -1,1 +1,1 @@
-"""The ROS 2 node: messages in, messages out. The only package here that imports rclpy."""
+"""The ROS 2 node. Only this folder and the player of the simulation import rclpy."""

@@ -1,4 +1,4 @@
-"""``calibrator``: the node."""
+"""The command ``calibrator``, which runs the node."""
 
 import argparse
 import json
@@ -32,18 +32,18 @@ parameters (-p NAME:=VALUE):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments: all are the node's, and passed on to it."""
+    """Declare the usage of the command; its arguments are passed on to the node."""
     parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
     epilog = _INTERFACE
     for name, field in (CalibratorConfig.by_name() | NodeConfig.by_name()).items():
         value = " ".join(filter(None, (json.dumps(field.default), field.metadata["unit"])))
-        doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), 6 * " ")
+        doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), "      ")
         epilog += f"  {name} ({value})\n{doc}\n"
     parser.epilog = epilog.replace("%", "%%")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the node until it is told to end; returns the exit code."""
+    """Run the node until a signal; return the exit code."""
     from hand_eye_calib.online.ros.node import main
 
     return main(arguments.passed_on)

@@ -1,6 +1,6 @@
 """The node: topics, services, parameters and timers around the live session.
 
-Solves run in a process of their own; everything else happens in the executor's one thread, so
+Solves run in a process of their own. All other code runs in the only thread of the executor, so
 nothing here needs a lock.
 """
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, partialmethod
-from itertools import chain, cycle
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -39,21 +39,24 @@ from hand_eye_calib.online.ros.tf import TF, Robot, RobotTree, TfBroadcaster, me
 
 
 class CalibratorNode(Node):
-    """Estimates the pose of the child sensor in the parent sensor's frame from two live streams of
-    poses.
+    """Estimates the pose of the child sensor in the parent sensor's frame from two live streams.
 
     Raises
     ------
     ConfigError
-        If a parameter given at the start is unusable.
+        If a parameter of the start is unusable.
     """
 
-    # Without rclpy's warnings about QoS, which the inputs give themselves: each costs as much as a
+    # The inputs report wrong QoS themselves. rclpy's own handlers for that cost as much as a
     # message at every turn of the executor.
-    _quiet = PublisherEventCallbacks(use_default_callbacks=False)
-    create_publisher = partialmethod(Node.create_publisher, event_callbacks=_quiet)
-    _deaf = SubscriptionEventCallbacks(use_default_callbacks=False)
-    create_subscription = partialmethod(Node.create_subscription, event_callbacks=_deaf)
+    create_publisher = partialmethod(
+        Node.create_publisher,
+        event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+    )
+    create_subscription = partialmethod(
+        Node.create_subscription,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+    )
 
     def __init__(self) -> None:
         try:
@@ -74,169 +77,191 @@ class CalibratorNode(Node):
         self._output_base = output_path(options.output_directory or ".").resolve()
         if options.monitor:
             config.require_poses("monitor")
-        _ = config.measured  # or it raises
+        # Raises an error for an impossible combination.
+        _ = config.measured
         others = other_names(options.other_children)
         self._session = LiveSession(self._log, config, others)
         tree = RobotTree(self, self._log)
         self._robot = Robot(self._log, options, tree)
         if options.base_frame or options.installed == TF:
-            message_type("base_frame" if options.base_frame else "installed")  # or it raises
+            # Raises an error if tf2_msgs is not installed.
+            message_type("base_frame" if options.base_frame else "installed")
             tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
-        self._session.topics = {each.name: each.topic for each in self._inputs[:2]}
-        if len({each.topic for each in self._inputs}) < len(self._inputs):
-            topics = listing([each.topic for each in self._inputs])
-            raise ConfigError(f"two inputs have one topic: remap one to another sensor's: {topics}")
+        self._session.topics = {source.name: source.topic for source in self._inputs[:2]}
+        topics = [source.topic for source in self._inputs]
+        if len(set(topics)) < len(topics):
+            text = "two inputs have one topic: remap one to another sensor's"
+            raise ConfigError(f"{text}: {listing(topics)}")
         self._session.start_journal(options, is_first=True)
-        for each in self._inputs:
-            each.resume()
-        self._results, self._states = ResultTopics(self), StateTopics(self)
+        for source in self._inputs:
+            source.resume()
+        self._results = ResultTopics(self)
+        self._states = StateTopics(self)
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
-        self._answered = self.create_guard_condition(lambda: self._cycle.take_answers())
-        hooks = self._answered.trigger, self._robot.complete, self._publish
-        self._cycle = SolveCycle(self._session, self._log, *hooks, config.targets)
+        answered = self.create_guard_condition(lambda: self._cycle.take_answers())
+        self._cycle = SolveCycle(
+            self._session,
+            self._log,
+            answered.trigger,
+            self._robot.complete,
+            self._publish,
+            config.targets,
+        )
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
+        self._start_timers()
         self._discover()
-        self._say_start()
+        self._log_start()
 
     def take_messages(self) -> bool:
-        """Take the messages that wait at the inputs; whether there were any."""
-        return max(each.take_waiting() for each in self._inputs)
+        """Process the messages that wait at the inputs; return whether there were any."""
+        had_messages = [source.take_waiting() for source in self._inputs]
+        return any(had_messages)
 
     def stop(self, timeout_s: float) -> bool:
-        """End the solving process and save the newest result; False if that was wanted and could
-        not be done.
-        """
+        """End the solving process and save the newest result; return False if that failed."""
         self._cycle.stop(timeout_s)
-        saved = True
+        is_saved = True
         if self._cycle.result is not None:
             if self._options.node.output_directory:
-                saved, _ = self._saver.save(self._options.node)
+                is_saved, _ = self._saver.save(self._options.node)
             else:
                 self._log.warning("the result is not saved: output_directory is not set")
         self._publish(has_ended=True)
         self._session.stop_journal()
-        return saved
+        return is_saved
 
     # ---------------------------------------------------------------- set-up
 
-    def _say_start(self) -> None:
-        """Say in one line what the node goes by."""
+    def _log_start(self) -> None:
+        """Log topics, directory and options in one line."""
         options = self._options.node
-        inputs = self._inputs
-        what = "watching" if options.monitor else "calibrating"
-        children = ", ".join(each.topic for each in inputs[1:])
-        given = self._options.given.items()
-        set_to = [f"{name} {value}" for name, value in given if name != "output_directory"]
-        files = f"files go to {self._output_base}" if options.output_directory else ""
-        told = [
-            f"{what} {children} against {inputs[0].topic}",
-            files or "nothing is saved: no output_directory",
-            f"set are {', '.join(set_to)}" if set_to else "",
-            "" if options.enabled else "no poses are accepted before ~/set_enabled",
+        parent, *children = [source.topic for source in self._inputs]
+        verb = "watching" if options.monitor else "calibrating"
+        texts = [f"{verb} {', '.join(children)} against {parent}"]
+        if options.output_directory:
+            texts.append(f"files go to {self._output_base}")
+        else:
+            texts.append("nothing is saved: no output_directory")
+        settings = [
+            f"{name} {value}"
+            for name, value in self._options.given.items()
+            if name != "output_directory"
         ]
-        self._log.info("; ".join(filter(None, told)))
+        if settings:
+            texts.append(f"set are {', '.join(settings)}")
+        if not options.enabled:
+            texts.append("no poses are accepted before ~/set_enabled")
+        self._log.info("; ".join(texts))
 
     def _watch_mount(self) -> Any:
+        """Return a new monitor of the mount."""
         robot = self._robot
-        watch = MOUNT_MONITORS["installed"]
-        return watch(self._session, robot.installed, lambda: robot.problem, self._log)
+        make = MOUNT_MONITORS["installed"]
+        return make(self._session, robot.installed, lambda: robot.problem, self._log)
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
         options = self._options.node
         parts = self._session, self._log, self._begin_session
-        made: TopicInput | TfInput
+        source: TopicInput | TfInput
         if frames := getattr(options, f"{name}_tf", ""):
-            made = TfInput(self, name, TfSource.parse(frames), parts)
+            source = TfInput(self, name, TfSource.parse(frames), parts)
         else:
-            made = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), parts)
-        made.configure(self._options.calibrator)
-        made.is_enabled = options.enabled
-        return made
+            source = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), parts)
+        source.configure(self._options.calibrator)
+        source.is_enabled = options.enabled
+        return source
 
     def _serve(self) -> None:
-        # A long queue: requests come while the node is busy, too.
+        # A long queue, because requests also come while the node is busy.
         qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         serve = partial(self.create_service, qos_profile=qos)
-        # A group of its own: while it awaits a solve, it would hold up every other callback of its
-        # group.
+        # While this callback awaits a solve, it would delay every other callback of its group.
         serve(Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup())
-        save = lambda request: self._saver.save(self._options.node)  # noqa: E731
-        serve(Trigger, "~/save", partial(self._answer, save))
+        serve(Trigger, "~/save", partial(self._answer, self._save))
         serve(Trigger, "~/reset", partial(self._answer, self._reset))
         serve(SetBool, "~/set_enabled", partial(self._answer, self._set_enabled))
-        # Steady time: these go on while a bag, and with it simulated time, is paused.
-        make = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._solve_timer = make(self._options.node.solve_period, self._on_solve_timer)
-        # In turn: all at once would hold up messages for long on a slow computer.
-        others = [self._publish, *[self._discover] * round(REPORT_PERIOD_S / FLUSH_PERIOD_S - 1)]
-        turns = cycle(chain.from_iterable((self._session.flush_journal, each) for each in others))
-        make(FLUSH_PERIOD_S / 2, lambda: next(turns)())
+
+    def _start_timers(self) -> None:
+        # Steady time, which goes on while a bag, and with it simulated time, is paused.
+        make_timer = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._solve_timer = make_timer(self._options.node.solve_period, self._on_solve_timer)
+        # One task at a time: all at once would delay messages for long on a slow computer.
+        flush = self._session.flush_journal
+        tasks = [flush, self._publish]
+        for _ in range(round(REPORT_PERIOD_S / FLUSH_PERIOD_S) - 1):
+            tasks += [flush, self._discover]
+        turns = cycle(tasks)
+        make_timer(FLUSH_PERIOD_S / 2, lambda: next(turns)())
 
     # ---------------------------------------------------------------- timers
 
     def _discover(self) -> None:
-        for each in self._inputs:
-            each.discover()
+        for source in self._inputs:
+            source.discover()
         name = self.get_fully_qualified_name()
         if self.count_publishers(f"{name}/{PROGRESS_TOPIC}") > 1:
             self._log.warning(f"another node is called {name}, too: start one with -r __node:=NAME")
 
     def _on_solve_timer(self) -> None:
-        silent = [each for each in self._inputs if not each.has_poses]
+        silent = [source for source in self._inputs if not source.has_poses]
         if silent and silent[0].is_enabled:
-            text = "; ".join(f"no pose yet on {each.topic}: {each.problem}" for each in silent)
-            self._log.info(text, GOES_ON_S)
+            texts = [f"no pose yet on {source.topic}: {source.problem}" for source in silent]
+            self._log.info("; ".join(texts), GOES_ON_S)
         self._cycle.start_if_due()
 
     def _publish(self, has_ended: bool = False) -> None:
-        """Publish all that is to be told now: so the topics agree at every time."""
+        """Publish result and state together, so that all topics agree at every time."""
         self._results.publish(self._cycle.published)
-        self._tf.look(self._cycle.result, self._why_not_broadcast())
+        self._tf.update(self._cycle.result, self._why_not_broadcast())
         if self._mount is not None:
             self._mount.look()
+        # The state counts messages that wait on a slow computer, too.
         if not has_ended:
-            self.take_messages()  # which a slow computer has kept waiting
+            self.take_messages()
         clock_ns = self.get_clock().now().nanoseconds
         self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
         self._cycle.answer_overdue()
 
     def _why_not_broadcast(self) -> str:
+        """Return the reason why the result must not be broadcast yet; empty if it may."""
         result = self._cycle.result
         progress = self._cycle.goal.progress
         if result is None:
             return "no result yet"
         if self._cycle.published is None:
             return self._cycle.problem
+        if progress.is_faulty and not progress.done:
+            return "the streams are faulty"
         if not progress.done:
-            return "the streams are faulty" if progress.is_faulty else "the goal is not reached"
-        wanted = self._options.node.base_frame
-        return "" if result.base_frame == wanted else f"base_frame {wanted} is not known"
+            return "the goal is not reached"
+        base_frame = self._options.node.base_frame
+        return "" if result.base_frame == base_frame else f"base_frame {base_frame} is not known"
 
     def _state(self) -> NodeState:
         cycle = self._cycle
         name = self.get_fully_qualified_name()
         steady_s = time.monotonic()
-        # A robot that rests, once there is a result, has nothing more to show. Who has no publisher
-        # any more does not rest, unless the goal is reached.
-        rests = cycle.published is not None
-        rests &= all(each.is_silent(steady_s) for each in self._inputs[:2])
+        accepts_poses = self._inputs[0].is_enabled
+        # A robot may stand still once there is a result. A topic without a publisher is worth a
+        # look, unless the goal is reached.
+        silent = [source.is_silent(steady_s) for source in self._inputs[:2]]
+        stands_still = cycle.published is not None and all(silent)
         is_done = cycle.goal.progress.done
-        inputs = {
-            each.name: each.state(steady_s, rests and (is_done or each.publishers != ()))
-            for each in self._inputs
-        }
+        inputs = {}
+        for source in self._inputs:
+            may_rest = stands_still and (is_done or source.publishers != ())
+            inputs[source.name] = source.state(steady_s, may_rest)
         if self._mount is not None:
             return NodeState(node=name, mount=self._mount.state(), inputs=inputs)
+        pause = pause_of(inputs, accepts_poses)
         return NodeState(
             node=name,
-            extrinsic=cycle.extrinsic_state(self._inputs[0].is_enabled, self._tf.state),
-            progress=cycle.progress_state(
-                self._robot.why_not_compared, pause_of(inputs, self._inputs[0].is_enabled)
-            ),
+            extrinsic=cycle.extrinsic_state(accepts_poses, self._tf.state),
+            progress=cycle.progress_state(self._robot.why_not_compared, pause),
             inputs=inputs,
             checks=cycle.checks.state(),
             journal=self._session.journal_state(self._options.node),
@@ -246,16 +271,23 @@ class CalibratorNode(Node):
     # --------------------------------------------------------------- session
 
     def _begin_session(self, because_of: PoseInput | None = None) -> None:
-        """Begin a new session: asked for, or because the stamps of an input have jumped back."""
+        """Begin a new session.
+
+        Parameters
+        ----------
+        because_of : PoseInput, optional
+            The input whose stamps have jumped back; None if a person has asked for a new session.
+        """
         self._session.reset()
         if self._mount is not None and because_of is None:
             self._mount = self._watch_mount()
-        for part in (self._log, self._cycle, self._mount):
-            if part is not None:
-                part.restart()
+        self._log.restart()
+        self._cycle.restart()
+        if self._mount is not None:
+            self._mount.restart()
         self._saver.state = None
-        for each in self._inputs:
-            each.restart(because_of)
+        for source in self._inputs:
+            source.restart(because_of)
         self._publish()
 
     # -------------------------------------------------------------- services
@@ -264,37 +296,40 @@ class CalibratorNode(Node):
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         solved = Future()
-        self._cycle.ask(lambda good, text: solved.set_result((good, text)))
+        self._cycle.ask(lambda is_good, text: solved.set_result((is_good, text)))
         response.success, response.message = await solved
         return response
 
     def _answer(self, act: Callable[[Any], tuple[bool, str]], request: Any, response: Any) -> Any:
-        """Answer a service with what was done: whether it worked, and a line about it."""
+        """Act on a request, and answer it with success and a line of text."""
         response.success, response.message = act(request)
         self._publish()
         return response
+
+    def _save(self, request: Trigger.Request) -> tuple[bool, str]:
+        return self._saver.save(self._options.node)
 
     def _reset(self, request: Trigger.Request) -> tuple[bool, str]:
         self._begin_session()
         text = "all poses forgotten, new session"
         priors = priors_of(self._options.calibrator)
         if priors:
-            kept = listing([f"prior.{axis} {value}" for axis, value in priors.items()])
-            text = f"{text}; {kept} still set: set to '' to forget it"
+            settings = listing([f"prior.{axis} {value}" for axis, value in priors.items()])
+            text = f"{text}; {settings} still set: set to '' to forget it"
         self._log.info(text)
         return True, text
 
     def _set_enabled(self, request: SetBool.Request) -> tuple[bool, str]:
-        for each in self._inputs:
-            each.is_enabled = request.data
-        text = f"{'' if request.data else 'not '}accepting poses"
+        for source in self._inputs:
+            source.is_enabled = request.data
+        text = "accepting poses" if request.data else "not accepting poses"
         self._log.info(text)
         return True, text
 
     # ------------------------------------------------------------ parameters
 
     def _check_options(self, options: NodeConfig) -> None:
-        """Raise ConfigError if options cannot be had together, or not on this machine."""
+        """Raise ConfigError if options exclude each other, or cannot work on this machine."""
         if options.publish_tf:
             message_type()
         if options.monitor and not options.installed:
@@ -305,6 +340,7 @@ class CalibratorNode(Node):
             output_path(options.output_directory, self._output_base)
 
     def _follow_parameters(self) -> None:
+        """Apply changed parameters."""
         options = self._options.node
         config = self._options.calibrator
         before = self._config
@@ -312,8 +348,8 @@ class CalibratorNode(Node):
             self._config = config
             self._session.reconfigure(config)
             self._cycle.follow(config, before)
-        for each in self._inputs:
-            each.configure(config)
+        for source in self._inputs:
+            source.configure(config)
         if options.monitor != (self._mount is not None):
             self._session.watch_only(None)
             self._mount = self._watch_mount() if options.monitor else None

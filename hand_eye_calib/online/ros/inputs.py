@@ -1,9 +1,9 @@
-"""The subscriptions of the node's inputs: from a topic, or from transforms, to poses."""
+"""The subscriptions of the node's inputs: poses from a topic or from transforms."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, TypeAlias
 
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -25,36 +25,54 @@ from hand_eye_calib.online.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_ty
 
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
-_, *_TYPES = POSE_TYPES  # without auto
+# Message types in the order of preference; the first entry of POSE_TYPES is "auto".
+_TYPES = POSE_TYPES[1:]
 
+# Errors of rclpy for QoS overrides that it cannot apply.
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
-Parts = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
+# Arguments of PoseInput after name and topic.
+Parts: TypeAlias = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
 
 
 class RosInput(PoseInput):
-    """An input that subscribes; with each subscription, what is called with a message and its info.
-    The parts are those of :class:`~hand_eye_calib.online.live.input.PoseInput`.
+    """An input with subscriptions.
+
+    Parameters
+    ----------
+    name, topic : str
+    parts : tuple
+        Further arguments of :class:`~hand_eye_calib.online.live.input.PoseInput`.
     """
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
+        # Each with its callback, which takes a message and the information about it.
         self._subscribed: list[tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]] = []
 
     def take_waiting(self) -> bool:
-        """Take the messages that wait in the queues; whether there were any."""
+        """Process the messages that wait in the queues; return whether there were any."""
         before = self._arrived
-        for one, callback in self._subscribed:
-            take = partial(one.handle.take_message, one.msg_type, one.raw)
-            with one.handle:
-                for taken in islice(iter(take, None), one.qos_profile.depth):
-                    callback(*taken)
+        for subscription, callback in self._subscribed:
+            handle = subscription.handle
+            take = partial(handle.take_message, subscription.msg_type, subscription.raw)
+            with handle:
+                for message in islice(iter(take, None), subscription.qos_profile.depth):
+                    callback(*message)
         return self._arrived > before
 
 
 class TopicInput(RosInput):
-    """Subscribes to the poses of one sensor: to messages of the wanted type, or "auto" for that of
-    the publishers.
+    """The poses of one sensor from a topic.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    name : str
+    wanted_type : str
+        Message type, or "auto" for the type of the publishers.
+    parts : tuple
+        See :class:`RosInput`.
     """
 
     def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
@@ -71,9 +89,9 @@ class TopicInput(RosInput):
         Raises
         ------
         ConfigError
-            If a type that is wanted cannot be used. A type that is found is refused in the log.
+            If the type of the options cannot be used. A type of publishers is refused in the log.
         """
-        # Of the topic as resolved: rclpy's count does not follow remaps itself.
+        # This method of rclpy remaps the topic, unlike count_publishers.
         publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
         self._n_publishers = len(publishers)
         self.publishers = tuple(
@@ -81,11 +99,11 @@ class TopicInput(RosInput):
             for publisher in publishers
             if self._type_name in ("", publisher.topic_type)
         )
-        self.problem = self._why_deaf(publishers) or counted(len(publishers), "publisher")
+        self.problem = self._wrong_qos(publishers) or counted(len(publishers), "publisher")
         is_wanted = self._wanted_type != "auto"
-        offered = {each.topic_type for each in publishers}
         wanted = [self._wanted_type] if is_wanted else _TYPES
-        usable = [each for each in wanted if each in offered]
+        offered = {publisher.topic_type for publisher in publishers}
+        usable = [type_name for type_name in wanted if type_name in offered]
         if offered and not usable:
             self.problem = f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
             self._log.warning(
@@ -94,17 +112,17 @@ class TopicInput(RosInput):
         if self._subscribed or not (usable or is_wanted):
             return
         try:
-            self._subscribe((usable or wanted)[0])
+            self._subscribe(usable[0] if usable else self._wanted_type)
         except ConfigError as error:
             if is_wanted:
                 raise
             self.problem = str(error)
             self._log.error(f"{self.topic} is not used: {error}")
 
-    def _why_deaf(self, publishers: Sequence[TopicEndpointInfo]) -> str:
-        """Why the middleware brings nothing of these publishers; empty if it does."""
-        offered = {each.qos_profile.reliability for each in publishers}
-        own = {each.qos_profile.reliability for each, _ in self._subscribed}
+    def _wrong_qos(self, publishers: Sequence[TopicEndpointInfo]) -> str:
+        """Return why the middleware delivers no message of these publishers; empty otherwise."""
+        offered = {publisher.qos_profile.reliability for publisher in publishers}
+        own = {subscription.qos_profile.reliability for subscription, _ in self._subscribed}
         if own != {ReliabilityPolicy.RELIABLE} or offered != {ReliabilityPolicy.BEST_EFFORT}:
             return ""
         return "it is published best effort, and qos_overrides ask for reliable: leave them out"
@@ -113,7 +131,8 @@ class TopicInput(RosInput):
         measures = messages.measured_as(type_name, self._wanted, self.topic)
         self._session.set_measures(self.name, measures)
         self._read = messages.MessageReader(type_name, measures, self._session.origin(self.name))
-        # With two arguments, rclpy passes the info as well, which its annotations do not know.
+        # rclpy passes the information, too, because the callback has two arguments; its annotations
+        # lack that.
         callback: Any = self._receive
         try:
             subscription = self._node.create_subscription(
@@ -121,8 +140,8 @@ class TopicInput(RosInput):
                 self._relative_topic,
                 callback,
                 quick(),
-                # As bytes: making the objects of a message takes ten times as long as reading what
-                # is needed of it.
+                # As bytes: to make the objects of a message takes ten times as long as to read the
+                # pose out of its bytes.
                 raw=True,
                 qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
             )
@@ -135,7 +154,7 @@ class TopicInput(RosInput):
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
     def _receive(self, data: bytes, info: Mapping[str, int]) -> None:
-        # With several publishers, or none any more, the numbers of lost messages are not known.
+        # Sequence numbers of several publishers are independent.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
             stamp_ns = messages.Cursor(data, is_ros1=False).stamp_ns()
@@ -147,26 +166,29 @@ class TopicInput(RosInput):
 
 
 class TfInput(RosInput):
-    """Takes the poses of one sensor, parent or child, from ``/tf`` and ``/tf_static``."""
+    """The poses of parent or child from ``/tf`` and ``/tf_static``."""
 
     def __init__(self, node: Node, name: str, source: TfSource, parts: Parts) -> None:
         super().__init__(name, str(source), parts)
         self._stream = TfStream(source, max_gap_s=0.0)
         kind = message_type(f"{name}_tf")
         for topic, qos in ((STATIC_TOPIC, LISTENING), (DYNAMIC_TOPIC, quick())):
-            heard: Any = partial(self._hear, topic)
-            self._subscribed.append((node.create_subscription(kind, topic, heard, qos), heard))
+            callback: Any = partial(self._receive, topic)
+            subscription = node.create_subscription(kind, topic, callback, qos)
+            self._subscribed.append((subscription, callback))
 
     def configure(self, config: CalibratorConfig) -> None:
+        """Apply the options."""
         super().configure(config)
-        messages.measured_as("", self._wanted, self.topic)  # or it raises
+        # Raises an error if the sensor does not measure poses.
+        messages.measured_as("", self._wanted, self.topic)
         self._stream.max_gap_s = config.max_gap
 
     def discover(self) -> None:
-        """Say what is missing; to be called often."""
+        """Update the reason why there are no poses; to be called often."""
         self.problem = self._stream.describe_missing()
 
-    def _hear(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
+    def _receive(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         for transform in map(messages.transform_of, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):

@@ -1,7 +1,6 @@
-"""Entry point of the node ``calibrator``: from arguments to a spinning node, and from a signal to a
-clean end.
+"""Entry point of the node ``calibrator``: start, spin, and a clean end after a signal.
 
-ROS and the engine are imported late, so that Ctrl-C while they load ends the program quietly too.
+ROS and the engine are imported late, so that Ctrl-C during their import ends the program quietly.
 """
 
 import gc
@@ -15,9 +14,10 @@ import traceback
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# One wait of the executor costs as much as ten messages. Those that come faster than the first of
-# these (s) are taken without it; it has its turn after the second.
+# One wait of the executor costs as much as ten messages. Messages that follow within this time (s)
+# are taken without the executor.
 _REST_S = 0.004
+# Longest time (s) without the executor.
 _TURN_S = 0.02
 
 
@@ -27,7 +27,7 @@ def main(args: list[str] | None = None) -> int:
     Parameters
     ----------
     args : list of str, optional
-        Arguments without the program's name; the process's own by default.
+        Arguments without the name of the program; by default those of the process.
 
     Returns
     -------
@@ -35,24 +35,22 @@ def main(args: list[str] | None = None) -> int:
         Exit code: 0 stopped by a signal; 1 bad parameter, failure, or a result that could not be
         saved (reported on stderr); 2 wrong usage.
     """
-    # The signals do nothing but make a pipe readable: no KeyboardInterrupt in the middle of a
-    # callback, no context that rclpy shuts down while a callback still publishes, and a second
-    # Ctrl-C changes nothing.
+    # A signal only makes a pipe readable. So no KeyboardInterrupt interrupts a callback, rclpy does
+    # not shut down its context while a callback publishes, and a second Ctrl-C changes nothing.
     readable, writable = os.pipe()
     os.set_blocking(writable, False)
     signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
     for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: None)
     code = _init(sys.argv[1:] if args is None else args) or _run_node(readable)
-    # The interpreter's own clean-up would restore the defaults, and a late Ctrl-C change the exit
-    # code.
+    # The interpreter would restore the default handlers, and a late Ctrl-C change the exit code.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     return code
 
 
 def _init(arguments: list[str]) -> int:
-    """Start rclpy; returns the exit code, 0 if it has started."""
+    """Start rclpy; return the exit code, 0 if it has started."""
     import rclpy
     from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
     from rclpy.logging import LoggingSeverity, set_logger_level
@@ -63,7 +61,7 @@ def _init(arguments: list[str]) -> int:
         print(f"calibrator: {text}", file=sys.stderr)
         return code
 
-    # rcl logs an error of its own before it raises the one that says what is wrong.
+    # rcl logs an error before it raises the same error with its cause.
     set_logger_level("rcl", LoggingSeverity.FATAL)
     try:
         if unknown := remove_ros_args(args=arguments):
@@ -78,7 +76,7 @@ def _init(arguments: list[str]) -> int:
 
 
 def _run_node(signals: int) -> int:
-    """Run the node until ``signals`` is readable; returns the exit code."""
+    """Run the node until the pipe ``signals`` is readable; return the exit code."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
@@ -101,11 +99,11 @@ def _run_node(signals: int) -> int:
     try:
         node = CalibratorNode()
         executor.add_node(node)
-        # A collection that looks at everything imported holds up callbacks for 30 ms, on a slow
-        # computer for 250.
+        # Without this, a collection visits all imported objects, and delays callbacks by 30 ms, on
+        # a slow computer by 250 ms.
         gc.collect()
         gc.freeze()
-        # The thread that writes the journal holds up a message no longer than this.
+        # The thread of the journal delays a message no longer than this.
         sys.setswitchinterval(_REST_S / 8)
         while not stopping.is_set():
             executor.spin_once()

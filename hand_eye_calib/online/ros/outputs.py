@@ -1,4 +1,4 @@
-"""What the node publishes: its results, and its state."""
+"""The publishers of the node: results and state."""
 
 import json
 from collections.abc import Iterator
@@ -23,11 +23,11 @@ from hand_eye_calib.online.ros.conversions import (
 )
 
 PROGRESS_TOPIC = "progress"
-# The end of the node waits for those who listen, as it does for a disk.
-_LAST_WORD = Duration(seconds=GRACE_S)
+# Time for which the end of the node waits until listeners have its last state.
+_GRACE = Duration(seconds=GRACE_S)
 
-# Parts of the state that the names of values on /diagnostics leave out.
-_UNNAMED = ("progress", "axes", "result", "differences")
+# Keys of the state that the names of values on /diagnostics omit.
+_OMITTED = ("progress", "axes", "result", "differences")
 
 
 class ResultTopics:
@@ -39,15 +39,18 @@ class ResultTopics:
         self._advertise()
 
     def _advertise(self) -> None:
-        self._is_told = False
+        # Whether ~/extrinsic has a message.
+        self._has_transform = False
         make = self._node.create_publisher
         self._transform = make(TransformStamped, "~/extrinsic", LATCHED)
         self._pose = make(PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED)
 
     def publish(self, calibration: Calibration | None) -> None:
-        """Publish a result that is new: with its covariance always, alone if the rotation and two
-        axes of the translation are determined, as the others are zeros; if not, or with None, an
-        earlier one is withdrawn: who subscribes from now on gets none.
+        """Publish a new result; withdraw the earlier result if there is none.
+
+        The transform without a covariance is published only if the rotation and two axes of the
+        translation are determined, because undetermined axes are zero. A late subscriber receives
+        no withdrawn message.
         """
         if calibration is self._newest:
             return
@@ -55,10 +58,11 @@ class ResultTopics:
         if calibration is None:
             self._withdraw()
             return
-        if len(calibration.hidden) <= 1 and {*calibration.hidden}.isdisjoint(ROTATIONS):
+        hidden = calibration.hidden
+        if len(hidden) <= 1 and not set(hidden) & set(ROTATIONS):
             self._transform.publish(to_transform(calibration))
-            self._is_told = True
-        elif self._is_told:
+            self._has_transform = True
+        elif self._has_transform:
             self._withdraw()
         self._pose.publish(to_pose_with_covariance(calibration))
 
@@ -76,16 +80,17 @@ class StateTopics:
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def publish(self, state: NodeState, clock_ns: int) -> None:
-        """Publish the state; ``clock_ns`` is the node's clock, 0 if it does not run."""
+        """Publish the state at a time of the node's clock (ns); 0 if the clock does not run."""
         self._progress.publish(String(data=json.dumps(plain(state), allow_nan=False)))
         self._diagnostics.publish(diagnostics(state, clock_ns))
         if state.has_ended:
-            self._progress.wait_for_all_acked(_LAST_WORD)
+            self._progress.wait_for_all_acked(_GRACE)
 
 
 def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
-    """The message for ``/diagnostics``: a status for each part of the node, by its fully qualified
-    name: two nodes must be told apart.
+    """Return the message for ``/diagnostics``: one status for each part of the node.
+
+    The fully qualified name of the node distinguishes two nodes.
     """
     message = DiagnosticArray()
     message.header.stamp = to_time(clock_ns)
@@ -103,17 +108,22 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
 
 
 def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
-    """Names and texts of the values of a part: those of a mapping have its name before theirs, and
-    the axis is last, as in ``sigma.x``.
+    """Yield names and texts of the values of a part.
+
+    A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``.
     """
+    # The first difference of a comparison is that from the installed transform.
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        value = value[0]  # of comparisons, that with what is installed
+        value = value[0]
     if isinstance(value, dict):
-        for name, each in value.items():
-            yield from _values(each, (*path, name))
+        for key, item in value.items():
+            yield from _values(item, (*path, key))
     elif path not in (("level",), ("text",)):
-        axes = [name for name in path if name in AXES]
-        name = ".".join([each for each in path if each not in (*_UNNAMED, *axes)] + axes)
-        if isinstance(value, bool):
-            value = str(value).lower()
-        yield name, "unknown" if value is None else in_words(value)
+        axes = [key for key in path if key in AXES]
+        keys = [key for key in path if key not in (*_OMITTED, *axes)]
+        text = in_words(value)
+        if value is None:
+            text = "unknown"
+        elif isinstance(value, bool):
+            text = text.lower()
+        yield ".".join(keys + axes), text

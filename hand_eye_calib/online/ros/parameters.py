@@ -1,4 +1,4 @@
-"""The node's parameters, made from the option dataclasses."""
+"""The parameters of the node, made from the option dataclasses."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,15 +14,15 @@ from hand_eye_calib.core.base.option import OptionField, Options, check_value, d
 _OF_NODE = NodeConfig.by_name()
 FIELDS = CalibratorConfig.by_name() | _OF_NODE
 
-# Declared by rclpy itself.
+# Parameters that rclpy declares.
 _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
 
 
 class Parameters:
-    """Declares the parameters on a node and keeps them as option objects.
+    """Declares the parameters on a node and stores them as option objects.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides=True``: so
-    rclpy shows what a file or the command line sets, unknown names included.
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``, so
+    that rclpy lists the values of files and of the command line, unknown names included.
 
     Parameters
     ----------
@@ -31,21 +31,21 @@ class Parameters:
         Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
         new options by then.
     check : callable
-        ``check(NodeConfig)`` raises ConfigError for options that cannot be put in force.
+        ``check(NodeConfig)`` raises ConfigError for options that cannot be applied.
 
     Attributes
     ----------
     given : dict
-        Values that somebody set, at their defaults or not.
+        Values that the user has set, even if equal to their defaults.
     calibrator : CalibratorConfig
     node : NodeConfig
     unknown : list of str
-        One line for every given name that does not exist, unless it is of a QoS.
+        One line for every name that does not exist, unless it is a QoS override.
 
     Raises
     ------
     ConfigError
-        If a given value is of the wrong type or out of range.
+        If a value is of the wrong type or out of range.
     """
 
     def __init__(
@@ -54,21 +54,24 @@ class Parameters:
         on_change: Callable[[], None],
         check: Callable[[NodeConfig], None],
     ) -> None:
-        found: dict[str, Any] = node.get_parameters_by_prefix("")
+        declared: dict[str, Any] = node.get_parameters_by_prefix("")
         overrides = {
-            name: each.value for name, each in found.items() if name not in _SYSTEM_PARAMETERS
+            name: parameter.value
+            for name, parameter in declared.items()
+            if name not in _SYSTEM_PARAMETERS
         }
-        for name in overrides:  # so that they can get descriptors
+        # Declared again below, with descriptors.
+        for name in overrides:
             node.undeclare_parameter(name)
         self.unknown = [
             f"parameter {name} does not exist and is ignored{did_you_mean(name, FIELDS)}"
             for name in overrides
             if name not in FIELDS and not name.startswith("qos_overrides.")
         ]
+        # YAML reads off without quotes as false.
         if overrides.get("journal") is False:
-            overrides["journal"] = "off"  # of which YAML makes a false, without quotes
-        ours = [name for name in FIELDS if name in overrides]
-        self.given: Options = {name: check_value(FIELDS[name], overrides[name]) for name in ours}
+            overrides["journal"] = "off"
+        self.given = _checked(overrides)
         self.calibrator, self.node = _configs(self.given)
         check(self.node)
         self._check_node = check
@@ -80,8 +83,9 @@ class Parameters:
         node.add_post_set_parameters_callback(self._apply)
 
     def _proposed(self, parameters: list[Parameter]) -> Options:
-        ours = {each.name: each.value for each in parameters if each.name in FIELDS}
-        return {**self.given, **{name: check_value(FIELDS[name], ours[name]) for name in ours}}
+        """Return all options with changed parameters."""
+        changes = {parameter.name: parameter.value for parameter in parameters}
+        return {**self.given, **_checked(changes)}
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -98,6 +102,18 @@ class Parameters:
             self._on_change()
 
 
+def _checked(values: Options) -> Options:
+    """Return the values of parameters of this node.
+
+    Raises
+    ------
+    ConfigError
+        If a value is of the wrong type or out of range.
+    """
+    names = [name for name in FIELDS if name in values]
+    return {name: check_value(FIELDS[name], values[name]) for name in names}
+
+
 def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
     of_node = {name: value for name, value in values.items() if name in _OF_NODE}
     of_calibrator = {name: value for name, value in values.items() if name not in _OF_NODE}
@@ -106,13 +122,16 @@ def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
 
 def _descriptor(field: OptionField) -> ParameterDescriptor:
     meta = field.metadata
-    # One that takes a word as well as a number has no single type.
+    words = meta["choices"]
+    # A parameter that takes a word as well as a number has no single type.
     is_dynamic = bool(meta["words"])
-    words = meta["choices"] or (f"{' or '.join(meta['words'])}, or a number",) * is_dynamic
-    unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
-    values = f" Values: {', '.join(words)}." if words else ""
+    if is_dynamic and not words:
+        words = (f"{' or '.join(meta['words'])}, or a number",)
+    description = meta["doc"]
+    if meta["unit"]:
+        description += f" Unit: {meta['unit']}."
+    if words:
+        description += f" Values: {', '.join(words)}."
     return ParameterDescriptor(
-        description=f"{meta['doc']}{unit}{values}",
-        read_only=meta["read_only"],
-        dynamic_typing=is_dynamic,
+        description=description, read_only=meta["read_only"], dynamic_typing=is_dynamic
     )

@@ -1,13 +1,16 @@
-"""The robot's transform tree: what is installed and the base frame are read from it, and the
-extrinsic is broadcast on ``/tf_static``, only once the goal is reached, never as a second parent.
+"""The transform tree of the robot.
+
+The installed transform and the base frame are read from the tree. The result is broadcast on
+``/tf_static`` once the goal is reached, and never as a second parent of a frame.
 """
 
 import contextlib
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -27,17 +30,27 @@ from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import Broadcast
 from hand_eye_calib.online.ros.conversions import LATCHED, LISTENING, quick, to_transform
 
+# Function of parent and child frame.
+ReadExtrinsic: TypeAlias = Callable[[str, str], Extrinsic]
+
+# Value of the option ``installed`` for the transform on /tf_static.
 TF = "tf"
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"
 
-# The transform tree is listened to for so long before anything is broadcast (s): discovery takes up
+# Time (s) for which the node listens to the transform tree before it broadcasts: discovery takes up
 # to 2.4 s.
 LOOK_S = 5.0
 
 
 def message_type(wanted_by: str = "publish_tf") -> type[Any]:
-    """tf2_msgs/TFMessage, which this parameter needs; a ConfigError if that is not installed."""
+    """Return tf2_msgs/TFMessage, which the parameter ``wanted_by`` needs.
+
+    Raises
+    ------
+    ConfigError
+        If tf2_msgs is not installed.
+    """
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError:
@@ -49,8 +62,12 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
 
 
 class RobotTree(FrameTree):
-    """The edges that others broadcast; of two parents of a frame the first counts. ``own`` is what
-    this node has broadcast itself, which is not heard.
+    """Edges that other nodes broadcast; the first parent of a frame counts.
+
+    Attributes
+    ----------
+    own : deque of TransformStamped
+        Transforms that this node has broadcast, which are ignored.
     """
 
     def __init__(self, node: Node, log: NodeLog) -> None:
@@ -61,58 +78,59 @@ class RobotTree(FrameTree):
         self._subscriptions: dict[str, Subscription] = {}
 
     def listen(self, topic: str = STATIC_TOPIC) -> None:
-        """Listen to a topic from now on."""
+        """Subscribe to a topic."""
         if topic not in self._subscriptions:
-            heard = partial(self._hear, topic)
             qos = LISTENING if topic == STATIC_TOPIC else quick()
-            subscription = self._node.create_subscription(message_type(), topic, heard, qos)
-            self._subscriptions[topic] = subscription
+            self._subscriptions[topic] = self._node.create_subscription(
+                message_type(), topic, partial(self._receive, topic), qos
+            )
 
     def ignore(self, topic: str) -> None:
-        """Listen to a topic no longer."""
+        """Unsubscribe from a topic."""
         if topic in self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def what_forbids(self, parent: str, child: str) -> str:
-        """Why the edge ``parent -> child`` must not be broadcast; empty if it may."""
-        if child in self.edges:
-            edge = self.edges[child]
+        """Return why the edge ``parent -> child`` must not be broadcast; empty if it may."""
+        if edge := self.edges.get(child):
             topic = STATIC_TOPIC if edge.is_static else DYNAMIC_TOPIC
             if edge.parent == parent:
                 return f"{topic} has the edge {parent} -> {child} already, from another node"
             return f"{child} has the parent {edge.parent} on {topic} already, and a frame has one"
-        with contextlib.suppress(InputError):  # it is not there, or others have closed a circle
+        # The parent is unknown, or other edges form a circle.
+        with contextlib.suppress(InputError):
             if child in self.above(parent):
                 return f"{parent} is below {child} already: the edge would close a circle"
         return ""
 
-    def _hear(self, topic: str, message: Any) -> None:
-        for each in message.transforms:
-            if each in self.own:
+    def _receive(self, topic: str, message: Any) -> None:
+        for transform in message.transforms:
+            if transform in self.own:
                 continue
-            edge = transform_of(each)
-            frame = edge.sensor_frame or ""
+            fields = transform_of(transform)
+            frame = fields.sensor_frame or ""
             try:
-                known = self.add(edge.world_frame, frame, None, is_static=topic == STATIC_TOPIC)
-                known.pose = checked_pose(edge.position, edge.quat_xyzw)
+                edge = self.add(fields.world_frame, frame, None, is_static=topic == STATIC_TOPIC)
+                edge.pose = checked_pose(fields.position, fields.quat_xyzw)
             except InputError as error:
                 self._log.warning(f"{topic} has an unusable transform of {frame}: {error}")
 
 
 class Robot:
-    """Completes results with what is installed, and with the pose in the base frame, from the
-    robot's own frames. These two options do not change while the node runs.
+    """Frames of the robot: adds installed transform and base frame to results.
+
+    The options ``installed`` and ``base_frame`` do not change while the node runs.
 
     Attributes
     ----------
     problem : str
-        Why the installed extrinsic or the base frame is not known yet; empty if it is, or if
-        nothing was asked for.
+        Reason why the installed transform or the base frame is unknown; empty if they are known, or
+        if no option asks for them.
 
     Raises
     ------
     ConfigError, InputError
-        If what is installed cannot be read.
+        If the installed transform cannot be read.
     """
 
     def __init__(self, log: NodeLog, options: NodeConfig, frames: FrameTree) -> None:
@@ -120,17 +138,20 @@ class Robot:
         self._frames = frames
         self._source = options.installed
         self._base_frame = options.base_frame
-        # What is installed between the two frames that were asked for last.
+        self.problem = ""
+        # Installed transform between the two frames of the last result.
         self._installed: Extrinsic | None = None
         self._installed_for = ("", "")
-        self.problem = ""
-        of_tree = partial(stated, frames.pose, STATIC_TOPIC)
-        self._read = of_tree if self._source in ("", TF) else open_installed(self._source)
+        if self._source in ("", TF):
+            self._read: ReadExtrinsic = partial(stated, frames.pose, STATIC_TOPIC)
+        else:
+            self._read = open_installed(self._source)
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
-        """What is installed; None if nothing was given, or it is not known (yet)."""
+        """Return the installed transform; None if it is unknown, or if no option asks for it."""
         frames = parent_frame, child_frame
-        if frames != self._installed_for:  # inverted poses exchange the frames of their stream
+        # Inverted poses exchange the frames of their stream.
+        if frames != self._installed_for:
             self._installed = None
         if self._installed is None and self._source:
             try:
@@ -143,8 +164,9 @@ class Robot:
         return self._installed
 
     def complete(self, calibration: Calibration) -> Calibration:
-        """A usable result with its comparison and its pose in the base frame, if that is known. A
-        single axis that the motion cannot determine has the value that is installed.
+        """Return a usable result with its comparison and its pose in the base frame, if known.
+
+        A single axis of the translation that the motion cannot determine gets the installed value.
         """
         installed = self.installed(calibration.parent_frame, calibration.child_frame)
         if installed is not None:
@@ -161,7 +183,7 @@ class Robot:
 
     @property
     def why_not_compared(self) -> str:
-        """Why a result is not compared with what is installed; empty if that was not asked for."""
+        """Reason why the result is not compared; empty if no option asks for a comparison."""
         return (self.problem or "no result yet") if self._source else ""
 
     def _report(self, problem: str) -> None:
@@ -170,56 +192,69 @@ class Robot:
 
 
 def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
-    """A result whose only unobservable axis, of the translation, is that of what is installed."""
+    """Return a result whose only unobservable axis, of the translation, is the installed one."""
     hidden = calibration.unobservable()
     if len(hidden) != 1 or hidden[0] in (*ROTATIONS, *calibration.out_of_reach):
         return calibration
-    index = AXES.index(hidden[0])
+    (axis,) = hidden
+    index = AXES.index(axis)
     T = calibration.T_parent_child.copy()
     covariance = turned(T[:3, :3], calibration.covariance_measured)
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
-    # The other axes follow as far as the motion has tied them to this one.
+    # The other axes follow as far as the motion correlates them with this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
-    told = f"{hidden[0]} is that of what is installed ({installed.origin})"
-    return replace(calibration, T_parent_child=T, warnings=(*calibration.warnings, told))
+    warning = f"{axis} is that of what is installed ({installed.origin})"
+    return replace(calibration, T_parent_child=T, warnings=(*calibration.warnings, warning))
 
 
 class TfBroadcaster:
-    """Broadcasts the result of a session that has reached its goal on ``/tf_static`` while that is
-    switched on. ``state`` is what is done about it, and the reason.
+    """Broadcasts the result on ``/tf_static`` once the session has reached its goal.
+
+    Attributes
+    ----------
+    state : (Broadcast, str)
+        Whether the result is broadcast, and the reason if it is not.
     """
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
+        self.state: tuple[Broadcast, str] = Broadcast.OFF, ""
         self._node = node
         self._log = log
         self._tree = tree
         self._is_on = False
         self._began_s = 0.0
         self._publisher: Any = None
-        self.state: tuple[Broadcast, str] = Broadcast.OFF, ""
 
     def switch(self, on: bool) -> None:
-        """Start or stop; a listener that has heard the edge keeps it until it is restarted."""
-        if on != self._is_on:
-            self._is_on = on
-            self._began_s = time.monotonic()
-            if on:
-                self._tree.listen()
-                self._tree.listen(DYNAMIC_TOPIC)
-            else:
-                self._tree.ignore(DYNAMIC_TOPIC)
+        """Switch broadcasting on or off; a listener keeps the last edge until it restarts."""
+        if on == self._is_on:
+            return
+        self._is_on = on
+        self._began_s = time.monotonic()
+        if on:
+            self._tree.listen()
+            self._tree.listen(DYNAMIC_TOPIC)
+        else:
+            self._tree.ignore(DYNAMIC_TOPIC)
 
-    def look(self, result: Calibration | None, why_not: str) -> None:
-        """Broadcast the session's result if it is new, as far as the tree allows it now; to be
-        called often. ``why_not`` is empty if it may be.
+    def update(self, result: Calibration | None, why_not: str) -> None:
+        """Broadcast the result if it is new and the tree permits it; to be called often.
+
+        Parameters
+        ----------
+        result : Calibration or None
+        why_not : str
+            Reason why the result must not be broadcast yet; empty if it may.
         """
-        if self._is_on and self._publisher is None:  # without a message: discovery takes seconds
+        # Created before the first message, because discovery takes seconds.
+        if self._is_on and self._publisher is None:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
         was_on = self.state[0] is Broadcast.ON
-        self.state = self._judged(result, why_not)
+        self.state = self._decide(result, why_not)
         if result is not None and self.state[0] is Broadcast.ON:
             self._broadcast(result, not was_on)
-        elif was_on:  # new listeners get nothing; the others keep it
+        elif was_on:
+            # New listeners receive nothing any more.
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
             self._log.warning(
@@ -227,7 +262,7 @@ class TfBroadcaster:
                 "they are restarted"
             )
 
-    def _judged(self, result: Calibration | None, why_not: str) -> tuple[Broadcast, str]:
+    def _decide(self, result: Calibration | None, why_not: str) -> tuple[Broadcast, str]:
         if not self._is_on:
             return Broadcast.OFF, ""
         if result is None or why_not:
@@ -238,16 +273,17 @@ class TfBroadcaster:
             return Broadcast.REFUSED, f"{axes_in_words(hidden)} not determined"
         if time.monotonic() - self._began_s < LOOK_S:
             return Broadcast.WAITING, "the transform tree is looked at first"
-        if forbidden := self._tree.what_forbids(result.mounting[0], result.child_frame):
+        if reason := self._tree.what_forbids(result.mounting[0], result.child_frame):
             self._log.error(
-                f"publish_tf is refused: {forbidden}. Put the result into the robot's description "
+                f"publish_tf is refused: {reason}. Put the result into the robot's description "
                 "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
             )
-            return Broadcast.REFUSED, forbidden
+            return Broadcast.REFUSED, reason
         return Broadcast.ON, ""
 
     def _broadcast(self, result: Calibration, is_first: bool) -> None:
-        self._tree.ignore(DYNAMIC_TOPIC)  # enough of that: it may be fast
+        # The tree has been checked, and this topic may be fast.
+        self._tree.ignore(DYNAMIC_TOPIC)
         own = self._tree.own
         transform = to_transform(result, True)
         if is_first:

@@ -1,7 +1,8 @@
-"""Listens to the nodes for ``watch``, and passes the presses of its buttons on."""
+"""Connection of ``watch`` to the nodes: receives their states and sends requests."""
 
 import os
 import time
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
@@ -24,15 +25,33 @@ from hand_eye_calib.online.ros.conversions import LATCHED
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.online.watch.board import Board, state_of
 
-# So many nodes are listened to, and so many topics with poses are told of, at most.
-_MOST = 20
+# Nodes that are heard, and topics with poses that are listed, at most.
+_MAX_NAMES = 20
 
-# A service that has not answered for so long will not (s).
+# Time (s) after which a request counts as unanswered.
 _PATIENCE_S = 3.0 * ANSWER_WITHIN_S
 
 
+@dataclass
+class _Request:
+    """A call of a service that has not been answered.
+
+    Attributes
+    ----------
+    future : Future or None
+        The answer; None while the service is awaited.
+    start_s : float
+        Time of the request (steady, s).
+    """
+
+    client: Client
+    message: Any
+    start_s: float
+    future: Future | None = None
+
+
 class Watcher:
-    """Fills a board with what the nodes say; a context manager."""
+    """Passes the states of nodes to a board; a context manager."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -47,8 +66,9 @@ class Watcher:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_timer(REPORT_PERIOD_S, self._look)
+        # Names of the nodes whose state is received.
         self._heard: set[str] = set()
-        self._asked: dict[str, tuple[Client, Any, Future | None, float]] = {}
+        self._requests: dict[str, _Request] = {}
         self._look()
 
     def __enter__(self) -> Self:
@@ -60,87 +80,99 @@ class Watcher:
         rclpy.shutdown(context=self._context)
 
     def spin(self, seconds: float) -> None:
-        """Take what comes in, for at most so long."""
+        """Process messages for at most so many seconds."""
         self._executor.spin_once(timeout_sec=seconds)
-        for asked in list(self._asked):
-            self._follow(asked)
+        for name in list(self._requests):
+            self._follow(name)
 
     def ask(self, request: str) -> None:
-        """Do what a button asks for: call ``solve``, ``save`` or ``reset`` of the node that is
-        shown, or set a parameter, as in ``prior.z:=1.85m+/-0.02m``; the answer goes to the board.
+        """Send a request to the displayed node; the board receives the answer.
+
+        Parameters
+        ----------
+        request : str
+            Name of a service such as ``solve``, or a parameter such as
+            ``prior.z:=1.85m+/-0.02m``.
         """
         if request == "acknowledge":
             self._board.acknowledge()
-        elif self._board.node and request not in self._asked:
-            parameters = self._parameters(request)
-            kind = Trigger
-            name = request
+            return
+        if not self._board.node or request in self._requests:
+            return
+        now_s = time.monotonic()
+        if parameters := self._parameters(request):
+            messages = [parameter.to_parameter_msg() for parameter in parameters]
+            message = SetParameters.Request(parameters=messages)
+            client = self._node.create_client(SetParameters, f"{self._board.node}/set_parameters")
+        else:
             message = Trigger.Request()
-            if parameters:
-                kind = SetParameters
-                name = "set_parameters"
-                messages = [parameter.to_parameter_msg() for parameter in parameters]
-                message = SetParameters.Request(parameters=messages)
-            client = self._node.create_client(kind, f"{self._board.node}/{name}")
-            self._asked[request] = client, message, None, time.monotonic()
-            self._board.answer(request, None, "asked ...", time.monotonic())
+            client = self._node.create_client(Trigger, f"{self._board.node}/{request}")
+        self._requests[request] = _Request(client, message, now_s)
+        self._board.answer(request, None, "asked ...", now_s)
 
     def _parameters(self, request: str) -> list[Parameter]:
-        """The parameters that a request sets; none if it calls a service."""
+        """Return the parameters that a request sets; none if it calls a service."""
         name, is_parameter, value = request.partition(":=")
         if is_parameter:
             return [Parameter(name, value=value)]
         if request == "recalibrate":
             return [Parameter("monitor", value=False)]
         if request == "forget":
-            axes = self._board.priors or AXES
-            return [Parameter(f"prior.{axis}", value="") for axis in axes]
+            return [Parameter(f"prior.{axis}", value="") for axis in self._board.priors or AXES]
         return []
 
     def _look(self) -> None:
-        """Listen to nodes that are new: anybody may have a topic of that name. And note the topics
-        with poses, but those of such nodes, for a person whose input has none.
+        """Subscribe to new nodes, and list the topics with poses of other nodes.
+
+        Any program may publish on a topic of this name, so the number of nodes is limited. The list
+        helps a person whose input has no poses.
         """
-        found = self._node.get_topic_names_and_types()
-        for topic, types in found:
+        topics = self._node.get_topic_names_and_types()
+        for topic, types in topics:
             name, _, last = topic.rpartition("/")
-            is_one = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
-            if is_one and name not in self._heard and len(self._heard) < _MOST:
+            is_state = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
+            if is_state and name not in self._heard and len(self._heard) < _MAX_NAMES:
                 self._heard.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
-        poses = [(topic, kind) for topic, kinds in found for kind in kinds if kind in POSE_TYPES]
-        poses = [each for each in poses if each[0].rpartition("/")[0] not in self._heard]
-        told = tuple(self._told(*each) for each in poses[:_MOST])
-        self._board.topics = told or ("none is published here",)
+        poses = [
+            (topic, type_name)
+            for topic, types in topics
+            for type_name in types
+            if type_name in POSE_TYPES and topic.rpartition("/")[0] not in self._heard
+        ]
+        lines = [self._describe(topic, type_name) for topic, type_name in poses[:_MAX_NAMES]]
+        self._board.topics = tuple(lines or ["none is published here"])
 
-    def _told(self, topic: str, kind: str) -> str:
+    def _describe(self, topic: str, type_name: str) -> str:
+        """Return a line with type, publishers and reliability of a topic."""
         publishers = self._node.get_publishers_info_by_topic(topic)
-        qos = {each.qos_profile.reliability.name.lower().replace("_", " ") for each in publishers}
-        count = counted(len(publishers), "publisher")
-        told = (kind.rpartition("/")[2], count, " and ".join(sorted(qos)))
-        return f"{topic} ({', '.join(filter(None, told))})"
+        texts = [type_name.rpartition("/")[2], counted(len(publishers), "publisher")]
+        if publishers:
+            names = {publisher.qos_profile.reliability.name for publisher in publishers}
+            texts.append(" and ".join(sorted(names)).lower().replace("_", " "))
+        return f"{topic} ({', '.join(texts)})"
 
     def _take(self, name: str, message: String) -> None:
         state = state_of(message.data)
         if state is not None and state.node == name:
             self._board.take(state, time.monotonic())
 
-    def _follow(self, request: str) -> None:
-        """Go on with a request: wait for the service, then for the answer."""
-        client, message, future, asked_s = self._asked[request]
-        if future is None and client.service_is_ready():
-            self._asked[request] = client, message, client.call_async(message), asked_s
-        elif future is not None and future.done():
-            response: Any = future.result()
-            if client.srv_type is SetParameters:
-                refused = [each.reason for each in response.results if not each.successful]
-                self._end(request, not refused, "; ".join(refused))
+    def _follow(self, name: str) -> None:
+        """Continue a request: await the service, then its answer."""
+        request = self._requests[name]
+        if request.future is None and request.client.service_is_ready():
+            request.future = request.client.call_async(request.message)
+        elif request.future is not None and request.future.done():
+            response: Any = request.future.result()
+            if request.client.srv_type is SetParameters:
+                refused = [result.reason for result in response.results if not result.successful]
+                self._end(name, not refused, "; ".join(refused))
             else:
-                self._end(request, response.success, response.message)
-        elif time.monotonic() - asked_s > _PATIENCE_S:
-            self._end(request, False, f"no answer within {_PATIENCE_S:.0f} s")
+                self._end(name, response.success, response.message)
+        elif time.monotonic() - request.start_s > _PATIENCE_S:
+            self._end(name, False, f"no answer within {_PATIENCE_S:.0f} s")
 
-    def _end(self, request: str, good: bool, text: str) -> None:
-        self._node.destroy_client(self._asked.pop(request)[0])
-        self._board.answer(request, good, printable(text) or "done", time.monotonic())
+    def _end(self, name: str, good: bool, text: str) -> None:
+        self._node.destroy_client(self._requests.pop(name).client)
+        self._board.answer(name, good, printable(text) or "done", time.monotonic())
