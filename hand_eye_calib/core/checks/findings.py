@@ -8,9 +8,18 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, defaults_of
+from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.results.records import Finding, Severity, gravest_first
 
-__all__ = ["Finding", "Severity", "answered", "finding", "graded", "gravest_first"]
+__all__ = [
+    "Finding",
+    "Severity",
+    "answered",
+    "finding",
+    "graded",
+    "gravest_first",
+    "repair_message",
+]
 
 _NOTE = Severity.NOTE
 _WARNING = Severity.WARNING
@@ -523,6 +532,22 @@ def conventions(code: str, stream: str) -> dict[str, float | str]:
         return {}
     kind, value = CONVENTIONS[code]
     return {f"{each}_{kind}": value for each in ("parent", "child") if stream in (each, "both")}
+
+
+def repair_message(findings: Sequence[Finding], options: Options, verdicts: str = "") -> str:
+    """Return what was repaired, the options that did it, and those that undo it.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        Those that the options repair.
+    options : mapping
+    verdicts : str
+        Verdicts with and without the repair, in words.
+    """
+    what = "; ".join(found.what for found in findings)
+    undo = options_in_words(defaults_of(options))
+    return f"repaired: {what}. Solved with {options_in_words(options)}{verdicts} (undo with {undo})"
 
 
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:

@@ -19,10 +19,10 @@ from typing import TypeAlias
 from hand_eye_calib.core.alignment.time_offset import TimeOffset, refine_time_offset
 from hand_eye_calib.core.base.config import METHODS, defaults_of
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
-from hand_eye_calib.core.base.option import Options, options_in_words
+from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding, repair_message
 from hand_eye_calib.core.checks.hypotheses import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_options
@@ -269,7 +269,12 @@ def _repaired(
     second = _estimated(second, left, settled, None).with_doubts(reading.doubts)
     if any(map(_speaks_against_repair, second.check.findings)):
         return None
-    message = _repair_message(second, findings, options, verdict_as_given)
+    verdict = second.calibration.verdict.value
+    message = repair_message(
+        [found for found in findings if {*found.options} & {*options}],
+        options,
+        f": {verdict}; as the streams are: {verdict_as_given}",
+    )
     second = second.with_messages({**options, **second.options}, (message, *second.messages))
     # A ratio of lengths does not exclude that the child has its own scale.
     doubts = [
@@ -279,18 +284,6 @@ def _repaired(
     ]
     doubts += [found for found in findings if found.code == "ambiguous"]
     return _with_offset_doubt(second, doubts)
-
-
-def _repair_message(
-    second: Attempt, findings: Collection[Finding], options: Options, verdict_as_given: str
-) -> str:
-    """Say what was repaired, with which options, and how to undo it."""
-    what = [found.what for found in findings if {*found.options} & {*options}]
-    return (
-        f"repaired: {'; '.join(what)}. Solved with {options_in_words(options)}: "
-        f"{second.calibration.verdict.value}; as the streams are: {verdict_as_given} "
-        f"(undo with {options_in_words(defaults_of(options))})"
-    )
 
 
 def _speaks_against_repair(found: Finding) -> bool:

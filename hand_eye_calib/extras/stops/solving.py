@@ -1,0 +1,322 @@
+"""Solve of stops: check them, repair what is certain, choose the setup, settle the scale."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.checks.findings import Finding, finding, repair_message
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.records import gravest_first
+from hand_eye_calib.extras.stops.checks import LEAST_LEAD, Examination, examine
+from hand_eye_calib.extras.stops.robot_world import RobotWorld, Stops, solve
+from hand_eye_calib.extras.stops.rough_fit import (
+    Mistakes,
+    StopPoses,
+    scaled,
+    turns_about_two_axes,
+)
+from hand_eye_calib.extras.stops.worlds import SETUPS
+
+# A scale differs from 1 if it does by so many standard deviations, and by this share.
+_SCALE_SIGMAS = 3.0
+_SCALE_SHARE = 0.01
+
+# Bias of the scale by noise of the child's positions, in squared standard deviations (as a share)
+# for each stop; it makes the scale smaller. Measured with KinHEC's noisy stops, whose scale is 0.76
+# +/- 0.06 where 1 is right.
+_BIAS_BY_NOISE = 3.0
+
+# A scale beyond this factor is not that of a target of another size.
+_LARGEST_SIZE = 10.0
+
+# Rounds of the search for the scale; a step below this share of a standard deviation ends it.
+_SCALE_ROUNDS = 10
+_SMALL_STEP = 0.02
+
+# Stops that rotate by more than this (rad; 10 deg) in the median determine all directions, unless
+# their errors are larger than those of any camera.
+_FAR_RAD = 0.17
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Stops read with the camera at one place, and their fit.
+
+    Attributes
+    ----------
+    fit : RobotWorld
+    stops : Stops
+    is_inverse : bool
+        Whether one side is taken as inverse: for an arm, the camera is beside the robot.
+    scale, scale_sigma : float
+        Factor of the child's lengths and its standard deviation; 0 if it was not estimated.
+    lead : float
+        How much larger the objective of the other place of the camera is.
+    """
+
+    fit: RobotWorld
+    stops: Stops
+    is_inverse: bool
+    scale: float = 1.0
+    scale_sigma: float = 0.0
+    lead: float = np.inf
+
+
+@dataclass(frozen=True)
+class SolvedStops:
+    """A reading of stops with the options, findings and warnings that lead to it."""
+
+    reading: Reading
+    config: CalibratorConfig
+    findings: tuple[Finding, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether no finding forbids the use of the result."""
+        return not any(found.makes_unusable for found in self.findings)
+
+    def adding(self, *findings: Finding) -> "SolvedStops":
+        """Return the same with further findings."""
+        return replace(self, findings=gravest_first((*self.findings, *findings)))
+
+
+def solve_checked(
+    poses: StopPoses, config: CalibratorConfig, setup: str | None = None
+) -> SolvedStops:
+    """Check stops, repair what is certain, and solve.
+
+    Parameters
+    ----------
+    poses : StopPoses
+        In the conventions of their source.
+    config : CalibratorConfig
+    setup : {"hand", "beside"}, optional
+        Place of the camera of an arm. Default: the likelier one.
+
+    Raises
+    ------
+    ConfigError
+        If the scale is to be estimated from rotations alone.
+    """
+    if config.scale == "estimate" and not poses.has_positions:
+        raise ConfigError("scale estimate needs positions; both sides have rotations alone")
+    unit = config.given_scale
+    examination = examine(_in_metres(poses, config, unit))
+    if config.scale in ("auto", "estimate"):
+        # The unit of the child's lengths is a part of the scale that is estimated.
+        unit = _child_unit(examination)
+        examination = _without_child_unit(examination)
+    findings, repairs = _beside_set_options(examination, config)
+    # The rough scale is that of lengths whose units are put right.
+    is_repaired = len(repairs) == len(examination.repairs)
+    rough_scale = examination.scale if is_repaired else None
+    warnings = []
+    if repairs:
+        options = _options_of(repairs, config)
+        warnings.append(repair_message(repairs, options))
+        config = replace(config, **options)
+        unit = float(options.get("scale", unit))
+    poses = _in_metres(poses, config, unit)
+    reading = _likelier_reading(poses, rough_scale or 1.0, setup)
+    if setup and reading.lead < -LEAST_LEAD:
+        other = "hand" if reading.is_inverse else "beside"
+        findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
+    free = None
+    if config.scale == "estimate" or _determines_scale(poses, findings):
+        free = _with_free_scale(poses, reading)
+        is_used = _judge_scale(free, config, unit, findings, warnings)
+        free = free if is_used else None
+    if free:
+        reading = free
+    elif reading.scale != 1.0:
+        reading = _likelier_reading(poses, 1.0, setup)
+    findings += _check_unknown(poses, reading.fit, findings)
+    reading = replace(reading, scale=unit * reading.scale, scale_sigma=unit * reading.scale_sigma)
+    return SolvedStops(reading, config, gravest_first(findings), tuple(warnings))
+
+
+# ------------------------------------------------------------------ options and repairs
+
+
+def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) -> StopPoses:
+    """Return poses in the usual convention, by the options and the child's factor to metres."""
+    parent = se3.put_right(poses.parent, config.parent_invert, config.parent_quaternion)
+    child = se3.put_right(poses.child, config.child_invert, config.child_quaternion)
+    return replace(
+        poses, parent=scaled(parent, config.parent_scale), child=scaled(child, child_unit)
+    )
+
+
+def _is_child_unit(found: Finding) -> bool:
+    return {*found.options} == {"scale"}
+
+
+def _child_unit(examination: Examination) -> float:
+    """Return the factor to metres of the child's lengths; 1 if they are in metres."""
+    units = [
+        float(found.options["scale"])
+        for found in (*examination.findings, *examination.repairs)
+        if _is_child_unit(found)
+    ]
+    return units[-1] if units else 1.0
+
+
+def _without_child_unit(examination: Examination) -> Examination:
+    """Return the examination without the finding about the unit of the child's lengths."""
+    findings = tuple(found for found in examination.findings if not _is_child_unit(found))
+    repairs = tuple(found for found in examination.repairs if not _is_child_unit(found))
+    return replace(examination, findings=findings, repairs=repairs)
+
+
+def _beside_set_options(
+    examination: Examination, config: CalibratorConfig
+) -> tuple[list[Finding], list[Finding]]:
+    """Return findings and repairs, where a repair of an option that the user set is a finding."""
+    findings = []
+    for found in examination.findings:
+        if found.code != "ambiguous":
+            findings.append(_beside_set_values(found, config))
+        elif not {*found.options} <= config.given:
+            # A user who sets the conventions of both sides has decided.
+            findings.append(found)
+    settled_codes = {found.code for found in examination.repairs if {*found.options} & config.given}
+    repairs = []
+    for found in examination.repairs:
+        if found.code in settled_codes:
+            findings.append(_beside_set_values(found, config))
+        else:
+            repairs.append(found)
+    return findings, repairs
+
+
+def _beside_set_values(found: Finding, config: CalibratorConfig) -> Finding:
+    """Return a finding whose options are combined with the values that the user set."""
+    options: dict[str, float | str] = {}
+    for name, value in found.options.items():
+        current = getattr(config, name)
+        if current == value or {current, value} == {"wxyz", "yzwx"}:
+            # A convention that is undone twice, or by its contrary, was right before.
+            options[name] = getattr(CalibratorConfig, name)
+        elif isinstance(value, float) and isinstance(current, float):
+            options[name] = value * current
+        else:
+            options[name] = value
+    return replace(found, options=options)
+
+
+def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[str, Any]:
+    """Return the options of all repairs; the factor of the parent's lengths times that set."""
+    options: dict[str, Any] = {}
+    for repair in repairs:
+        options |= repair.options
+    if "parent_scale" in options:
+        options["parent_scale"] = float(options["parent_scale"]) * config.parent_scale
+    return options
+
+
+# ------------------------------------------------------------------ setup and scale
+
+
+def _likelier_reading(poses: StopPoses, scale: float, setup: str | None) -> Reading:
+    """Return the likelier reading of stops, or that of a setup, whose lead may be negative."""
+    readings = []
+    for is_inverse in (False, True) if poses.is_arm else (False,):
+        stops = poses.without(Mistakes(is_inverse=is_inverse), scale)
+        readings.append(Reading(solve(stops), stops, is_inverse, scale))
+    if not poses.is_arm:
+        return readings[0]
+    if setup is None:
+        readings.sort(key=lambda reading: reading.fit.objective)
+    elif setup == "beside":
+        readings.reverse()
+    chosen, other = readings
+    return replace(chosen, lead=other.fit.objective - chosen.fit.objective)
+
+
+def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
+    """Return whether stops without errors determine the factor of the child's lengths."""
+    has_errors = any(found.makes_unusable for found in findings)
+    return not has_errors and poses.has_positions and turns_about_two_axes(poses.parent)
+
+
+def _with_free_scale(poses: StopPoses, reading: Reading) -> Reading:
+    """Return a reading with the factor of the child's lengths estimated."""
+    mistakes = Mistakes(is_inverse=reading.is_inverse)
+    scale = reading.scale
+    for _ in range(_SCALE_ROUNDS):
+        stops = poses.without(mistakes, scale)
+        fit = solve(stops, stretch=np.inf)
+        if not np.isfinite(fit.scale_sigma):
+            break
+        if abs(fit.scale_step) < _SMALL_STEP * fit.scale_sigma:
+            break
+        scale *= 1.0 + float(np.clip(fit.scale_step, -0.5, 1.0))
+    sigma = scale * fit.scale_sigma
+    return replace(reading, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
+
+
+def _judge_scale(
+    free: Reading,
+    config: CalibratorConfig,
+    unit: float,
+    findings: list[Finding],
+    warnings: list[str],
+) -> bool:
+    """Return whether an estimated scale is used; add the finding and the warning about it.
+
+    ``unit`` is the factor that the child's lengths were multiplied by before.
+    """
+    is_auto = config.scale == "auto"
+    is_estimate = config.scale == "estimate"
+    is_size = 1.0 / _LARGEST_SIZE < free.scale < _LARGEST_SIZE
+    is_clear = _difference_from_one(free) > _SCALE_SHARE or (is_auto and unit != 1.0)
+    is_used = is_estimate or (is_clear and is_size and not config.is_known("scale"))
+    is_asked = is_estimate or (is_auto and is_size)
+    scale = unit * free.scale
+    sigma = unit * free.scale_sigma
+    if is_clear and not is_asked:
+        findings.append(
+            finding(
+                "target_scale",
+                "child",
+                options={"scale": "estimate"},
+                scale=scale,
+                sigma=sigma,
+                times=1.0 / scale,
+            )
+        )
+    if is_used and not is_estimate:
+        undo = "none" if unit == 1.0 or is_auto else unit
+        warnings.append(
+            f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as "
+            f"they are, give scale {undo}"
+        )
+    return is_used
+
+
+def _difference_from_one(free: Reading) -> float:
+    """Return by which share an estimated scale differs from 1, beyond its errors and its bias."""
+    share = free.scale_sigma / free.scale
+    bias = _BIAS_BY_NOISE * len(free.stops) * share**2
+    lowest = np.log(free.scale) - _SCALE_SIGMAS * share
+    highest = np.log(free.scale) + bias + _SCALE_SIGMAS * share
+    return float(max(lowest, -highest, 0.0))
+
+
+def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:
+    """Return why directions are unknown: stops turn about one axis, or contradict each other."""
+    if not turns_about_two_axes(poses.parent):
+        return [finding("turning_about_one_axis")] if poses.has_positions else []
+    has_errors = any(found.makes_unusable for found in findings)
+    rotations = poses.parent[:, :3, :3]
+    turn_rad = median(se3.rotation_angle(rotations[0].T @ rotations))
+    if has_errors or not fit.undetermined().size or turn_rad < _FAR_RAD:
+        return []
+    share = min(float(np.sqrt(3.0)) * fit.level_rad / turn_rad, 1.0)
+    return [finding("disagreeing_stops", part="rotations", share=share)]
