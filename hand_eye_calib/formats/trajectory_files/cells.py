@@ -1,6 +1,6 @@
-"""Cells of the lines of a text file: what separates them, and the numbers in them.
+"""Cells of the lines of a text file: the separator between them, and the numbers in them.
 
-All patterns match whole cells and need time in proportion to their length.
+Every pattern matches a whole cell, in time proportional to its length.
 """
 
 import csv
@@ -10,22 +10,25 @@ from math import nan
 
 from hand_eye_calib.formats.trajectory_files.dates import is_date_or_time
 
-#: White space between cells.
+#: Separator of cells between which there is only white space.
 BLANKS = ""
-# Tried in this order: where two give as many numbers, the first is taken.
+# Separators in the order in which they are tried: the first of equally good ones is taken.
 _SEPARATORS = (";", "\t", ",", "|", BLANKS)
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE)
-# What programs write where they have no value.
+# Texts that programs write in place of a missing value.
 _NULLS = {"", "nan", "-nan", "null", "none", "na", "n/a", "#n/a", "nil", "-", "--", "?"}
-# Degrees, minutes and seconds with their signs, in at most so many characters.
+# Degrees, minutes and seconds with their signs, and a hemisphere before or behind them.
 _ANGLE = re.compile(
-    r"([-+]?\d{1,3}(?:[.,]\d*)?)(?:[°ºd:\s]+(\d{1,2}(?:[.,]\d*)?)"
-    r"(?:['′’m:\s]+(\d{1,2}(?:[.,]\d*)?))?)?[°ºdms'′’\"″”\s]*",
+    r"(?P<before>[NSEW]?)\s*"
+    r"(?P<degrees>[-+]?\d{1,3}(?:[.,]\d*)?)(?:[°ºd:\s]+(?P<minutes>\d{1,2}(?:[.,]\d*)?)"
+    r"(?:['′’m:\s]+(?P<seconds>\d{1,2}(?:[.,]\d*)?))?)?[°ºdms'′’\"″”\s]*"
+    r"(?P<behind>[NSEW]?)",
     re.ASCII,
 )
+# Characters of the longest angle.
 _LONGEST_ANGLE = 40
-# What an angle has and other cells of numbers have not.
+# Characters that an angle has and that other cells of numbers do not have.
 _ANGLE_SIGNS = set("NSEW°º'′’\"″”:")
 
 CellsOf = Callable[[str], list[str]]
@@ -37,12 +40,12 @@ def is_number(cell: str) -> bool:
 
 
 def is_value(cell: str) -> bool:
-    """Whether a cell is a number, a date or time, or says that there is none."""
+    """Whether a cell is a number, an angle, a date or time, or the mark of a missing value."""
     return is_number(cell) or is_null(cell) or is_date_or_time(cell) or _is_marked_angle(cell)
 
 
 def is_null(cell: str) -> bool:
-    """Whether a cell says that there is no value, nan included."""
+    """Whether a cell is empty, nan or another mark of a missing value."""
     return cell.lower() in _NULLS
 
 
@@ -52,17 +55,17 @@ def is_angle(cell: str) -> bool:
 
 
 def _is_marked_angle(cell: str) -> bool:
-    """Whether a cell is an angle and no row of numbers that blanks separate."""
+    """Whether a cell is an angle rather than a row of numbers between blanks."""
     return not _ANGLE_SIGNS.isdisjoint(cell) and is_angle(cell)
 
 
 def number(cell: str) -> float:
-    """The number in a cell: NaN where there is none.
+    """Return the number in a cell: NaN for a missing value.
 
     Raises
     ------
     ValueError
-        If the cell has something else.
+        If the cell has other text.
     """
     try:
         return float(cell)
@@ -75,12 +78,12 @@ def number(cell: str) -> float:
 
 
 def angle(cell: str) -> float:
-    """The number in a cell, or degrees of an angle such as 52 12 0.5 N.
+    """Return the number in a cell, or the degrees of an angle such as 52 12 0.5 N.
 
     Raises
     ------
     ValueError
-        If the cell has something else.
+        If the cell has other text.
     """
     try:
         return number(cell)
@@ -92,28 +95,25 @@ def angle(cell: str) -> float:
 
 
 def _degrees(cell: str) -> float | None:
-    """Degrees of an angle in degrees, minutes and seconds with a sign or a hemisphere."""
+    """Return the degrees of an angle in degrees, minutes and seconds; None for other text."""
     text = cell.strip()
-    if len(text) > _LONGEST_ANGLE:
+    match = _ANGLE.fullmatch(text) if len(text) <= _LONGEST_ANGLE else None
+    if not match or (match["before"] and match["behind"]):
         return None
-    sides = [letter for letter in (text[:1], text[-1:]) if letter and letter in "NSEW"]
-    if sides:
-        text = text.strip("NSEW").strip()
-    match = _ANGLE.fullmatch(text)
-    if len(sides) > 1 or not match:
+    numbers = match.group("degrees", "minutes", "seconds")
+    sizes = [abs(float(text.replace(",", "."))) for text in numbers if text]
+    if max(sizes[1:], default=0.0) >= 60:
         return None
-    parts = [abs(float(part.replace(",", "."))) for part in match.groups() if part]
-    if any(part >= 60 for part in parts[1:]):
-        return None
-    size = sum(part / 60**power for power, part in enumerate(parts))
-    is_negative = text.startswith("-") or "S" in sides or "W" in sides
-    return -size if is_negative else size
+    total = sum(size / 60**power for power, size in enumerate(sizes))
+    hemisphere = match["before"] or match["behind"]
+    is_negative = match["degrees"].startswith("-") or hemisphere in ("S", "W")
+    return -total if is_negative else total
 
 
 def splitter(separator: str) -> CellsOf:
-    """The function that splits a line into cells at a separator, none inside quotes."""
+    """Return a function that splits a line into cells at a separator outside quotes."""
     if separator == BLANKS:
-        return _at_blanks
+        return _split_at_blanks
 
     def cells_of(line: str) -> list[str]:
         if '"' in line:
@@ -125,20 +125,26 @@ def splitter(separator: str) -> CellsOf:
     return cells_of
 
 
-def _at_blanks(line: str) -> list[str]:
+def _split_at_blanks(line: str) -> list[str]:
     if '"' not in line:
         return line.split()
-    quoted = csv.reader([line.replace("\t", " ")], delimiter=" ", skipinitialspace=True)
-    return [cell for cell in next(quoted) if cell]
+    cells = csv.reader([line.replace("\t", " ")], delimiter=" ", skipinitialspace=True)
+    return [cell for cell in next(cells) if cell]
 
 
 def separator_of(lines: Sequence[str]) -> str:
-    """What separates the cells of lines: with it, the most digits are in cells that are numbers."""
-    counts = [
-        sum(_digits_in_numbers(splitter(separator)(line)) for line in lines)
-        for separator in _SEPARATORS
-    ]
-    return _SEPARATORS[counts.index(max(counts))] if any(counts) else _usual(lines)
+    """Return the separator with which the most digits are in cells that are numbers.
+
+    Lines without numbers have the first separator that is in the first line.
+    """
+    n_digits = {}
+    for separator in _SEPARATORS:
+        cells_of = splitter(separator)
+        n_digits[separator] = sum(_digits_in_numbers(cells_of(line)) for line in lines)
+    if any(n_digits.values()):
+        return max(_SEPARATORS, key=n_digits.__getitem__)
+    first_line = lines[0] if lines else ""
+    return next(separator for separator in _SEPARATORS if separator in first_line)
 
 
 def _digits_in_numbers(cells: Sequence[str]) -> int:
@@ -146,31 +152,34 @@ def _digits_in_numbers(cells: Sequence[str]) -> int:
     return sum(letter.isdigit() for cell in numbers for letter in cell)
 
 
-def _usual(lines: Sequence[str]) -> str:
-    """What separates cells that are no numbers."""
-    first = lines[0] if lines else ""
-    return next((separator for separator in _SEPARATORS[:-1] if separator in first), BLANKS)
-
-
 def names_in(line: str, separator: str) -> list[list[str]]:
-    """The names that a line may have, by what separates them: the separator, that separator
-    outside brackets, white space outside brackets, and wide gaps.
+    """Return the names that a line may have, one list for each way to split the line.
+
+    A line is split at the separator, at the separator outside brackets, at white space outside
+    brackets, at wide gaps, and at other separators.
     """
     text = line.lstrip("#/%").strip()
-    ways = [splitter(separator)(text), _outside_brackets(text, separator)]
-    ways += [_outside_brackets(text, BLANKS), [part.strip() for part in text.split("  ")]]
-    ways += [splitter(other)(text) for other in (",", ";", "\t") if other != separator]
-    return [[name for name in way if name] if way is ways[3] else way for way in ways]
+    between_gaps = [name.strip() for name in text.split("  ")]
+    ways = [
+        splitter(separator)(text),
+        _outside_brackets(text, separator),
+        _outside_brackets(text, BLANKS),
+        [name for name in between_gaps if name],
+    ]
+    return ways + [splitter(other)(text) for other in (",", ";", "\t") if other != separator]
 
 
 def _outside_brackets(text: str, separator: str) -> list[str]:
-    """Cells of a line that is not split inside brackets."""
+    """Split a line at a separator, but not inside brackets."""
     cells = [""]
     depth = 0
     for letter in text:
-        depth += (letter in "([{") - (letter in ")]}" and depth > 0)
+        if letter in "([{":
+            depth += 1
+        elif letter in ")]}" and depth:
+            depth -= 1
         is_end = letter == separator or (separator == BLANKS and letter.isspace())
-        if depth == 0 and is_end:
+        if is_end and depth == 0:
             cells.append("")
         else:
             cells[-1] += letter

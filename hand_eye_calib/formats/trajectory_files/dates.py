@@ -1,6 +1,6 @@
-"""Stamps in text: numbers, weeks of GPS, dates and times of day, exactly as they are written.
+"""Stamps in text, exactly as they are written: numbers, weeks of GPS, dates and times of day.
 
-Every pattern meets text of at most :data:`_LONGEST` characters.
+Every pattern is applied to at most :data:`_LONGEST` characters.
 """
 
 import re
@@ -10,39 +10,45 @@ from decimal import Decimal, InvalidOperation
 
 from hand_eye_calib.core.base.config import STAMP_UNITS
 
-#: What a person should know of stamps of GPS time.
+#: Note on stamps of GPS time. The 18 s are the leap seconds since 1980-01-06.
 GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
 
+# Nanoseconds in a second.
 _NS = STAMP_UNITS["s"]
-
-#: Characters of the longest date with time and zone, with room for spaces.
+# Characters of the longest date with time and zone, with room for spaces.
 _LONGEST = 48
-#: Proleptic day of 1970-01-01.
+# Proleptic day of 1970-01-01, from which stamps count.
 _EPOCH_DAY = date(1970, 1, 1).toordinal()
+#: Seconds in a day.
 DAY_S = 86_400
-#: GPS time begins at 1980-01-06, s since 1970, and counts weeks.
-_GPS_EPOCH_S = 315_964_800
+#: Seconds in a week of GPS.
 WEEK_S = 604_800
+# Beginning of GPS time, 1980-01-06, in s since 1970 (IS-GPS-200).
+_GPS_EPOCH_S = 315_964_800
 
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _YEAR_FIRST = re.compile(r"(\d{4})([-/._ ])(\d\d?|[a-z]{3,9})\2(\d\d?)", re.IGNORECASE | re.ASCII)
 _YEAR_LAST = re.compile(r"(\d\d?)([-/. ])(\d\d?|[a-z]{3,9})\2(\d{4})", re.IGNORECASE | re.ASCII)
+# A date such as 20231114, with the groups of _YEAR_FIRST.
 _PACKED = re.compile(r"(20\d\d)()(\d\d)(\d\d)", re.ASCII)
-# Between date and time.
-_BETWEEN = re.compile(r"T|[ ,_-]{1,4}", re.IGNORECASE)
+# Text between a date and a time of day.
+_BETWEEN = re.compile(r"T|[ ,_-]{1,4}|", re.IGNORECASE)
 _TIME = re.compile(
     r"(\d\d?)([:._-]?)(\d\d)(?:\2(\d\d)(?:([.,]|\2)(\d{1,12}))?)? ?([ap]m)? ?"
     r"(z|utc|gmt|[-+]\d\d(?::?\d\d)?)?",
     re.IGNORECASE | re.ASCII,
 )
 _ZONE = re.compile(r"([-+])(\d\d):?(\d\d)?", re.ASCII)
+# Characters of the longest time of day that belongs to a date in another column.
+_LONGEST_TIME = len("HH:MM:SS.123456789ab")
 
 
 def seconds_of(text: str) -> Decimal:
-    """Seconds since 1970 of a date with a time of day, or of the day for a time of day alone.
+    """Return the seconds since 1970 of a date with a time of day.
 
-    Without a zone the time is UTC. A fraction behind the same character as between minutes and
-    seconds is a count of milliseconds, microseconds or nanoseconds.
+    A time of day alone becomes the seconds of the day. A time without a zone is UTC. A fraction may
+    stand behind the same character as stands between minutes and seconds: then its digits are a
+    number of milliseconds, microseconds or nanoseconds.
 
     Raises
     ------
@@ -59,9 +65,7 @@ def seconds_of(text: str) -> Decimal:
         return _time_of_day(text)
     if not rest:
         return Decimal(DAY_S * day)
-    between = _BETWEEN.match(rest)
-    start = between.end() if between else 0
-    return DAY_S * day + _time_of_day(rest[start:])
+    return DAY_S * day + _time_of_day(_BETWEEN.sub("", rest, count=1))
 
 
 def is_date_or_time(text: str) -> bool:
@@ -90,35 +94,32 @@ def is_ambiguous(text: str) -> bool:
     return int(match[1]) <= 12 and int(match[3]) <= 12 and match[1] != match[3]
 
 
-def seconds_of_week(week: str, second: Decimal) -> Decimal:
-    """Seconds since 1970, in GPS time, of a second of a week of GPS."""
-    number = Decimal(week)
-    if number != int(number) or not 0 <= number < 10_000:
-        raise ValueError(f"found {week[:20]!r} for the week of GPS")
-    return _GPS_EPOCH_S + WEEK_S * int(number) + second
-
-
 def _day_and_rest(text: str) -> tuple[int | None, str]:
-    """The day since 1970 at the beginning of a text, none without one, and what follows it."""
+    """Return the day since 1970 of a date at the beginning of a text, and the text behind the date.
+
+    The day is None if the text does not begin with a date.
+    """
     if match := _YEAR_FIRST.match(text) or _PACKED.match(text):
         return _day(match[1], match[3], match[4]), text[match.end() :]
-    if match := _YEAR_LAST.match(text):
-        first = match[1]
-        second = match[3]
-        # Month first is usual with slashes, unless it cannot be.
-        month_first = match[2] == "/" and int(first) <= 12
-        day, month = (second, first) if month_first else (first, second)
-        return _day(match[4], month, day), text[match.end() :]
-    return None, text
+    match = _YEAR_LAST.match(text)
+    if not match:
+        return None, text
+    day = match[1]
+    month = match[3]
+    # With slashes the month is first, unless the first number is too large for a month.
+    if match[2] == "/" and int(match[1]) <= 12:
+        day = match[3]
+        month = match[1]
+    return _day(match[4], month, day), text[match.end() :]
 
 
 def _day(year: str, month: str, day: str) -> int:
-    number = int(month) if month.isdigit() else 1 + _MONTHS.index(month[:3].lower())
-    return date(int(year), number, int(day)).toordinal() - _EPOCH_DAY
+    month_number = int(month) if month.isdigit() else 1 + _MONTHS.index(month[:3].lower())
+    return date(int(year), month_number, int(day)).toordinal() - _EPOCH_DAY
 
 
 def _time_of_day(text: str) -> Decimal:
-    """Seconds of a time of day, in UTC."""
+    """Return the seconds of a time of day, in UTC."""
     match = _TIME.fullmatch(text)
     if not match:
         raise ValueError("no time of day")
@@ -132,71 +133,93 @@ def _time_of_day(text: str) -> Decimal:
         hour = hour % 12 + (12 if half.lower() == "pm" else 0)
     if hour > 24 or minute > 59 or second > 60:
         raise ValueError("no time of day")
-    fraction = _fraction(digits, is_count=point == separator and point != ".") if digits else 0
-    return 3600 * hour + 60 * minute + second + Decimal(fraction) - _zone_s(zone or "")
-
-
-def _fraction(digits: str, is_count: bool) -> Decimal:
-    """The part of a second in digits after a point, or a count of ms, us or ns."""
-    places = -(-len(digits) // 3) * 3 if is_count else len(digits)
-    return Decimal(digits).scaleb(-places)
+    n_decimals = len(digits or "")
+    if point == separator and point != ".":
+        # The digits are a number of ms, us or ns: the decimals are 3, 6 or 9.
+        n_decimals = -(-n_decimals // 3) * 3
+    fraction = Decimal(digits or 0).scaleb(-n_decimals)
+    return 3600 * hour + 60 * minute + second + fraction - _zone_s(zone or "")
 
 
 def _zone_s(zone: str) -> int:
-    """Seconds that a zone is ahead of UTC."""
+    """Return the seconds that a time zone is ahead of UTC."""
     match = _ZONE.fullmatch(zone)
     if not match:
         return 0
-    size = 3600 * int(match[2]) + 60 * int(match[3] or 0)
-    return -size if match[1] == "-" else size
+    ahead_s = 3600 * int(match[2]) + 60 * int(match[3] or 0)
+    return -ahead_s if match[1] == "-" else ahead_s
 
 
 # ---- the stamp of a row
 
 
 def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Decimal:
-    """The stamp of a row as it is written, with no binary floating point in between, in the unit of
-    its column; in seconds for dates and weeks of GPS, in nanoseconds for two columns. The ``unit``
-    is that of the second of a week, if it is named: otherwise what is no second of a week, nor of
-    the next, is a millisecond.
+    """Return the stamp of a row as it is written, never through a binary floating-point number.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Quantities of the cells, such as ("date", "t"); see columns.stamp_columns.
+    cells : sequence of str
+    unit : str, optional
+        Unit of the second of a week, if the column names it. Otherwise a number that is no second
+        of this week or of the next is in milliseconds.
+
+    Returns
+    -------
+    Decimal
+        In the unit of its column; in seconds for dates and weeks of GPS; in nanoseconds for columns
+        of seconds and nanoseconds.
 
     Raises
     ------
     ValueError
-        If the cells have something else.
+        If the cells have other text.
     """
-    if len(cells) == 1:
-        return _decimal(cells[0])
-    if names == ("secs", "nsecs"):
-        return Decimal(int(cells[0]) * _NS + int(cells[1]))
-    second = _number(cells[1])
-    if names[0] == "week" and second is not None and second.is_finite():
-        for possible_unit in (unit,) if unit else ("s", "ms"):
-            in_seconds = second * STAMP_UNITS[possible_unit] / _NS
-            if in_seconds < 2 * WEEK_S:
-                return seconds_of_week(cells[0], in_seconds)
-        return second
     last = cells[-1]
-    # A time of day belongs to its date, whatever else is complete in itself.
-    if names[0] == "date" and ":" in last and len(last) < len("HH:MM:SS") + 12:
+    if len(cells) == 1:
+        return _decimal(last)
+    if names == ("secs", "nsecs"):
+        return Decimal(int(cells[0]) * _NS + int(last))
+    if names[0] == "week":
+        second = _number(last)
+        if second is not None and second.is_finite():
+            return _stamp_in_week(cells[0], second, unit)
+    # A stamp that is complete in itself does not need the date.
+    if names[0] == "date" and ":" in last and len(last) < _LONGEST_TIME:
         return seconds_of(" ".join(cells))
     return _decimal(last)
 
 
+def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
+    """Return the seconds since 1970, in GPS time, of a second of a week of GPS.
+
+    A number that is too large for a second of a week is returned as it is.
+    """
+    for possible_unit in (unit,) if unit else ("s", "ms"):
+        second_of_week = second * STAMP_UNITS[possible_unit] / _NS
+        if second_of_week < 2 * WEEK_S:
+            week = Decimal(week_text)
+            if week != int(week) or not 0 <= week < 10_000:
+                raise ValueError(f"found {week_text[:20]!r} for the week of GPS")
+            return _GPS_EPOCH_S + WEEK_S * int(week) + second_of_week
+    return second
+
+
 def _number(text: str) -> Decimal | None:
-    """The number in a text, none if it is something else."""
-    if "_" in text:  # Decimal skips it, but in a stamp it separates
+    """Return the number in a text; None for other text."""
+    if "_" in text:  # Decimal skips underscores, but in a stamp they separate
         return None
-    for written in (text, text.replace(",", ".")):
+    for number in (text, text.replace(",", ".")):
         try:
-            return Decimal(written)
+            return Decimal(number)
         except InvalidOperation:
             continue
     return None
 
 
 def _decimal(text: str) -> Decimal:
-    """Seconds or another unit in a number, or seconds of a date or time of day."""
+    """Return a number in any unit, or the seconds of a date or time of day."""
     stamp = _number(text)
     if stamp is None and is_date_or_time(text):
         return seconds_of(text)
@@ -206,7 +229,7 @@ def _decimal(text: str) -> Decimal:
 
 
 def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """What a person should know of stamps like those of one row."""
+    """Return notes for the user on stamps such as those of one row."""
     notes = []
     if names and names[0] == "week":
         notes.append(GPS_TIME)
@@ -216,7 +239,7 @@ def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
 
 
 def seconds(stamp_ns: int) -> str:
-    """A stamp in seconds, with all its digits."""
+    """Return a stamp in seconds, with all its digits."""
     whole, nanoseconds = divmod(abs(int(stamp_ns)), _NS)
     sign = "-" if stamp_ns < 0 else ""
     return f"{sign}{whole}.{nanoseconds:09d}"

@@ -12,24 +12,40 @@ from hand_eye_calib.formats.trajectory_files.dates import DAY_S, WEEK_S, seconds
 from hand_eye_calib.formats.trajectory_files.layout import DIGITS
 from hand_eye_calib.formats.trajectory_files.table import Table
 
+# Nanoseconds in a second.
 _NS = STAMP_UNITS["s"]
-# Poses farther apart than this (s) are of no use to a calibration: rather the unit has been
-# mistaken.
+# Longest median time between poses (s) that a calibration can use. A longer one is a sign of a
+# mistaken unit.
 _LONGEST_INTERVAL_S = 10
-# Stamps that count from the start of a day or a week begin again in the last and first of so many
-# parts of it.
-_PARTS = 10
-# Numbers such as 20231114221320.5 are dates with the time of day.
-_PACKED = (Decimal(20_000_101_000_000), Decimal(21_000_101_000_000))
-# Share of poses that move on while their stamp does not, from which on stamps are too coarse.
+# Numbers such as 20231114221320.5 are dates with the time of day: from 2000-01-01 on, and before
+# 2100-01-01.
+_FIRST_PACKED = Decimal(20_000_101_000_000)
+_END_OF_PACKED = Decimal(21_000_101_000_000)
+# Share of poses that move on while their stamp does not: from this share on the stamps have lost
+# their last digits.
 _COARSE_SHARE = 0.25
-# Other poses than the one before with the same stamp differ by more than this in some number.
+# Poses differ if a number of theirs differs by more than this, which is rounding.
 _SAME = 1e-12
 
 
 def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
-    """Stamps (N,) in nanoseconds, in the unit that is given, that the format has, or that their
-    size tells; an InputError if there are none, they are too large, or their unit is not clear.
+    """Return the stamps of a table in nanoseconds.
+
+    Parameters
+    ----------
+    table : Table
+    stamp_unit : str or None
+        "s", "ms", "us" or "ns". If it is None, the unit is that of the format, or is recognised
+        from the size of the stamps.
+
+    Returns
+    -------
+    (N,) array of int64
+
+    Raises
+    ------
+    InputError
+        If the table has no stamps, they are too large, or their unit is unclear.
     """
     if not table.stamps:
         raise InputError(
@@ -38,11 +54,10 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         )
     unit = stamp_unit or table.units["t"]
     stamps = table.stamps
-    if not unit and _PACKED[0] <= min(stamps) and max(stamps) < _PACKED[1]:
+    if not unit and min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:
         stamps = _unpacked(stamps)
     sizes = np.abs(np.array(stamps, dtype=float))
-    by_size = (name for name, digits in DIGITS.items() if sizes.max() >= 10.0**digits)
-    recognised = unit or next(by_size, "s")
+    recognised = unit or _unit_of_size(sizes.max())
     factor = STAMP_UNITS[recognised]
     table.refuse(
         np.asarray(sizes * factor >= float(np.iinfo(np.int64).max)),
@@ -51,9 +66,9 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
             "with `stamp_unit`"
         ),
     )
-    rounded = (int((stamp * factor).to_integral_value()) for stamp in stamps)
-    stamps_ns = np.fromiter(rounded, dtype=np.int64, count=len(stamps))
-    # Stamps with a fraction are in seconds.
+    whole = (int((stamp * factor).to_integral_value()) for stamp in stamps)
+    stamps_ns = np.fromiter(whole, dtype=np.int64, count=len(stamps))
+    # Stamps with a fraction are in seconds: their unit is clear.
     if not unit and not any(stamp % 1 for stamp in stamps):
         _refuse_unclear_unit(table, stamps_ns, recognised)
     for period_s in (DAY_S, WEEK_S):
@@ -61,8 +76,16 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     return stamps_ns
 
 
+def _unit_of_size(largest: float) -> str:
+    """Return the unit of stamps since 1970 whose largest is given."""
+    for unit, digits in DIGITS.items():
+        if largest >= 10.0**digits:
+            return unit
+    return "s"
+
+
 def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
-    """Seconds of dates such as 20231114221320.5, or the stamps if one is no date."""
+    """Return the seconds of dates such as 20231114221320.5; the stamps if one is no date."""
     try:
         return [seconds_of(f"{stamp:f}") for stamp in stamps]
     except ValueError:
@@ -70,6 +93,7 @@ def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
 
 
 def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> None:
+    """Raise an InputError if the poses are so far apart that the unit seems to be mistaken."""
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
         raise InputError(
@@ -80,19 +104,25 @@ def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> 
 
 
 def _continued(stamps_ns: IntArray, period_s: int) -> IntArray:
-    """Stamps that go on where those of a day or a week begin again at 0."""
+    """Return stamps that go on where stamps of a day or a week begin again at 0.
+
+    They begin again where a stamp in the last tenth of the period is followed by one in the first
+    tenth.
+    """
     period_ns = period_s * _NS
     if not len(stamps_ns) or stamps_ns.min() < 0 or stamps_ns.max() > period_ns:
         return stamps_ns
-    is_at_end = stamps_ns[:-1] > period_ns - period_ns // _PARTS
-    is_at_start = stamps_ns[1:] < period_ns // _PARTS
+    tenth_ns = period_ns // 10
+    is_at_end = stamps_ns[:-1] > period_ns - tenth_ns
+    is_at_start = stamps_ns[1:] < tenth_ns
     begins_again = np.r_[False, is_at_end & is_at_start]
     return stamps_ns + np.cumsum(begins_again) * period_ns
 
 
 def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None:
-    """Raise an InputError if many poses (N, k) differ from the one before with the same stamp: the
-    stamps have lost their last digits.
+    """Raise an InputError if stamps (N,) have lost their last digits.
+
+    They have if many poses (N, k) differ from the pose before them with the same stamp.
     """
     if len(stamps_ns) < 2:
         return
@@ -101,34 +131,40 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
     if (is_same_stamp & has_moved).mean() < _COARSE_SHARE:
         return
     different = np.unique(stamps_ns)
-    steps_s = np.diff(different) * 1e-9
-    coarse = f"have steps of {steps_s.min():.4g} s" if len(steps_s) else "are all the same"
-    if len(steps_s) and not (different % _NS).any():
-        coarse = "have whole seconds only"
+    if len(different) == 1:
+        problem = "are all the same"
+    elif (different % _NS).any():
+        problem = f"have steps of {(np.diff(different) * 1e-9).min():.4g} s"
+    else:
+        problem = "have whole seconds only"
     raise InputError(
-        f"{table.path}: the timestamps {coarse}: {len(stamps_ns)} poses have {len(different)} "
+        f"{table.path}: the timestamps {problem}: {len(stamps_ns)} poses have {len(different)} "
         "different ones; write timestamps with all their digits, such as with %.9f instead of %g "
         "or %e, or give `times`"
     )
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Indices of poses in the order of time, each stamp once, and what was repaired for that; an
-    InputError if it must not be repaired.
+    """Return the indices of poses in the order of time, each stamp once, and notes on the repair.
+
+    Raises
+    ------
+    InputError
+        If stamps are not in order and ``repair`` is False.
     """
-    wrong = np.r_[False, stamps_ns[1:] <= stamps_ns[:-1]]
     if not repair:
+        is_wrong = np.r_[False, stamps_ns[1:] <= stamps_ns[:-1]]
         table.refuse(
-            wrong,
+            is_wrong,
             lambda index: (
                 f"timestamps must increase, found {seconds(stamps_ns[index])} after "
-                f"{seconds(stamps_ns[index - 1])}; {int(wrong.sum())} such lines; sort the lines "
-                "and drop repeated timestamps, or have that done with `repair`"
+                f"{seconds(stamps_ns[index - 1])}; {int(is_wrong.sum())} such lines; sort the "
+                "lines and drop repeated timestamps, or have that done with `repair`"
             ),
         )
-    keep = np.unique(stamps_ns, return_index=True)[1]
+    indices = np.unique(stamps_ns, return_index=True)[1]
     n_backward = int((np.diff(stamps_ns) < 0).sum())
-    n_dropped = len(stamps_ns) - len(keep)
+    n_dropped = len(stamps_ns) - len(indices)
     repairs = []
     if n_backward:
         repairs.append(
@@ -136,4 +172,4 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
         )
     if n_dropped:
         repairs.append(f"dropped {n_dropped} whose stamp was there already")
-    return keep, [f"{table.path}: {'; '.join(repairs)}"]
+    return indices, [f"{table.path}: {'; '.join(repairs)}"]
