@@ -1,4 +1,4 @@
-"""What the columns of a table are, by their names: quantities, units, and what they measure."""
+"""Quantities, units and kind of data of a table's columns, recognised by the columns' names."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,19 +8,20 @@ from hand_eye_calib.core.base.config import STAMP_UNITS
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
 TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-# Coefficients of a quaternion with the scalar first, and of one whose order is not known.
+#: Coefficients of a quaternion with the scalar first.
 SCALAR_FIRST = ("q0", "q1", "q2", "q3")
+#: Coefficients of a quaternion whose order is not known.
 UNNAMED = ("q1", "q2", "q3", "q4")
 ROTATION_VECTOR = ("rotvec_x", "rotvec_y", "rotvec_z")
-# The first three rows of a pose's matrix, and its rotation and translation.
+#: First three rows of the matrix of a pose.
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 ROTATION = tuple(f"m{row}{column}" for row in "123" for column in "123")
 TRANSLATION = tuple(f"m{row}4" for row in "123")
 LAST_ROW = tuple(f"m4{column}" for column in "1234")
 RATES = ("wx", "wy", "wz")
 TWIST = ("vx", "vy", "vz", *RATES)
-# Sets of quantities that give a position or an orientation, the preferred first; of a machine on a
-# plane, fewer.
+# Groups of quantities that are a position or an orientation, the preferred group first; and the
+# smaller groups that suffice for a machine on a plane.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
 PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
 _ORIENTATIONS = (
@@ -32,17 +33,26 @@ _ORIENTATIONS = (
     UNNAMED,
 )
 _PLANAR_ORIENTATIONS = (("yaw",), ("heading",))
+_POSITION_QUANTITIES = {name for group in _POSITIONS for name in group}
+_ORIENTATION_QUANTITIES = {
+    name for group in (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS) for name in group
+}
 
-# What stands before the axis in names of angular rates, velocities and quaternions.
+# Names of a coordinate, by its axis and the axis's number, and names of its own.
+_POSITION_NAMES = (
+    "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} position{1} "
+    "actual_tcp_pose_{1} ecef_{0} {0}_ecef {0}_ecf {2}"
+)
+_DIRECTIONS = {"x": "easting pos_east", "y": "northing pos_north", "z": "altitude pos_up"}
+# Beginnings of the names of angular rates, velocities and quaternions, before the axis.
 _BEGINNINGS = {
     "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
     "v": "v",
     "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
 }
-_OF_POSITION = "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} "
-# Last parts of column names, lower case, words joined by underscores; exports of bags have whole
-# paths such as .pose.pose.position.x.
-_ALIASES = {
+# Names of each quantity, in lower case, with underscores between words. A column of a bag's export
+# has a whole path, such as .pose.pose.position.x, whose end is compared.
+_NAMES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
     "datetime date_time utc utctime utc_time time_utc time_of_day epoch unix_time unixtime "
@@ -54,12 +64,10 @@ _ALIASES = {
     "second_of_week secs_of_week week_seconds time_of_week timeofweek tow_sec tow_secs sow_sec",
     "mow": "itow gms mow towms tow_msec gps_week_ms week_ms week_msec week_milliseconds "
     "gps_milliseconds gps_ms ms_of_week msec_of_week milliseconds_of_week",
-    "x": _OF_POSITION.format("x")
-    + "easting pos_east position0 actual_tcp_pose_0 ecef_x x_ecef x_ecf",
-    "y": _OF_POSITION.format("y")
-    + "northing pos_north position1 actual_tcp_pose_1 ecef_y y_ecef y_ecf",
-    "z": _OF_POSITION.format("z") + "altitude pos_up position2 actual_tcp_pose_2 "
-    "ecef_z z_ecef z_ecf",
+    **{
+        axis: _POSITION_NAMES.format(axis, number, names)
+        for number, (axis, names) in enumerate(_DIRECTIONS.items())
+    },
     "lat": "lat latitude",
     "lon": "lon long lng longitude",
     "height": "height ht h_ell h_msl height_msl ellipsoid_height ellipsoidal_height altitude alt "
@@ -74,50 +82,46 @@ _ALIASES = {
     "sensor": "device_id device_name sensor_id sensor_name camera_id camera_name child_frame_id "
     "rigid_body body_name object_name subject_name",
     **{
-        f"{kind}{axis}": " ".join(f"{name}{axis}" for name in names.split())
-        for kind, names in _BEGINNINGS.items()
+        f"{kind}{axis}": " ".join(f"{beginning}{axis}" for beginning in beginnings.split())
+        for kind, beginnings in _BEGINNINGS.items()
         for axis in "xyzw"
     },
     **{name: f"{name} quat_{name}" for name in (*SCALAR_FIRST, *UNNAMED)},
-    **{
-        name: f"{name} actual_tcp_pose_{k} r{name[-1]}" for k, name in enumerate(ROTATION_VECTOR, 3)
-    },
+    "rotvec_x": "rotvec_x actual_tcp_pose_3 rx",
+    "rotvec_y": "rotvec_y actual_tcp_pose_4 ry",
+    "rotvec_z": "rotvec_z actual_tcp_pose_5 rz",
     **{name: name for name in MATRIX},
 }
-# Names without an underscore that paths may end in, such as gps_fix_latitude.
-_ENDS = {
-    *("latitude", "longitude", "altitude"),
-    "itow",
-    *QUATERNION,
-    *(f"t{axis}" for axis in POSITION),
-}
+# Names of one word that a path may end in, such as gps_fix_latitude.
+_ENDS = {"latitude", "longitude", "altitude", "itow", *QUATERNION, "tx", "ty", "tz"}
 # An element of a matrix: t_00, r11, rot_1_2, pose.T[0][3].
 _ELEMENT = re.compile(
     r"(?:^|_)(?:m|r|t|h|rot|mat|matrix|rotation|pose|transform|rotm)_?(\d)_?(\d)$"
 )
-# Names, after each other, of some part of an orientation or of a position, known or not.
+# Parts of an orientation or of a position in the names of all columns, also in unknown names.
 _ORIENTED = re.compile(
     r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|"
     r"(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
-).search
-_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)").search
+)
+_PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)")
 
-# Units as names have them, with a slash for what separates words.
-_UNITS = {
-    **{
-        unit: unit for unit in ("m", "mm", "cm", "ft", "deg", "rad", "deg/s", "rad/s", *STAMP_UNITS)
-    },
-    "feet": "ft",
-    **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
-    **dict.fromkeys(("degree", "degrees", "°"), "deg"),
-    **dict.fromkeys(("radian", "radians"), "rad"),
-    **dict.fromkeys(("dps", "°/s"), "deg/s"),
-    **dict.fromkeys(("second", "seconds"), "s"),
-    **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"),
-    **dict.fromkeys(("usec", "µs", "μs", "microsecond", "microseconds"), "us"),
-    **dict.fromkeys(("nanosecond", "nanoseconds"), "ns"),
+# Names of units, with a slash between words.
+_UNIT_NAMES = {
+    "m": "m metre metres meter meters",
+    "mm": "mm",
+    "cm": "cm",
+    "ft": "ft feet",
+    "deg": "deg degree degrees °",
+    "rad": "rad radian radians",
+    "deg/s": "deg/s dps °/s",
+    "rad/s": "rad/s",
+    "s": "s second seconds",
+    "ms": "ms msec millisecond milliseconds",
+    "us": "us usec µs μs microsecond microseconds",
+    "ns": "ns nanosecond nanoseconds",
 }
-# In brackets only: as last words they are names of their own, such as stamp_sec.
+_UNITS = {name: unit for unit, names in _UNIT_NAMES.items() for name in names.split()}
+# Units in brackets. Without brackets these are the last words of names, such as stamp_sec.
 _UNITS_IN_BRACKETS = {
     **_UNITS,
     **dict.fromkeys(("sec", "secs"), "s"),
@@ -125,28 +129,43 @@ _UNITS_IN_BRACKETS = {
     # Degrees, minutes and seconds.
     **dict.fromkeys(("d/m/s", "+/-d/m/s", "dms", "d/m"), "deg"),
 }
-# Words of stamps, the last for seconds of a week of GPS: a unit behind them is one of time.
+# A word of a stamp: the unit behind it is a unit of time. The last is the second of a GPS week.
 _TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
-_OPENING = "[("
-_CLOSING = "])"
+# Brackets with their content, up to the end of the name if nothing closes them.
+_BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
 
 
 def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
-    """Columns of the quantities that have any: those with one of its names; if there is none, those
-    with a path that ends in one; and the units in the names, empty for none.
+    """Return the columns of each quantity, and the unit in each name.
+
+    The columns of a quantity are those with one of its names. If there are none, they are those
+    with a path that ends in one of its names.
+
+    Parameters
+    ----------
+    names : (N,) sequence of str
+
+    Returns
+    -------
+    columns : dict of str to list of int
+        Only quantities with a column.
+    units : (N,) list of str
+        Empty for a name without a unit.
     """
     split = [_split(name) for name in names]
     plain = [name for name, _ in split]
     columns: dict[str, list[int]] = {}
-    for quantity, aliases in _ALIASES.items():
-        known = aliases.split()
-        # Of paths, the longest end that is known: position_x rather than x.
-        ends = tuple(f"_{alias}" for alias in known if "_" in alias or alias in _ENDS)
-        places = [at for at, name in enumerate(plain) if name in known]
-        places = places or [at for at, name in enumerate(plain) if name.endswith(ends)]
+    for quantity, text in _NAMES.items():
+        known = text.split()
+        places = [place for place, name in enumerate(plain) if name in known]
+        if not places:
+            # The longest known end of a path counts: position_x rather than x.
+            ends = tuple(f"_{end}" for end in known if "_" in end or end in _ENDS)
+            places = [place for place, name in enumerate(plain) if name.endswith(ends)]
         if quantity in ROTATION_VECTOR:
-            # In degrees they are rather angles, in an order that nothing names.
-            places = [at for at in places if not (is_brief(names[at]) and split[at][1] == "deg")]
+            # Brief names in degrees are rather angles, whose order no name states.
+            is_angle = [is_brief(name) and unit == "deg" for name, unit in split]
+            places = [place for place in places if not is_angle[place]]
         if places:
             columns[quantity] = places
     columns |= _elements(plain, columns)
@@ -154,70 +173,98 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
 
 
 def is_brief(name: str) -> bool:
-    """Whether a column is called rx, ry or rz: a rotation vector of Universal Robots, or angles of
-    other robots.
+    """Whether a column is called rx, ry or rz.
+
+    That is a rotation vector of Universal Robots, or angles of other robots.
     """
     return plain_name(name) in ("rx", "ry", "rz")
 
 
 def _elements(plain: Sequence[str], columns: Mapping[str, list[int]]) -> dict[str, list[int]]:
-    """Columns of the elements of a matrix, counted from 0 or from 1; the translation may have the
-    names of a position.
+    """Return the columns of the elements of a matrix, empty without a whole rotation.
+
+    Rows and columns of the matrix count from 0 or from 1. The translation may have the names of a
+    position.
     """
-    matches = [_ELEMENT.search(name) for name in plain]
-    counts = [(int(match[1]), int(match[2])) if match else None for match in matches]
-    first = 0 if (0, 0) in counts else 1
-    elements: dict[str, list[int]] = {}
-    for place, count in enumerate(counts):
-        if count:
-            row, column = count
-            elements.setdefault(f"m{row - first + 1}{column - first + 1}", []).append(place)
+    places_of: dict[tuple[int, int], list[int]] = {}
+    for place, name in enumerate(plain):
+        if match := _ELEMENT.search(name):
+            places_of.setdefault((int(match[1]), int(match[2])), []).append(place)
+    shift = 1 if (0, 0) in places_of else 0
+    elements = {
+        f"m{row + shift}{column + shift}": places for (row, column), places in places_of.items()
+    }
     if not {*ROTATION} <= elements.keys():
         return {}
-    by_name = dict(zip(TRANSLATION, POSITION, strict=True))
-    for element, axis in by_name.items():
-        if element not in elements and axis in columns:
-            elements[element] = columns[axis]
+    for element, axis in zip(TRANSLATION, POSITION, strict=True):
+        if axis in columns:
+            elements.setdefault(element, columns[axis])
     return {name: places for name, places in elements.items() if name in MATRIX}
 
 
 def measured(
     columns: Mapping[str, list[int]], names: Sequence[str], measures: str
 ) -> tuple[str, Sequence[str]]:
-    """What the columns measure, and the quantities to read for that: poses and the preferred
-    quantities in doubt, so that what is missing is named.
+    """Return the kind of data in a table, and the quantities to read for that kind.
+
+    In doubt these are the preferred quantities of poses, so that an error names the missing ones.
+
+    Parameters
+    ----------
+    columns : mapping of str to list of int
+        Columns of each quantity.
+    names : sequence of str
+        Names of all columns.
+    measures : str
+        "poses", "positions", "rotations", "rates", "twists", "stamps", or "auto" for the kind that
+        the columns have.
     """
-    groups = [*_POSITIONS, *PLANAR_POSITIONS, *_ORIENTATIONS, *_PLANAR_ORIENTATIONS]
-    groups = [group for group in groups if {*group} <= columns.keys()]
-    flat = next((group for group in groups if group in (*_POSITIONS, *PLANAR_POSITIONS)), ())
-    turn = next((group for group in groups if group in _ORIENTATIONS), ())
-    heading = next((group for group in groups if group in _PLANAR_ORIENTATIONS), ())
+    position = _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns)
+    orientation = _first_group((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), columns) or QUATERNION
     has_matrix = {*ROTATION} <= columns.keys()
     if measures == "auto":
-        oriented = {*sum((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), ())}
-        measures = "poses"
-        listed = ",".join(plain_name(name) for name in names)
+        measures = "poses" if has_matrix else _kind_of(columns, names)
+    if measures == "poses":
         if has_matrix:
-            measures = "poses"
-        elif flat and not (columns.keys() & oriented or _ORIENTED(listed)):
-            measures = "positions"
-        elif not columns.keys() & {*sum(_POSITIONS, ())}:
-            is_turning = turn and not _PLACED(listed)
-            measures = (
-                "rates" if {*RATES} <= columns.keys() else "rotations" if is_turning else "poses"
-            )
-    if measures == "poses" and has_matrix:
-        return measures, MATRIX
-    orientation: Sequence[str] = turn or heading or QUATERNION
-    is_planar = measures == "positions" or orientation in _PLANAR_ORIENTATIONS
-    position = flat if flat and (is_planar or flat in _POSITIONS) else POSITION
-    parts = {"rates": RATES, "twists": TWIST, "positions": position, "rotations": orientation}
-    parts["stamps"] = ()
-    return measures, parts.get(measures, (*position, *orientation))
+            return measures, MATRIX
+        # A position without a height is one of a machine on a plane.
+        if position in PLANAR_POSITIONS and orientation not in _PLANAR_ORIENTATIONS:
+            position = ()
+        return measures, (*(position or POSITION), *orientation)
+    quantities: dict[str, Sequence[str]] = {
+        "rates": RATES,
+        "twists": TWIST,
+        "positions": position or POSITION,
+        "rotations": orientation,
+        "stamps": (),
+    }
+    return measures, quantities[measures]
 
 
-#: Ways to give a stamp, the preferred first: the stamp of the message's header rather than the
-#: time of its arrival; a date and a time of day; a week of GPS and its second or millisecond.
+def _first_group(
+    groups: Iterable[Sequence[str]], columns: Mapping[str, list[int]]
+) -> Sequence[str]:
+    """Return the first group of quantities that all have columns; empty if there is none."""
+    return next((group for group in groups if {*group} <= columns.keys()), ())
+
+
+def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
+    """Return the kind of data in columns without a matrix."""
+    listed = ",".join(plain_name(name) for name in names)
+    if _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns):
+        has_orientation = columns.keys() & _ORIENTATION_QUANTITIES or _ORIENTED.search(listed)
+        return "poses" if has_orientation else "positions"
+    if columns.keys() & _POSITION_QUANTITIES:
+        return "poses"
+    if {*RATES} <= columns.keys():
+        return "rates"
+    if _first_group(_ORIENTATIONS, columns) and not _PLACED.search(listed):
+        return "rotations"
+    return "poses"
+
+
+#: Quantities that make a stamp, the preferred ones first. The stamp of the message's header counts
+#: before the time of its arrival, and a date with a time of day before the week of GPS.
 _STAMPS = (
     ("secs", "nsecs"),
     ("header",),
@@ -229,81 +276,53 @@ _STAMPS = (
     ("sow",),
     ("mow",),
     ("date",),
-    (),
 )
 
 
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
-    """Return the quantities that give the stamp; none if there are none.
+    """Return the quantities that make the stamp; empty if there are none.
 
     A stamp beside a week of GPS and its second is on the clock of the recording.
     """
     has_second = "sow" in columns or "mow" in columns
     if has_second and {"week", "t"} <= columns.keys():
         return ("t",)
-    return next(way for way in _STAMPS if {*way} <= columns.keys())
+    return _first_group(_STAMPS, columns)
 
 
 def is_pose(columns: Iterable[str]) -> bool:
-    """Whether there are columns of a position, of rates, or of a rotation's matrix."""
+    """Whether there are columns of a position, of rates, or of a rotation matrix."""
     groups = (*PLANAR_POSITIONS, RATES, ROTATION)
     return any({*group} <= {*columns} for group in groups)
 
 
 def plain_name(name: str) -> str:
-    """A column's name without its unit."""
+    """Return a column's name without its unit."""
     return _split(name)[0]
 
 
 def _split(name: str) -> tuple[str, str]:
-    """A column's name without its unit, and the unit, empty if there is none:
-    ``.pose.position.x [mm]`` to pose_position_x and mm, wx_deg_s to wx and deg/s.
+    """Return a column's name without its unit, and the unit, empty if there is none.
+
+    ``.pose.position.x [mm]`` becomes pose_position_x and mm, wx_deg_s becomes wx and deg/s.
     """
     name = name.strip().lower()
-    # An element such as q[0] or T[0][3].
-    name = re.sub(r"\[(\d)\]", r"_\1_", name) if re.search(r"\[\d\]$", name) else name
+    if re.search(r"\[\d\]$", name):  # an element such as q[0] or T[0][3]
+        name = re.sub(r"\[(\d)\]", r"_\1_", name)
     # Frames as in p_RS_R_x.
     name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name)
-    outside, inside = _brackets(name)
+    outside = _BRACKETS.sub(lambda match: "" if match[2] else f" {match[1]}", name)
     words = re.findall("[a-z0-9°µμ]+", outside)
-    if inside is not None:
-        unit = re.sub(r"[\s/_]+", "/", _without_inverse(inside))
-        return "_".join(words), _UNITS_IN_BRACKETS.get(unit, "")
+    in_brackets = [match[1] for match in _BRACKETS.finditer(name) if match[2]]
+    if in_brackets and name.endswith(("]", ")")):
+        # The unit deg s^-1 is deg/s.
+        unit = in_brackets[-1].strip().removesuffix("-1").removesuffix("^").strip()
+        return "_".join(words), _UNITS_IN_BRACKETS.get(re.sub(r"[\s/_]+", "/", unit), "")
     if len(words) > 1 and words[-1].isdigit() and words[-2] in ("q", "position"):
         return "_".join([*words[:-2], words[-2] + words[-1]]), ""
     is_time = any(_TIME_WORD.fullmatch(word) for word in words)
-    for count in (2, 1):
-        unit = _UNITS.get("/".join(words[-count:]), "")
-        if len(words) > count and unit and (unit in STAMP_UNITS) == is_time:
-            return "_".join(words[:-count]), unit
+    for n_words in (2, 1):
+        unit = _UNITS.get("/".join(words[-n_words:]), "")
+        if len(words) > n_words and unit and (unit in STAMP_UNITS) == is_time:
+            return "_".join(words[:-n_words]), unit
     return "_".join(words), ""
-
-
-def _brackets(name: str) -> tuple[str, str | None]:
-    """A name without what it has in brackets, and what the last brackets at its end have, if any;
-    in one pass.
-    """
-    outside: list[str] = []
-    inside: list[str] = []
-    last: str | None = None
-    is_inside = False
-    for letter in name:
-        if letter in _OPENING and not is_inside:
-            is_inside = True
-            inside = []
-        elif letter in _CLOSING and is_inside:
-            is_inside = False
-            last = "".join(inside)
-        elif is_inside:
-            inside.append(letter)
-        else:
-            outside.append(letter)
-    if is_inside:
-        outside += [" ", *inside]
-    at_end = name.endswith(tuple(_CLOSING))
-    return "".join(outside), last if at_end else None
-
-
-def _without_inverse(unit: str) -> str:
-    """A unit such as "deg s" for "deg s^-1"."""
-    return unit.strip().removesuffix("-1").removesuffix("^").strip()
