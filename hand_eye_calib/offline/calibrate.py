@@ -10,7 +10,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import option_name
 from hand_eye_calib.core.base.text import AXIS_UNITS, Prior, shown_value
-from hand_eye_calib.core.engine.estimation import compare_answers, other_answers
+from hand_eye_calib.core.engine.cross_check import compare_answers, other_answers
 from hand_eye_calib.core.engine.run import Progress, run
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike

@@ -10,7 +10,7 @@ from result_making import good_calibration
 
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
-from hand_eye_calib.core.engine.estimation import compare_answers
+from hand_eye_calib.core.engine.cross_check import compare_answers
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import (
     Calibration,

@@ -7,7 +7,8 @@ import numpy as np
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Severity, answered, gravest_first
-from hand_eye_calib.core.engine.estimation import cross_checked, solve_poses
+from hand_eye_calib.core.engine.cross_check import cross_checked
+from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.kinds import Kind
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, Snapshot
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict

@@ -21,6 +21,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.checks.check import in_other_units
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding, graded
 from hand_eye_calib.core.engine import estimation
+from hand_eye_calib.core.engine.cross_check import cross_checked
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise import estimator as adaptive_estimator
@@ -281,7 +282,7 @@ def estimate_rotation(
     )
     floor = estimation.floor_of(solved, rotations, config) * np.repeat([0.0, 1.0], 3)
     solved = replace(solved, floor=floor)
-    checked = estimation.cross_checked(solved, config, rotations) if cross_check else None
+    checked = cross_checked(solved, config, rotations) if cross_check else None
     result = replace(checked or solved.calibration(), findings=findings)
     if not has_rates:
         return result
