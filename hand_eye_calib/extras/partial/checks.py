@@ -1,17 +1,20 @@
 """Checks of two streams of which one has only positions, only rotations or only angular rates.
 
-A stream of positions borrows the orientations of the other stream, aligned to the world frame of
+Positions: the stream borrows the orientations of the other stream, aligned to the world frame of
 the positions window by window. Both streams are poses then. The regressions of
 :mod:`~hand_eye_calib.core.checks.response` detect a wrong scale of a coordinate, a delay and
 smoothing.
 
-For rotations and rates, the rotation vectors of one stream are regressed on those of the other.
-The antisymmetric part of the matrix is a correction of the extrinsic rotation. The symmetric part
-is a fault: gains on the diagonal, misaligned axes off the diagonal.
+Rotations and rates: the rotation vectors of the streams, in the parent sensor's frame, fulfil
+``y = (I + [phi]_x + S) x + noise``. The antisymmetric part [phi]_x corrects the extrinsic rotation.
+The symmetric part S is a fault: gains on its diagonal, misaligned axes off the diagonal (D.
+Tedaldi, A. Pretto, E. Menegatti, *A robust and easy to implement method for IMU calibration without
+external equipments*, 2014, eq. 5).
 """
 
 from collections.abc import Collection
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -39,15 +42,15 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over, sync
 from hand_eye_calib.core.results.calibration import Calibration
 
 # Duration of a window in which positions are aligned (s). The heading of an odometry drifts little
-# in 30 s, and most motions of 3 s lie within one window.
+# in 30 s, and most motions of 3 s are within one window.
 _WINDOW_S = 30.0
 
 # Fewest positions of a window that is aligned without its neighbours.
 _LEAST_ALIGNED = 10
 
-# A lever arm is zero if every axis is below one of two limits: this distance (m) ...
+# A lever arm is zero if each axis is below this distance (m) or below ``_ZERO_SIGMAS``.
 _ZERO_M = 0.005
-# ... or this many standard deviations. The limit serves rotations, too.
+# Standard deviations below which a lever arm, or a rotation, is zero.
 _ZERO_SIGMAS = 3.0
 
 # A zero lever arm is an error if the upper bounds of two axes are below this distance (m): two
@@ -143,11 +146,11 @@ def _check_turning(
     """Check rotations or rates; return the findings of the first check that has any."""
     T_parent_child = calibration.T_parent_child
     sigmas = calibration.sigmas_measured[3:]
-    same = check_rotation(T_parent_child[:3, :3], sigmas, priors, has_rates)
+    parallel = check_rotation(T_parent_child[:3, :3], sigmas, priors, has_rates)
     if copied := _copied_rotations(pairs, T_parent_child):
-        return [replace(found, severity=Severity.ERROR) for found in same] or copied
-    if found := same or _check_handedness(pairs, stream):
-        return found
+        return _as_errors(parallel) or copied
+    if findings := parallel or _check_handedness(pairs, stream):
+        return findings
     return check_rotations(_without_bias(pairs, calibration), T_parent_child, stream, has_rates)
 
 
@@ -161,13 +164,19 @@ def _check_moving(
 ) -> list[Finding]:
     """Check positions; return the findings of the first check that has any."""
     T_parent_child = calibration.T_parent_child
-    same = check_position(T_parent_child[:3, 3], calibration.sigmas_measured[:3], priors)
+    sigmas = calibration.sigmas_measured[:3]
+    no_lever_arm = check_position(T_parent_child[:3, 3], sigmas, priors)
     pairs = _with_orientations(pairs, T_parent_child, stream)
     if copied := _copied_positions(pairs, T_parent_child):
-        return [replace(found, severity=Severity.ERROR) for found in same] or copied
-    if found := [*interpolated, *same]:
-        return found
+        return _as_errors(no_lever_arm) or copied
+    if findings := [*interpolated, *no_lever_arm]:
+        return findings
     return check_positions(pairs, T_parent_child, stream, least_share)
+
+
+def _as_errors(findings: list[Finding]) -> list[Finding]:
+    """Return the same findings as errors."""
+    return [replace(suspect, severity=Severity.ERROR) for suspect in findings]
 
 
 def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
@@ -182,7 +191,7 @@ def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
 
 
 def check_position(
-    lever_arm: FloatArray, sigmas: FloatArray, given: Collection[str]
+    lever_arm: FloatArray, sigmas: FloatArray, priors: Collection[str]
 ) -> list[Finding]:
     """Detect a lever arm of zero, which suggests that positions were copied between the streams.
 
@@ -190,29 +199,29 @@ def check_position(
     ----------
     lever_arm, sigmas : (3,) array
         Lever arm and its standard deviations (m), infinite for unobservable axes.
-    given : collection of str
-        Axes with a prior; these are not checked.
+    priors : collection of str
+        Axes with a prior; they are not checked.
     """
-    axes = [k for k, axis in enumerate("xyz") if np.isfinite(sigmas[k]) and axis not in given]
+    axes = [k for k, axis in enumerate("xyz") if np.isfinite(sigmas[k]) and axis not in priors]
     if len(axes) < 2:
         return []
-    sizes = np.abs(lever_arm[axes])
-    spreads = sigmas[axes]
-    if (sizes > np.maximum(_ZERO_M, _ZERO_SIGMAS * spreads)).any():
+    lengths_m = np.abs(lever_arm[axes])
+    sigmas_m = sigmas[axes]
+    if (lengths_m > np.maximum(_ZERO_M, _ZERO_SIGMAS * sigmas_m)).any():
         return []
-    uppers_m = np.sort(sizes + 2.0 * spreads)
+    uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
     if uppers_m[1] > _UNKNOWN_M:
         return []
     # Two axes are not enough for an error: an antenna may be right above the other sensor.
     is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNKNOWN_M
     severity = Severity.ERROR if is_sure else Severity.WARNING
-    distance_m = float(np.linalg.norm(sizes))
-    size = f"{length(distance_m)} +/- {length(float(spreads.max()))}"
+    distance_m = float(np.linalg.norm(lengths_m))
+    size = f"{length(distance_m)} +/- {length(float(sigmas_m.max()))}"
     return [finding("no_lever_arm", "both", severity, size=size, translation_m=distance_m)]
 
 
 def check_rotation(
-    rotation: FloatArray, sigmas: FloatArray, given: Collection[str], has_rates: bool
+    rotation: FloatArray, sigmas: FloatArray, priors: Collection[str], has_rates: bool
 ) -> list[Finding]:
     """Detect a rotation of zero, which suggests that both streams come from one sensor.
 
@@ -221,8 +230,8 @@ def check_rotation(
     rotation : (3, 3) array
     sigmas : (3,) array
         Standard deviations (rad), infinite for unobservable axes.
-    given : collection of str
-        Axes with a prior; with one about a rotation, nothing is checked.
+    priors : collection of str
+        Axes with a prior. With a prior about a rotation, nothing is checked.
     has_rates : bool
         Whether a stream has rates. The finding is an error then, otherwise a warning: the axes of
         two cameras may well be parallel.
@@ -230,12 +239,12 @@ def check_rotation(
     limit_rad = agreement.MAX_SIGMA_RAD
     # The standard deviations must be small on all axes: if two level sensors turn only about the
     # vertical, yaw is unobservable, and roll and pitch are zero for any two sensors.
-    if {"roll", "pitch", "yaw"} & {*given} or not sigmas.max() < limit_rad:
+    if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
         return []
-    turned = np.abs(se3.rotation_log(rotation))
-    if (turned > np.maximum(agreement.SAME_RAD, _ZERO_SIGMAS * sigmas)).any():
+    angles_rad = np.abs(se3.rotation_log(rotation))
+    if (angles_rad > np.maximum(agreement.SAME_RAD, _ZERO_SIGMAS * sigmas)).any():
         return []
-    angle_rad = float(np.linalg.norm(turned))
+    angle_rad = float(np.linalg.norm(angles_rad))
     severity = Severity.ERROR if has_rates else Severity.WARNING
     return [finding("parallel_axes", "both", severity, size=angle(angle_rad), angle_rad=angle_rad)]
 
@@ -277,14 +286,17 @@ def check_positions(
         interval_s = median(np.diff(pairs.stamps_ns)) * 1e-9
         suspects += agreement.delay_suspects(fast, pairs, speed, 0.0)
         suspects += agreement.smoothing_suspects(fast, interval_s, speed)
-    candidates = [
-        (suspect.code == "smoothed_positions", share, _for_positions(suspect))
-        for share, suspect in suspects
-        if suspect and share > least_share and suspect.stream == stream
-        if suspect.code in _POSITION_CODES
-    ]
-    # Smoothing comes first: it also shrinks a coordinate that changes fast, like a wrong scale.
-    return [max(candidates, key=lambda candidate: candidate[:2])[2]] if candidates else []
+    best: list[Finding] = []
+    best_rank = (False, least_share)
+    for share, suspect in suspects:
+        if suspect is None or suspect.stream != stream or suspect.code not in _POSITION_CODES:
+            continue
+        # Smoothing comes first: it also shrinks a coordinate that changes fast, like a wrong scale.
+        rank = (suspect.code == "smoothed_positions", share)
+        if share > least_share and rank > best_rank:
+            best = [_for_positions(suspect)]
+            best_rank = rank
+    return best
 
 
 def _for_positions(suspect: Finding) -> Finding:
@@ -316,7 +328,8 @@ def _with_orientations(pairs: PosePairs, T_parent_child: FloatArray, stream: str
     for window in np.unique(windows):
         inside = windows == window
         used = inside if inside.sum() >= _LEAST_ALIGNED else np.abs(windows - window) <= 1
-        path, positions = (Ts[used, :3, 3] for Ts in (predicted, measured))
+        path = predicted[used, :3, 3]
+        positions = measured[used, :3, 3]
         products = (positions - positions.mean(axis=0)).T @ (path - path.mean(axis=0))
         borrowed[inside, :3, :3] = se3.nearest_rotation(products) @ predicted[inside, :3, :3]
     if stream == "child":
@@ -333,24 +346,26 @@ def _copied_positions(pairs: PosePairs, T_parent_child: FloatArray) -> list[Find
     moved_m = median(np.linalg.norm(motions.Ts_parenti_parentj[:, :3, 3], axis=1))
     if residual_m > min(_COPIED_M, _COPIED_SHARE * moved_m):
         return []
-    text = "The positions agree with the poses to rounding"
-    return [
-        finding("not_independent", "both", Severity.ERROR, evidence=text, residual_m=residual_m)
-    ]
+    return _copied("The positions agree with the poses to rounding", residual_m=residual_m)
+
+
+def _copied(evidence: str, **residual: Any) -> list[Finding]:
+    """Return the finding that one stream was computed from the other."""
+    return [finding("not_independent", "both", Severity.ERROR, evidence=evidence, **residual)]
 
 
 def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
     """Detect positions (N, 3) that were interpolated between few measured positions."""
     steps = np.diff(positions, axis=0)
-    sizes = np.linalg.norm(steps, axis=1)
-    moving = np.minimum(sizes[1:], sizes[:-1]) > _MOVES_M
-    if moving.sum() < MIN_PAIRS:
+    lengths_m = np.linalg.norm(steps, axis=1)
+    is_moving = np.minimum(lengths_m[1:], lengths_m[:-1]) > _MOVES_M
+    if is_moving.sum() < MIN_PAIRS:
         return []
     # Distance of each position from the line through its two neighbours.
-    chord = steps[1:] + steps[:-1]
-    along = np.linalg.norm(chord, axis=1)
-    off = np.linalg.norm(se3.cross(steps[:-1], chord), axis=1) / np.maximum(along, 1e-12)
-    share = float((off[moving] < _STRAIGHT_M).mean())
+    chords = steps[1:] + steps[:-1]
+    areas = np.linalg.norm(se3.cross(steps[:-1], chords), axis=1)
+    distances_m = areas / np.maximum(np.linalg.norm(chords, axis=1), 1e-12)
+    share = float((distances_m[is_moving] < _STRAIGHT_M).mean())
     return [finding("interpolated", stream, share=share)] if share > _STRAIGHT_SHARE else []
 
 
@@ -359,14 +374,12 @@ def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Find
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < MIN_PAIRS:
         return []
-    remaining = np.linalg.norm(of_child @ T_parent_child[:3, :3].T - of_parent, axis=1)
-    left_rad = median(remaining)
-    if left_rad > min(_COPIED_RAD, _COPIED_SHARE * median(np.linalg.norm(of_parent, axis=1))):
+    residuals = of_child @ T_parent_child[:3, :3].T - of_parent
+    residual_rad = median(np.linalg.norm(residuals, axis=1))
+    usual_rad = median(np.linalg.norm(of_parent, axis=1))
+    if residual_rad > min(_COPIED_RAD, _COPIED_SHARE * usual_rad):
         return []
-    text = "The rotations of both streams agree to rounding"
-    return [
-        finding("not_independent", "both", Severity.ERROR, evidence=text, residual_rad=left_rad)
-    ]
+    return _copied("The rotations of both streams agree to rounding", residual_rad=residual_rad)
 
 
 def check_rotations(
@@ -394,19 +407,19 @@ def check_rotations(
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < BLOCKS * MIN_PAIRS:
         return []
-    suspects: list[Finding | None] = []
-    if has_rates:
-        suspects = _matrix_suspects(of_parent, of_child @ rotation.T, stream)
-    still = np.zeros((len(pairs), 3))
+    still = np.zeros(3)
     turning = PosePairs(
         pairs.stamps_ns,
         se3.from_rotation_translation(pairs.Ts_pw_p[:, :3, :3], still),
         se3.from_rotation_translation(pairs.Ts_cw_c[:, :3, :3], still),
     )
-    change = find_change(turning, se3.from_rotation_translation(rotation, np.zeros(3)))
+    change = find_change(turning, se3.from_rotation_translation(rotation, still))
     moved = agreement.moved_mount(change, int(pairs.stamps_ns[0])) if change else None
     if moved:
         return [moved]
+    if not has_rates:
+        return []
+    suspects = _matrix_suspects(of_parent, of_child @ rotation.T, stream)
     findings = gravest_first([suspect for suspect in suspects if suspect])
     return [*findings[:1]]
 
@@ -414,13 +427,11 @@ def check_rotations(
 def _rotation_vectors(pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors (K, 3) of parent and child over 1 s, each in its own sensor frame."""
     motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
-    turns = [
-        se3.rotation_log(Ts[:, :3, :3])
-        for Ts in (motions.Ts_parenti_parentj, motions.Ts_childi_childj)
-    ]
-    angles = np.max([np.linalg.norm(vectors, axis=1) for vectors in turns], axis=0)
-    usable = angles < MAX_ROTATION_RAD
-    return turns[0][usable], turns[1][usable]
+    of_parent = se3.rotation_log(motions.Ts_parenti_parentj[:, :3, :3])
+    of_child = se3.rotation_log(motions.Ts_childi_childj[:, :3, :3])
+    angles = np.maximum(np.linalg.norm(of_parent, axis=1), np.linalg.norm(of_child, axis=1))
+    is_usable = angles < MAX_ROTATION_RAD
+    return of_parent[is_usable], of_child[is_usable]
 
 
 def _check_handedness(pairs: PosePairs, stream: str) -> list[Finding]:
@@ -429,14 +440,16 @@ def _check_handedness(pairs: PosePairs, stream: str) -> list[Finding]:
     if len(of_parent) < BLOCKS * MIN_PAIRS:
         return []
     # Subtract the mean, which contains the bias: a wrong rotation spoils the estimate of the bias.
-    of_parent, of_child = (vectors - vectors.mean(axis=0) for vectors in (of_parent, of_child))
+    of_parent = of_parent - of_parent.mean(axis=0)
+    of_child = of_child - of_child.mean(axis=0)
     left, _, right = np.linalg.svd(of_child.T @ of_parent)
     rotating = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
     mirroring = rotating * [1.0, 1.0, -1.0]
-    by_rotation, by_mirror = (
-        median(np.linalg.norm(of_child @ left @ signs @ right - of_parent, axis=1))
-        for signs in (rotating, mirroring)
-    )
+    residuals_rad = []
+    for signs in (rotating, mirroring):
+        errors = of_child @ left @ signs @ right - of_parent
+        residuals_rad.append(median(np.linalg.norm(errors, axis=1)))
+    by_rotation, by_mirror = residuals_rad
     usual = median(np.linalg.norm(of_parent, axis=1))
     is_mirrored = by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
     return [finding("mirrored_rates", stream)] if is_mirrored else []

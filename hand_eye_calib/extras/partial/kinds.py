@@ -1,4 +1,7 @@
-"""Streams of which one gives only a part of its poses: positions, rotations or angular rates."""
+"""Kinds of data in which one stream measures only a part of its poses.
+
+The streams are positions beside poses, or rotations or angular rates of both sensors.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,36 +21,36 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial.checks import check_solved
 from hand_eye_calib.extras.partial.partial import estimate_lever_arm, estimate_rotation
 
-# Values of options that only whole poses obey: one method, one reference, one backend.
+# Allowed values of options that only affect full poses.
 _OF_POSES: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
     "reference": ("auto",),
     "backend": ("fast",),
 }
 
-# Positions have no cross-check by DNLO, whose options these are.
+# Positions have no cross-check by DNLO: its options keep their defaults.
 _OF_POSITIONS: dict[str, tuple[object, ...]] = {
     **_OF_POSES,
     "threshold": (CalibratorConfig.threshold,),
     "min_inlier_fraction": (CalibratorConfig.min_inlier_fraction,),
 }
 
-# Rotations have no lengths.
+# Rotations have no lengths: their scale is 1.
 _OF_ROTATIONS: dict[str, tuple[object, ...]] = {
     **_OF_POSES,
     "scale": ("none", "auto"),
     "parent_scale": (1.0,),
 }
 
-# Positions alone are paired anew from this change of the time offset (s) on: their model knows it
-# better than speeds do.
+# Change of the time offset (s) from which on positions are paired anew. Their model estimates the
+# offset better than speeds do.
 _LEAST_CHANGE_OF_POSITIONS_S = 0.05
 
-# Share of the squared residuals of positions that belong to another path which a fault must explain
-# to be named.
+# Share of the squared residuals that a fault must explain to be reported, if the positions are on
+# another path than the poses.
 _NAMES_UNRELATED = 0.6
 
-# Smaller time offsets (s) of streams that are no poses are found by every solve.
+# Every solve estimates time offsets below this (s).
 _FOUND_BY_SOLVE_S = 0.25
 
 # Accuracy of a coarse time offset, in intervals between poses.
@@ -65,40 +68,39 @@ def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
 
 
 def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibration:
-    """Estimate the part of the extrinsic that the streams show, on the clock of the solve."""
+    """Estimate the observable part of the extrinsic, and pair anew if the time offset is large."""
     config = snapshot.config
     result = estimate(snapshot.pose_pairs, config)
-    given_s = float(config.time_offset)
-    moved_s = abs(result.time_offset_s - given_s)
-    if not moved_s < UNASKED_S:
-        return replace(result, time_offset_s=given_s)
-    if len(snapshot.kept) or not moved_s > MOST_MOVED_S:
+    before_s = float(config.time_offset)
+    change_s = abs(result.time_offset_s - before_s)
+    if not change_s < UNASKED_S:
+        return replace(result, time_offset_s=before_s)
+    if len(snapshot.kept) or not change_s > MOST_MOVED_S:
         return result
-    # Interpolated where the other stream has its poses, rather than moved along its velocity.
+    # Interpolate at the stamps of the other stream, instead of moving poses along the velocity.
     config = replace(config, time_offset=result.time_offset_s)
-    moved = replace(snapshot, config=config).pose_pairs
-    return estimate(moved, config) if len(moved) >= config.min_pairs else result
+    pose_pairs = replace(snapshot, config=config).pose_pairs
+    return estimate(pose_pairs, config) if len(pose_pairs) >= config.min_pairs else result
 
 
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
-    """Check two streams of which one gives only a part of its poses.
+    """Check two streams of which one measures only a part of its poses.
 
-    The findings of the solve itself are among those of the check.
+    The result includes the findings of the solve.
 
     Parameters
     ----------
     snapshot : Snapshot
     calibration : Calibration, optional
-        A result from these streams. Its time offset and scale count as known.
+        A result from these streams. Its time offset and scale are not checked again.
     """
     config = snapshot.config
     findings = [*calibration.findings] if calibration else []
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
-    if not len(snapshot.kept):  # pairs may have gaps where the streams have none
+    if not len(snapshot.kept):  # stored pairs may have gaps that the streams do not have
         scale = calibration.scale if calibration else config.given_scale
-        on_one_scale = child.scaled(scale)
-        aligned = on_one_scale.shifted(known_s)
+        aligned = child.scaled(scale).shifted(known_s)
         lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
         findings += checking.check_parts(parent, aligned, config.max_gap, lever_arm_m)
     hidden = calibration.hidden if calibration else []
@@ -110,26 +112,29 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         findings += check_solved(parent, child, calibration, config, least_share)
     if hidden and not any(found.makes_unusable for found in findings):
         findings.append(checking.unseen(hidden))
-    # Lengths in another unit are the cause of what the solve found.
+    # Lengths in another unit come first: they cause the findings of the solve.
     findings.sort(key=lambda found: found.code != "lengths")
-    different = [found for index, found in enumerate(findings) if found not in findings[:index]]
+    different: list[Finding] = []
+    for found in findings:
+        if found not in different:
+            different.append(found)
     return CheckResult(gravest_first(different))
 
 
 def _least_lever_arm(calibration: Calibration) -> float:
-    """Return the length (m) that the lever arm of a result has at least, within its uncertainty."""
+    """Return the least length (m) of the lever arm of a result, within its uncertainty."""
     sigmas = np.sqrt(np.diag(calibration.covariance_measured))[:3]
-    is_shown = [axis not in calibration.hidden for axis in "xyz"]
-    return checking.least_lever_arm(calibration.T_parent_child, np.where(is_shown, sigmas, np.inf))
+    is_hidden = [axis in calibration.hidden for axis in "xyz"]
+    return checking.least_lever_arm(calibration.T_parent_child, np.where(is_hidden, np.inf, sigmas))
 
 
 def _check_clock(
     parent: Trajectory, child: Trajectory, known_s: float, snapshot: Snapshot
 ) -> list[Finding]:
-    """Return the finding that the clocks differ, if speeds or angular rates show it clearly."""
-    of_speed = kind_of(snapshot.config).is_timed_by_speed
+    """Detect a clock offset by the correlation of speeds or angular rates, if it is clear."""
+    uses_speeds = kind_of(snapshot.config).is_timed_by_speed
     max_gap_s = snapshot.config.max_gap
-    correlation = correlate_rates(parent, child.shifted(known_s), max_gap_s, of_speed)
+    correlation = correlate_rates(parent, child.shifted(known_s), max_gap_s, uses_speeds)
     if not correlation.is_clear or abs(correlation.offset_s) < _FOUND_BY_SOLVE_S:
         return []
     sigma_s = _COARSE_INTERVALS * max(parent.interval_s, child.interval_s)
@@ -137,7 +142,7 @@ def _check_clock(
     return checking.check_offset(offset, known_s)
 
 
-#: Poses of one sensor and positions of the other on the road.
+#: Poses of one sensor and positions of the other.
 POSITIONS = Kind(
     solve=_solve_positions,
     check=check,
@@ -146,7 +151,7 @@ POSITIONS = Kind(
     is_timed_by_speed=True,
 )
 
-#: Rotations or angular rates of both sensors on the road.
+#: Rotations or angular rates of both sensors.
 ROTATIONS = Kind(
     solve=_solve_rotations,
     check=check,
