@@ -39,14 +39,14 @@ def space_of(seed=1, cut=(4,)):
     columns = np.concatenate([random.standard_normal((n, 6, N_PARAMETERS)), residuals], axis=2)
     return StateSpace(
         intervals_s=intervals_s,
-        relative=intervals_s / 0.1,
+        walk_factors=intervals_s / 0.1,
         columns=columns,
         ahead=ahead,
         behind=behind,
-        white=(bases[0][None], bases[1][None]),
-        walk=bases,
+        white_bases=(bases[0][None], bases[1][None]),
+        walk_bases=bases,
         twists=twists,
-        sizes=SIZES,
+        group_sizes=SIZES,
         weights=random.uniform(0.3, 2.0, N_POSES),
         cut=flags,
         prior=np.zeros((N_PARAMETERS + 1, N_PARAMETERS + 1)),
@@ -68,7 +68,7 @@ def dense_covariance(space, levels):
     n, _, d = space.behind.shape
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
-        bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white]
+        bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white_bases]
         bases.append(np.outer(space.twists[pose], space.twists[pose]))
         white = sum(variance * basis for variance, basis in zip(variances, bases, strict=False))
         prior[pose, :6, pose, :6] = white / space.weights[pose]
@@ -81,9 +81,9 @@ def dense_covariance(space, levels):
         entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = np.eye(6), space.ahead[i]
         entries[i, :, i] = -space.behind[i]
     entries = entries.reshape(6 * n, -1)
-    walk = variances[3] * space.walk[0] + variances[4] * space.walk[1]
+    walk = variances[3] * space.walk_bases[0] + variances[4] * space.walk_bases[1]
     return entries @ prior.reshape(N_POSES * d, -1) @ entries.T + np.kron(
-        np.diag(space.relative), walk
+        np.diag(space.walk_factors), walk
     )
 
 

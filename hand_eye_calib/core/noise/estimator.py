@@ -1,8 +1,10 @@
 """Adaptive estimator of X by generalised least squares.
 
 The noise model is estimated together with X, so that all increments are used with the right
-weights. White noise favours long baselines, drift short ones, time-correlated errors neither; a
-jump cuts the trajectory. docs/adaptive.md has the derivation and tests.
+weights. White noise favours long baselines, drift favours short ones, time-correlated errors favour
+neither; a jump cuts the trajectory. The model is that of
+:mod:`~hand_eye_calib.core.noise.increments`; :mod:`~hand_eye_calib.core.noise.stages` is the
+search. docs/adaptive.md has the derivation and tests.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from hand_eye_calib.core.noise.increments import (
     SYSTEMATIC,
     TIME,
     Streams,
+    parameter_columns,
 )
 from hand_eye_calib.core.noise.noise_model import (
     ROTATION,
@@ -35,27 +38,33 @@ from hand_eye_calib.core.noise.noise_model import (
     NoiseModel,
     fast_sigmas,
 )
-from hand_eye_calib.core.noise.stages import STAGES, Fit, Problem, Workspace, is_settled, start
+from hand_eye_calib.core.noise.stages import (
+    STAGES,
+    Fit,
+    Problem,
+    Stage,
+    Workspace,
+    is_settled,
+    start,
+)
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import CorrelatedError, Noise
 
 # Stages that a quick solve leaves out.
-_SLOW = frozenset({"tails", "lasting"})
-# Number of first stages, whose fit a search may fall back on.
-_FIRST = 3
+_SLOW_STAGES = frozenset({"tails", "lasting"})
 
-# Standard deviations beyond which a systematic error is reported.
+# Stages that find noise and outliers: noise, outliers, tails. A search without time-correlated
+# errors starts from their fit.
+_FIRST_STAGES = STAGES[:3]
+_LAST_STAGES = STAGES[3:]
+
+# A systematic error is reported beyond this number of standard deviations.
 PLAIN_SIGMAS = 3.0
 
 # Smallest jitter of stamps (ms) that is reported.
 _NOTABLE_JITTER_MS = 0.1
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
-
-
-def _first_times(times_s: FloatArray) -> str:
-    times = ", ".join(f"{time_s:.3f}" for time_s in times_s[:5].tolist())
-    return f"{times} ..." if len(times_s) > 5 else times
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +77,9 @@ class ModelSolution:
     levels : (m,) array
         Log levels of the model.
     parameters, parameter_sigmas : (8 or more,) arrays
-        Parameters of all systematic errors, see :mod:`~hand_eye_calib.core.noise.increments`, and
-        their standard deviations; zero for those that are not there.
+        Parameters of all systematic errors, see
+        :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`, and their standard deviations;
+        zero for absent errors.
     scale, scale_sigma : float
         Factor from the child's lengths to the parent's, and its standard deviation.
     time_offset_s, time_offset_sigma_s : float
@@ -79,9 +89,9 @@ class ModelSolution:
     spikes : (n + 1,) bool array
         Poses that are wrong by themselves, and left out.
     misfit : float
-        Weighted squared residual over its degrees of freedom. The covariance has this factor in it.
+        Weighted squared residual over its degrees of freedom. The covariance contains this factor.
     part_products : (K, p + 1, p + 1) array
-        What each part of the recording adds, see
+        Contributions of the parts of the recording, see
         :func:`~hand_eye_calib.core.noise.state_space.Posterior.part_products`.
     objective : float
         Negative log likelihood.
@@ -104,7 +114,7 @@ class ModelSolution:
     converged: bool
 
     def events(self, stamps_ns: IntArray) -> list[str]:
-        """Describe jumps and outliers, with the times (s) of the first."""
+        """Describe jumps and outliers, with the times (s) of the first ones."""
         stamps_s = np.asarray(stamps_ns * 1e-9, dtype=np.float64)
         jumps_s = stamps_s[1:][self.jumps]
         outliers_s = stamps_s[self.spikes]
@@ -118,9 +128,15 @@ class ModelSolution:
         return sentences
 
 
+def _first_times(times_s: FloatArray) -> str:
+    """List up to five times (s)."""
+    times = ", ".join(f"{time_s:.3f}" for time_s in times_s[:5].tolist())
+    return f"{times} ..." if len(times_s) > 5 else times
+
+
 @dataclass(frozen=True, kw_only=True)
 class AdaptiveSolution(ModelSolution):
-    """Answer of the adaptive estimator.
+    """Solution of the adaptive estimator.
 
     Attributes
     ----------
@@ -129,9 +145,9 @@ class AdaptiveSolution(ModelSolution):
         Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, systematic errors and misfit
         accounted for.
     unseen : (6, U) array
-        Directions of xi that no increment says anything about.
+        Directions of xi for which no increment is evidence.
     weights : (n + 1,) array
-        Of the poses' white errors; other than 1 where tails are heavy.
+        Of the poses' white errors; other than 1 if tails are heavy.
     is_noise_dominated : bool
         Whether single poses are noisier than the rotation between them: only some were used.
     metres_per_pose : float
@@ -147,14 +163,16 @@ class AdaptiveSolution(ModelSolution):
 
     @property
     def systematic(self) -> str:
-        """Systematic errors that the data show beyond doubt, joined by ``+``; ``none``."""
-        shown = np.abs(self.parameters) > PLAIN_SIGMAS * self.parameter_sigmas
-        return "+".join(name for name, at in PARAMETERS.items() if shown[at].any()) or "none"
+        """Systematic errors beyond doubt, joined by ``+``; ``none`` without any."""
+        is_beyond_doubt = np.abs(self.parameters) > PLAIN_SIGMAS * self.parameter_sigmas
+        names = [name for name, columns in PARAMETERS.items() if is_beyond_doubt[columns].any()]
+        return "+".join(names) or "none"
 
     @property
     def rate_bias(self) -> FloatArray:
-        """(2, 3) array: bias of the child's rates less that of the parent's, along the axes of the
-        child, and its standard deviations, rad/s.
+        """Bias of the child's rates less that of the parent's, and standard deviations: (2, 3).
+
+        In rad/s, along the axes of the child.
         """
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
@@ -172,10 +190,10 @@ class AdaptiveSolution(ModelSolution):
     def noise(self) -> Noise:
         """Standard deviations per axis, and names of systematic errors."""
         sigmas = fast_sigmas(self.levels)
-        lasting_sigmas = np.exp(0.5 * self.levels)[VARIANCES].tolist()
+        slow_sigmas = np.exp(0.5 * self.levels)[VARIANCES].tolist()
         lasting = []
         for process, sigma, level in zip(
-            self.model.slow, lasting_sigmas, self.levels[TIME_CONSTANTS], strict=True
+            self.model.slow, slow_sigmas, self.levels[TIME_CONSTANTS], strict=True
         ):
             kind, part = process
             tau_s = float(np.exp(level))
@@ -193,14 +211,11 @@ class AdaptiveSolution(ModelSolution):
 
     def describe(self, stamps_ns: IntArray) -> Noise:
         """Return the noise in numbers and in words, with the times of jumps and outliers."""
-        sentences = [
-            *self._noise_in_words(),
-            *self._systematic_in_words(),
-            *self.events(stamps_ns),
-        ]
+        sentences = self._noise_in_words() + self._systematic_in_words() + self.events(stamps_ns)
         return replace(self.noise, in_words=tuple(sentences))
 
     def _noise_in_words(self) -> list[str]:
+        """Describe white noise, drift, time-correlated errors and jitter."""
         sigmas = fast_sigmas(self.levels)
         lasting = self.noise.lasting
         white = angle(sigmas.rotation_rad)
@@ -224,13 +239,14 @@ class AdaptiveSolution(ModelSolution):
         return sentences
 
     def _systematic_in_words(self) -> list[str]:
+        """Describe the systematic errors beyond doubt."""
         systematic = self.systematic.split("+")
         sentences = []
         if "scale" in systematic:
-            off = 100 * (self.scale - 1)
+            percent = 100 * (self.scale - 1)
             sigma = 100 * self.scale_sigma
-            size = f"{abs(off):.2f} +/- {sigma:.2g} %"
-            longer = "shorter" if off > 0 else "longer"
+            size = f"{abs(percent):.2f} +/- {sigma:.2g} %"
+            longer = "shorter" if percent > 0 else "longer"
             sentences.append(f"the child's lengths are {size} {longer} than the parent's")
         if "bias" in systematic:
             bias = zip("xyz", 1000 * self.parameters[BIAS], strict=True)
@@ -251,6 +267,7 @@ class AdaptiveSolution(ModelSolution):
 
 
 def _slow_in_words(slow: CorrelatedError) -> str:
+    """Describe a time-correlated error."""
     if slow.part == "scale":
         return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
     if slow.part == "direction":
@@ -281,7 +298,7 @@ def solve(
     quick : bool
         Stop at white noise, drift and outliers: neither time-correlated errors nor heavy tails.
     is_clock_free : bool
-        The clock offset was estimated from these poses: it is not known beforehand.
+        Whether the clock offset was estimated from these poses. If so, it is not known beforehand.
     without : collection of str
         Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` to leave out.
     tuning : Tuning
@@ -289,34 +306,40 @@ def solve(
     Returns
     -------
     AdaptiveSolution
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If no noise model fits the poses to rounding.
     """
     problem = Problem(
         streams=Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c),
-        columns=[column for name in systematic for column in PARAMETERS[name]],
+        columns=parameter_columns(systematic),
         is_clock_free=is_clock_free,
-        without=frozenset(without) | (_SLOW if quick else frozenset()),
+        without=frozenset(without) | (_SLOW_STAGES if quick else frozenset()),
         tuning=tuning,
     )
     return _solved(problem)
 
 
 def _solved(problem: Problem) -> AdaptiveSolution:
+    """Pass all stages; leave out poses or time-correlated errors if the search needs it."""
     workspace = Workspace(problem)
-    first = _passed(workspace, start(problem), STAGES[:_FIRST])
+    first = _passed(workspace, start(problem), _FIRST_STAGES)
     # A camera that observes a target: its errors repeat, and exceed the rotation between poses.
     if first.model.centre != "sensors" and problem.is_noisy(first):
         kept = _strided(problem, first)
         if len(kept) < len(problem.streams):
             fewer = replace(problem, streams=problem.streams[kept])
             return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
-    fit = _passed(workspace, first, STAGES[_FIRST:])
+    fit = _passed(workspace, first, _LAST_STAGES)
     if not is_settled(workspace, fit):
         workspace = Workspace(replace(problem, without=problem.without | {"lasting"}))
-        fit = _passed(workspace, first, STAGES[_FIRST:])
+        fit = _passed(workspace, first, _LAST_STAGES)
     return _solution(workspace, fit)
 
 
-def _passed(workspace: Workspace, fit: Fit, stages: Sequence) -> Fit:
+def _passed(workspace: Workspace, fit: Fit, stages: Sequence[Stage]) -> Fit:
     """Return the fit after some stages."""
     for stage in stages:
         if stage.__name__ not in workspace.problem.without:
@@ -325,16 +348,18 @@ def _passed(workspace: Workspace, fit: Fit, stages: Sequence) -> Fit:
 
 
 def _strided(problem: Problem, fit: Fit) -> IntArray:
-    """Poses to keep: a stride whose rotation exceeds the rotation noise of a pose."""
+    """Return every k-th sound pose, for the smallest k whose rotation exceeds its noise clearly.
+
+    If no stride reaches this, it is the longest one that keeps enough poses.
+    """
     tuning = problem.tuning
-    streams = problem.streams
     sound_poses = np.flatnonzero(~fit.outliers.spikes)
     longest_stride = 1
     for stride in tuning.strides:
         if len(sound_poses) >= stride * tuning.fewest_strides:
             longest_stride = max(stride, longest_stride)
     noise_rad = np.exp(0.5 * fit.levels[ROTATION])
-    rotations = streams.Ts_pw_p[sound_poses, :3, :3]
+    rotations = problem.streams.Ts_pw_p[sound_poses, :3, :3]
     for stride in tuning.strides:
         turns = np.swapaxes(rotations[:-stride], 1, 2) @ rotations[stride:]
         if noise_rad < tuning.noisy * median(se3.rotation_angle(turns)):
@@ -356,31 +381,26 @@ def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) ->
 def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     """Return the solution one step from where the search ended."""
     problem = workspace.problem
-    streams = problem.streams
     columns = problem.columns
     posterior = workspace.posterior(fit)
     normal = posterior.normal
-    # Rows of an increment that tell: three where only rotations are measured, without a place.
-    places = np.concatenate([streams.Ts_pw_p[:, :3, 3], streams.Ts_cw_c[:, :3, 3]], axis=1)
-    n_rows = 6 if np.ptp(places, axis=0).any() else 3
-    n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
-    misfit = float(normal.cost) / max(n_rows * n_evidence - 6 - len(columns), 1)
-    # Steps smaller than predicted do not make what was learned over long baselines more certain.
+    final = fit.moved(normal.step, columns)
+    misfit = float(normal.cost) / _degrees_of_freedom(problem, fit)
+    # A misfit below 1 does not make the evidence of long baselines more certain.
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
-    unseen = np.zeros(6)
+    is_present = fit.sigmas > problem.tuning.none
+    parameters = np.where(is_present, final.parameters, 0.0)
+    sigmas = np.where(is_present, sigmas, 0.0)
+    undetected = np.zeros(6)
     for (kind, _), level in zip(fit.model.slow, fit.levels[VARIANCES], strict=True):
         if kind == "body":
-            unseen[:3] += problem.tuning.unseen_share * np.exp(level)
-    steps = np.diff(streams.Ts_pw_p[:, :3, 3], axis=0)
-    final = fit.moved(normal.step, columns)
-    is_there = fit.sigmas > problem.tuning.none
-    parameters = np.where(is_there, final.parameters, 0.0)
-    sigmas = np.where(is_there, sigmas, 0.0)
+            undetected[:3] += problem.tuning.unseen_share * np.exp(level)
+    steps = np.diff(problem.streams.Ts_pw_p[:, :3, 3], axis=0)
     return AdaptiveSolution(
         T_parent_child=final.T,
-        cov_parent_child_in_child=covariance[:6, :6] + np.diag(unseen),
+        cov_parent_child_in_child=covariance[:6, :6] + np.diag(undetected),
         unseen=normal.unseen[:6],
         model=fit.model,
         levels=fit.levels,
@@ -394,8 +414,18 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
         jumps=fit.outliers.jumps,
         spikes=fit.outliers.spikes,
         misfit=misfit,
-        metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(streams),
+        metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(problem.streams),
         part_products=posterior.part_products(),
         objective=0.5 * (posterior.log_determinant + float(normal.cost)),
         converged=is_settled(workspace, fit),
     )
+
+
+def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
+    """Number of residuals that are evidence, less the parameters; at least 1."""
+    streams = problem.streams
+    positions = np.concatenate([streams.Ts_pw_p[:, :3, 3], streams.Ts_cw_c[:, :3, 3]], axis=1)
+    # Streams of rotations alone have constant positions.
+    n_rows = 6 if np.ptp(positions, axis=0).any() else 3
+    n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
+    return max(n_rows * n_evidence - 6 - len(problem.columns), 1)

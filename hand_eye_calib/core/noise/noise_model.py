@@ -4,10 +4,12 @@ The error c of a pair of poses, in the child's frame, is the sum of these indepe
 
 - a white error: translation, rotation, and along the velocity, for stamps that jitter;
 - a random walk of the motions: translation and rotation;
-- first-order Gauss-Markov processes: translations fixed to the child's body, translations and
-  rotations fixed to the parent's world, the scale and the direction of travel.
+- first-order Gauss-Markov processes g: ``c = M g`` with M constant for translations fixed to the
+  child's body, and ``M = Ad(X^-1) blkdiag(R_p', R_p')`` for translations and rotations fixed to the
+  parent's world. A drifting scale or direction of travel enters the increments instead.
 
-Each part has one variance for all axes. A level is the logarithm of a variance.
+Each part has one variance for all axes. A level is the logarithm of a variance or of a time
+constant. Derivation: docs/adaptive.md.
 """
 
 from __future__ import annotations
@@ -24,19 +26,17 @@ from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# What white rotation noise turns a trajectory about: either sensor itself, or the origin of the
-# child's or of the parent's world, as of a camera that sees a target.
+# Centres of white rotation noise: either sensor itself, or the origin of the child's or of the
+# parent's world, as of a camera that observes a target.
 CENTRES = ("sensors", "child", "parent")
 
-# Log levels before those of lasting errors: white translation (m^2), white rotation (rad^2), jitter
-# of stamps (s^2), walk of translation and of rotation.
-_FAST = ("translation", "rotation", "jitter", "walk_translation", "walk_rotation")
-N_FAST = len(_FAST)
+# Levels of the fast errors: white translation (m^2), white rotation (rad^2), jitter of stamps
+# (s^2), walk of translation and of rotation.
+N_FAST = 5
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
-# Levels of white noise and of the walk, translation and rotation each.
 WHITES = slice(TRANSLATION, ROTATION + 1)
 WALKS = slice(WALK_TRANSLATION, WALK_ROTATION + 1)
-# Levels of lasting errors: of each process its variance, then its time constant (s).
+# Levels of time-correlated errors follow: of each process its variance, then its time constant (s).
 VARIANCES = slice(N_FAST, None, 2)
 TIME_CONSTANTS = slice(N_FAST + 1, None, 2)
 
@@ -44,18 +44,22 @@ PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
 TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0])
 ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
-# Variances (m^2, rad^2, s^2) and log variances are within these bounds.
+# Bounds of variances (m^2, rad^2, s^2) and of log variances. Rounding is below the lower one.
 LOWEST_VARIANCE = 1e-14
 _HIGHEST_LEVEL = 14.0
 
-# Least log shares of white noise and of the walk in the whole: the precisions of both are added in
-# one matrix.
-_LEAST_WHITE = -14.0
-_LEAST_WALK = -12.0
+# Lower bounds of the log shares of white noise and of the walk in the whole. The precisions of both
+# are added in one matrix.
+_LOWEST_WHITE = -14.0
+_LOWEST_WALK = -12.0
+
+# Bounds of the walk's variance over an increment, in units of a typical increment. Neither a gap
+# nor twin stamps may dominate.
+_WALK_BOUNDS = (0.1, 100.0)
 
 
 class FastSigmas(NamedTuple):
-    """Standard deviations of the errors that every model has, per axis."""
+    """Standard deviations, per axis, of the errors that every model has."""
 
     translation_m: float
     rotation_rad: float
@@ -64,16 +68,18 @@ class FastSigmas(NamedTuple):
     walk_rotation_rad: float
 
 
-#: A process of time-correlated errors, by its kind and its part: of the body or the world,
-#: translation or rotation; of the path, scale or direction.
+#: Kind and part of a process of time-correlated errors: ("body" or "world", "translation" or
+#: "rotation"), or ("path", "scale" or "direction").
 Slow: TypeAlias = tuple[str, str]
 
-# No rotation fixed to the body: a mount that wanders. X would forget what it knows, and no
-# recording gains by it.
+# There is no rotation fixed to the body, which is a mount that wanders: X would forget its
+# evidence, and no recording gains by it.
 LASTING: tuple[Slow, ...] = (
     ("body", "translation"),
-    *(("world", part) for part in PARTS),
-    *(("path", part) for part in PATH_PARTS),
+    ("world", "translation"),
+    ("world", "rotation"),
+    ("path", "scale"),
+    ("path", "direction"),
 )
 
 
@@ -84,7 +90,9 @@ class NoiseModel:
     Attributes
     ----------
     slow : tuple of Slow
+        Time-correlated errors.
     centre : {"sensors", "child", "parent"}
+        Centre of white rotation noise, see :data:`CENTRES`.
     interval_s, duration_s : float
         Typical interval and duration of the recording.
     tuning : Tuning
@@ -107,44 +115,48 @@ class NoiseModel:
         cut: BoolArray,
         prior: FloatArray,
     ) -> StateSpace:
-        """State space of a linearisation.
+        """Return the state space of a linearisation.
 
         Parameters
         ----------
         streams : Streams
         linearisation : Linearisation
         twists : (N, 6) array
-            The child's, see :class:`~hand_eye_calib.core.noise.increments.Course`.
+            Of the child, see :class:`~hand_eye_calib.core.noise.increments.Course`.
         T_parent_child : (4, 4) array
         weights : (N,) array
         cut : (n,) bool array
         prior : (p + 1, p + 1) array
+            The last three as in :class:`~hand_eye_calib.core.noise.state_space.StateSpace`.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         intervals_s = np.diff(streams.stamps_s)
-        # Rotation noise, half of it the parent's, which moves the child by the lever arm.
-        both = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
-        is_swung = self.centre != "sensors"
+        # Half of the rotation noise is the parent's, which moves the child by the lever arm.
+        rotations = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
+        white_rotations = rotations[None]
+        if self.centre != "sensors":
+            white_rotations = self._swing(streams, to_child)
         ahead = [np.zeros((len(intervals_s), 6, 0))]
         behind = [linearisation.adjoints]
         for kind, part in self.slow:
             if kind == "path":
-                behind.append(-linearisation.by_path[part])
-                ahead.append(np.zeros_like(behind[-1]))
-                continue
-            directions = _directions(kind, part, streams, to_child)
-            ahead.append(directions[1:])
-            behind.append(linearisation.adjoints @ directions[:-1])
+                by_path = linearisation.by_path[part]
+                ahead.append(np.zeros_like(by_path))
+                behind.append(-by_path)
+            else:
+                M = _directions(kind, part, streams, to_child)
+                ahead.append(M[1:])
+                behind.append(linearisation.adjoints @ M[:-1])
         return StateSpace(
             intervals_s=intervals_s,
-            relative=np.clip(intervals_s / self.interval_s, *self.tuning.relative),
+            walk_factors=np.clip(intervals_s / self.interval_s, *_WALK_BOUNDS),
             columns=linearisation.columns,
             ahead=np.concatenate(ahead, axis=2),
-            behind=np.concatenate(behind, axis=2) if self.slow else behind[0],
-            white=(TRANSLATIONS[None], self._swing(streams, to_child) if is_swung else both[None]),
-            walk=(TRANSLATIONS, both),
+            behind=np.concatenate(behind, axis=2) if self.slow else linearisation.adjoints,
+            white_bases=(TRANSLATIONS[None], white_rotations),
+            walk_bases=(TRANSLATIONS, rotations),
             twists=twists,
-            sizes=tuple(each.shape[2] for each in ahead[1:]),
+            group_sizes=tuple(matrices.shape[2] for matrices in ahead[1:]),
             weights=weights,
             cut=cut,
             prior=prior,
@@ -163,31 +175,30 @@ class NoiseModel:
     def shares(
         self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """Matrices (1 or N, 6, 6) from the white errors c to what of them is the parent's, in the
-        child's frame.
+        """Matrices (1 or N, 6, 6) that take white errors c to the parent's share of them.
 
         White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c``
-        with the white covariances S' of the parent and S of the child: with a lever arm, a
-        translation says which of the sensors rotated. Both have half of the noise, but rotation
-        noise about a world's origin is that sensor's alone.
+        with the white covariances S' of the parent and S of the child, in the child's frame. With a
+        lever arm, a translation shows which of the sensors rotated. Both sensors have half of the
+        noise, but rotation noise about a world's origin is that sensor's alone.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
-        translation, rotation = np.exp(levels[[TRANSLATION, ROTATION]])
+        translation, rotation = np.exp(levels[WHITES])
         half = 0.5 * translation * TRANSLATIONS
         turning = 0.5 * rotation * ROTATIONS
-        of_child = half[None]
-        of_parent = (to_child @ half @ to_child.T)[None]
+        S_child = half[None]
+        S_parent = (to_child @ half @ to_child.T)[None]
         if self.centre == "sensors":
-            of_parent = of_parent + to_child @ turning @ to_child.T
-            of_child = of_child + turning
+            S_parent = S_parent + to_child @ turning @ to_child.T
+            S_child = S_child + turning
         elif self.centre == "child":
-            of_child = of_child + rotation * self._swing(streams, to_child)
+            S_child = S_child + rotation * self._swing(streams, to_child)
         else:
-            of_parent = of_parent + rotation * self._swing(streams, to_child)
-        return np.swapaxes(np.linalg.solve(of_parent + of_child, of_parent), 1, 2)
+            S_parent = S_parent + rotation * self._swing(streams, to_child)
+        return np.swapaxes(np.linalg.solve(S_parent + S_child, S_parent), 1, 2)
 
     def prior(self, levels: FloatArray) -> Prior:
-        """Prior of the levels for a search from these levels."""
+        """Return the prior of the levels for a search that starts at these levels."""
         tuning = self.tuning
         total = whole(levels)
         shortest = np.log(self.interval_s)
@@ -195,17 +206,17 @@ class NoiseModel:
         precision = np.zeros(len(levels))
         lower = np.full(len(levels), np.log(LOWEST_VARIANCE))
         upper = np.full(len(levels), _HIGHEST_LEVEL)
-        lower[WHITES] = np.maximum(lower[WHITES], total + _LEAST_WHITE)
-        lower[WALKS] = np.maximum(lower[WALKS], total + _LEAST_WALK)
+        lower[WHITES] = np.maximum(lower[WHITES], total + _LOWEST_WHITE)
+        lower[WALKS] = np.maximum(lower[WALKS], total + _LOWEST_WALK)
         mean[JITTER] = tuning.jitter
         precision[JITTER] = tuning.jitter_precision
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
-        upper[TIME_CONSTANTS] = max(np.log(tuning.longest_share * self.duration_s), shortest)
-        # One that lasts is a bias or a mount askew, which have parameters.
-        is_direction = [part == "direction" for _, part in self.slow]
+        longest = max(np.log(tuning.longest_share * self.duration_s), shortest)
+        # A direction that lasts is a bias or a rotated mount, which have parameters.
         longest_of_direction = shortest + np.log(tuning.first_tau)
-        upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, upper[TIME_CONSTANTS])
+        is_direction = [part == "direction" for _, part in self.slow]
+        upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
         return Prior(mean, precision, lower, upper)
 
     def with_lasting(
@@ -213,11 +224,12 @@ class NoiseModel:
     ) -> tuple[NoiseModel, FloatArray]:
         """Return the model with time-correlated errors, and log levels to start a search at."""
         tuning = self.tuning
-        shortest = tuning.first_tau * self.interval_s
-        longest = max(tuning.last_tau * self.duration_s, shortest)
-        first = dict(zip(PARTS, whole(levels) + np.log(tuning.audible), strict=True))
-        first |= dict.fromkeys(PATH_PARTS, tuning.first_of_path)
-        starts = [[first[part], 0.5 * np.log(shortest * longest)] for _, part in processes]
+        shortest_s = tuning.first_tau * self.interval_s
+        longest_s = max(tuning.last_tau * self.duration_s, shortest_s)
+        log_tau = 0.5 * np.log(shortest_s * longest_s)
+        variances = dict(zip(PARTS, whole(levels) + np.log(tuning.audible), strict=True))
+        variances |= dict.fromkeys(PATH_PARTS, tuning.first_of_path)
+        starts = [[variances[part], log_tau] for _, part in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
     def lasting(
@@ -229,21 +241,21 @@ class NoiseModel:
         start = WHITE
         for kind, part in self.slow:
             if kind != "path":
-                directions = _directions(kind, part, streams, to_child)
-                error += se3.times(directions, states[:, start : start + 3])
+                M = _directions(kind, part, streams, to_child)
+                error += se3.times(M, states[:, start : start + 3])
             start += 1 if part == "scale" else 3
         return error
 
 
 def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) -> FloatArray:
-    """Matrices (N, 6, 3) from a process to the error c."""
+    """Matrices M (N, 6, 3) from a process to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
     return to_child[:, PARTS[part]] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
 
 
 def fast_sigmas(levels: FloatArray) -> FastSigmas:
-    """Standard deviations of white noise, jitter and walk at log levels."""
+    """Return the standard deviations of white noise, jitter and walk at log levels."""
     return FastSigmas(*np.exp(0.5 * levels)[:N_FAST].tolist())
 
 

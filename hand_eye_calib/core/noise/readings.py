@@ -25,7 +25,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.noise import stages
-from hand_eye_calib.core.noise.increments import PARAMETERS, SYSTEMATIC, Streams
+from hand_eye_calib.core.noise.increments import SYSTEMATIC, Streams, parameter_columns
 from hand_eye_calib.core.noise.noise_model import CENTRES
 from hand_eye_calib.core.noise.outliers import Outliers, bridged
 
@@ -58,46 +58,46 @@ def loss_difference(
         If the noise model cannot be fitted to a reading.
     """
     stride = -(-len(stamps_ns) // MOST_POSES)
+    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     workspaces = []
+    fits = []
     for Ts_pw_p, Ts_cw_c in (first, second):
-        stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
         streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)[::stride]
-        columns = [column for name in SYSTEMATIC for column in PARAMETERS[name]]
-        workspaces.append(stages.Workspace(stages.Problem(streams, columns)))
-    starts = []
-    for workspace in workspaces:
-        noise = stages.noise(workspace, stages.start(workspace.problem))
-        starts.append(stages.outliers(workspace, noise))
+        problem = stages.Problem(streams, parameter_columns(SYSTEMATIC))
+        workspace = stages.Workspace(problem)
+        fit = stages.noise(workspace, stages.start(problem))
+        fits.append(stages.outliers(workspace, fit))
+        workspaces.append(workspace)
     common = Outliers(
-        starts[0].outliers.jumps | starts[1].outliers.jumps,
-        starts[0].outliers.spikes | starts[1].outliers.spikes,
+        fits[0].outliers.jumps | fits[1].outliers.jumps,
+        fits[0].outliers.spikes | fits[1].outliers.spikes,
     )
     losses = []
-    for workspace, start in zip(workspaces, starts, strict=True):
-        losses.append(_least_loss(workspace, start, common))
+    for workspace, fit in zip(workspaces, fits, strict=True):
+        losses.append(_smallest_loss(workspace, fit, common))
     return losses[1] - losses[0]
 
 
-def _least_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
+def _smallest_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
     The fit has the given outliers and no robust weights.
     """
     streams = workspace.problem.streams
     n_poses = len(streams)
+    plain = replace(
+        start,
+        poses=bridged(streams, start.T, outliers.spikes),
+        error=np.zeros((n_poses, 6)),
+        outliers=outliers,
+        weights=np.ones(n_poses),
+        has_heavy_tails=False,
+    )
     fits = []
     for centre in CENTRES:
-        plain = replace(
-            start,
-            poses=bridged(streams, start.T, outliers.spikes),
-            error=np.zeros((n_poses, 6)),
-            model=replace(start.model, slow=(), centre=centre),
-            outliers=outliers,
-            weights=np.ones(n_poses),
-            has_heavy_tails=False,
-        )
+        model = replace(start.model, slow=(), centre=centre)
         with suppress(np.linalg.LinAlgError):
-            fits.append(stages.noise(workspace, plain))
+            fits.append(stages.noise(workspace, replace(plain, model=model)))
     if not fits:
         raise np.linalg.LinAlgError("no noise model fits these poses")
     best = min(fits, key=lambda fit: _loss(workspace, fit))

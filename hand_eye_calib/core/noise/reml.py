@@ -1,13 +1,20 @@
 """Noise levels by restricted maximum likelihood (REML).
 
-The derivatives are exact. They need only the blocks of the states' covariance on the diagonal and
-beside it. The curvature is the average of observed and expected information (Gilmour, Thompson,
-Cullis, Biometrics 51, 1995), ``1/2 f_k' P f_l`` with ``f_k = dV/dlevel_k P r``.
+The loss of levels theta, which are logarithms, is the restricted negative log likelihood of the
+residuals r under their covariance V (Patterson, Thompson, Biometrika 58, 1971):
+
+    loss = 1/2 (log|V| + r'P r + log|J'V^-1 J|),    P = V^-1 - V^-1 J (J'V^-1 J)^-1 J'V^-1
+    d loss / d theta_k = 1/2 (tr(P V_k) - r'P V_k P r),    V_k = dV / d theta_k
+
+The gradient is exact; it needs only the blocks of the states' covariance on the diagonal and beside
+it. The curvature is the average of observed and expected information (Gilmour, Thompson, Cullis,
+Biometrics 51, 1995): ``1/2 f_k' P f_l`` with ``f_k = V_k P r``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -15,11 +22,17 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.noise.normal import multiplied, transposed
 from hand_eye_calib.core.noise.state_space import WHITE, Markov, Posterior, StateSpace
-from hand_eye_calib.core.noise.tuning import Tuning
 
-# Steps of levels shorter than this end a search; so does this number of steps.
-_SHORTEST_STEP = 1e-3
+# Largest number of steps, and the shortest step of a log level.
 _MAX_STEPS = 20
+_SHORTEST_STEP = 1e-3
+
+# First and largest radius of a step of a log level.
+_FIRST_RADIUS = 1.5
+_LARGEST_RADIUS = 3.0
+
+# Information added to every level. It bounds the step along levels that do not matter.
+_ADDED_CURVATURE = 0.05
 
 
 class Prior(NamedTuple):
@@ -31,23 +44,30 @@ class Prior(NamedTuple):
     upper: FloatArray
 
     def loss(self, levels: FloatArray) -> float:
-        """Negative log density, constants left out."""
+        """Negative log density without constants."""
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
 
 # Space, levels and prior without processes that do not matter; None if all matter.
-Rest: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
+Reduced: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
+
+
+class _Move(NamedTuple):
+    """A step that lowers the loss: the posterior there, the gain, and the radius of the next."""
+
+    posterior: Posterior
+    gain: float
+    radius: float
 
 
 def fit(
     space: StateSpace,
     start: FloatArray,
     prior: Prior,
-    tuning: Tuning,
-    settled: float | None = None,
-    smaller: Callable[[FloatArray, FloatArray], Rest] | None = None,
+    settled_loss: float,
+    reduce: Callable[[FloatArray, FloatArray], Reduced] | None = None,
 ) -> tuple[Posterior, FloatArray]:
-    """Minimise the loss over the levels by Newton steps within a radius.
+    """Minimise the loss over the levels by Newton steps within a trust region.
 
     Parameters
     ----------
@@ -55,63 +75,80 @@ def fit(
     start : (m,) array
         Levels at the start.
     prior : Prior
-    tuning : Tuning
-    settled : float, optional
-        Steps end if one promises to lower the loss by less. Default: the tuning's.
-    smaller : callable, optional
+    settled_loss : float
+        The search ends if a step promises to lower the loss by less.
+    reduce : callable, optional
         Called with levels and information before each step. Returns the space, levels and prior
         without processes that do not matter, or None if all matter.
 
     Returns
     -------
     Posterior
-        At the levels of the least loss.
+        At the best levels.
     (m, m) array
         Average information on the levels.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the covariance at the start is not positive definite to rounding.
     """
-    settled = tuning.settled_loss if settled is None else settled
-    levels = np.clip(start, prior.lower, prior.upper)
-    posterior = Posterior(space, levels)
-    radius = tuning.first_radius
-    loss = posterior.loss + prior.loss(levels)
+    posterior = Posterior(space, np.clip(start, prior.lower, prior.upper))
+    loss = posterior.loss + prior.loss(posterior.levels)
+    radius = _FIRST_RADIUS
     for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
-        rest = smaller(levels, information) if smaller else None
-        if rest:
-            space, levels, prior = rest
+        reduced = reduce(posterior.levels, information) if reduce else None
+        if reduced:
+            space, levels, prior = reduced
             posterior = Posterior(space, levels)
             loss = posterior.loss + prior.loss(levels)
             gradient, information = derivatives(posterior)
-        gradient = gradient + prior.precision * (levels - prior.mean)
-        curvature = information + np.diag(prior.precision + tuning.least_curvature)
-        gain = 0.0
-        while radius > _SHORTEST_STEP:
-            step, is_newton = _step(levels, gradient, curvature, prior, radius)
-            promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
-            is_small = is_newton and promised < settled
-            if is_small or np.abs(step).max() < _SHORTEST_STEP:
-                break
-            try:
-                rival = Posterior(space, levels + step)
-                gain = loss - (rival.loss + prior.loss(rival.levels))
-            except np.linalg.LinAlgError:
-                gain = 0.0
-            if gain > 0.0:
-                break
-            radius = tuning.shrink * float(np.abs(step).max())
-            gain = 0.0
-        if gain == 0.0:
+        gradient = gradient + prior.precision * (posterior.levels - prior.mean)
+        curvature = information + np.diag(prior.precision + _ADDED_CURVATURE)
+        move = _move(posterior, loss, gradient, curvature, prior, radius, settled_loss)
+        if move is None:
             break
-        levels = rival.levels
-        posterior = rival
-        loss = loss - gain
-        if gain > tuning.good * promised:
-            radius = min(2.0 * radius, tuning.largest_radius)
-        elif gain < tuning.poor * promised:
-            radius = 0.5 * float(np.abs(step).max())
-        if gain < 0.5 * settled:
+        posterior = move.posterior
+        radius = move.radius
+        loss = loss - move.gain
+        if move.gain < 0.5 * settled_loss:
             break
     return posterior, information
+
+
+def _move(
+    posterior: Posterior,
+    loss: float,
+    gradient: FloatArray,
+    curvature: FloatArray,
+    prior: Prior,
+    radius: float,
+    settled_loss: float,
+) -> _Move | None:
+    """Return a step that lowers the loss; None if no step promises to lower it enough.
+
+    The radius follows the usual rules of a trust region: it grows after a step that keeps half of
+    what it promised, and shrinks after one that keeps a fifth or less, or that raises the loss.
+    """
+    while radius > _SHORTEST_STEP:
+        step, is_newton = _step(posterior.levels, gradient, curvature, prior, radius)
+        length = float(np.abs(step).max())
+        promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
+        if length < _SHORTEST_STEP or (is_newton and promised < settled_loss):
+            return None
+        gain = 0.0
+        with suppress(np.linalg.LinAlgError):
+            rival = Posterior(posterior.space, posterior.levels + step)
+            gain = loss - (rival.loss + prior.loss(rival.levels))
+        if gain > 0.0:
+            if gain > 0.5 * promised:
+                radius = min(2.0 * radius, _LARGEST_RADIUS)
+            elif gain < 0.2 * promised:
+                radius = 0.5 * length
+            return _Move(rival, gain, radius)
+        radius = 0.3 * length
+    return None
 
 
 def _step(
@@ -124,98 +161,99 @@ def _step(
     free = (levels > prior.lower + 1e-9) | (gradient < 0)
     free &= (levels < prior.upper - 1e-9) | (gradient > 0)
     step = np.zeros(len(levels))
-    damping = 0.0
     values, vectors = np.linalg.eigh(curvature[np.ix_(free, free)])
     along = vectors.T @ gradient[free]
-    least = 0.05 * max(float(np.abs(gradient[free]).max(initial=0.0)) / radius, 1e-3)
+    steepest = float(np.abs(gradient[free]).max(initial=0.0))
+    smallest_damping = 0.05 * max(steepest / radius, 1e-3)
+    damping = 0.0
     while True:
         step[free] = -vectors @ (along / (values + damping))
         if np.abs(step).max() <= radius:
             break
-        damping = max(2.0 * damping, least)
+        damping = max(2.0 * damping, smallest_damping)
     return np.clip(levels + step, prior.lower, prior.upper) - levels, damping == 0.0
 
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-    """Gradient (m,) of the loss by the log levels and the average information (m, m)."""
+    """Return the gradient (m,) of the loss by the log levels and the average information (m, m).
+
+    With S^-1 the precision of errors that have covariance S, and M the second moments of their
+    smoothed values, the derivative by the level of a basis is
+    ``1/2 exp(level) tr((S^-1 - S^-1 M S^-1) basis)``.
+    """
     space = posterior.space
-    precision = posterior.white
-    states, walk = posterior.restricted()
+    states, walk = posterior.smoothed()
     white = states[:, :WHITE]
     moments = white @ transposed(white)
     moments += posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
     moments *= space.weights[:, None, None]
+    precision = posterior.white_precision
     excess = precision - precision @ moments @ precision
     excess[space.weights == 0.0] = 0.0
-    traces = [float((excess * basis).sum()) for basis in space.white]
+    traces = [float((excess * basis).sum()) for basis in space.white_bases]
     along = (excess @ space.twists[:, :, None])[:, :, 0]
     traces.append(float((along * space.twists).sum()))
-    moments = walk_covariance(posterior) + walk @ transposed(walk)
+    moments = posterior.walk_covariances() + walk @ transposed(walk)
     total = np.tensordot(posterior.evidence, moments, axes=1)
-    excess = (~space.cut).sum() * posterior.walk - posterior.walk @ total @ posterior.walk
-    traces += [float((excess * basis).sum()) for basis in space.walk]
+    precision = posterior.walk_precision
+    excess = (~space.cut).sum() * precision - precision @ total @ precision
+    traces += [float((excess * basis).sum()) for basis in space.walk_bases]
     gradient = [0.5 * np.exp(posterior.levels[: len(traces)]) * traces]
-    gradient += [_markov_gradient(posterior, process, states) for process in posterior.markov]
+    gradient += [_group_gradient(posterior, group, states) for group in posterior.groups]
     information = _average_information(posterior, states[:, :, 0], walk[:, :, 0])
     return np.concatenate(gradient), information
 
 
-def walk_covariance(posterior: Posterior) -> FloatArray:
-    """Covariance (n, 6, 6) of the walk's increments for known parameters."""
+def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:
+    """Derivatives (2,) of the loss by the log variance and the log time constant of a group."""
+    phi = group.phi
+    rest = group.rest
     covariance, below = posterior.factor.selected_inverse
-    space = posterior.space
-    back = transposed(posterior.space.behind)
-    half = space.ahead_times(covariance[1:])
-    own = space.ahead_times(transposed(half)) + transposed(back) @ covariance[:-1] @ back
-    mixed = space.ahead_times(below) @ back
-    own -= mixed
-    own -= transposed(mixed)
-    return own
-
-
-def _markov_gradient(posterior: Posterior, process: Markov, states: FloatArray) -> FloatArray:
-    phi = process.phi
-    rest = process.rest
-    group = process.states
-    covariance, below = posterior.factor.selected_inverse
-    own = states[:, group]
-    here = np.einsum("nii->n", covariance[:, group, group]) + np.einsum("nij,nij->n", own, own)
-    ahead = np.einsum("nii->n", below[:, group, group])
-    ahead += np.einsum("nij,nij->n", own[1:], own[:-1])
-    innovations = here[1:] - 2.0 * phi * ahead + phi**2 * here[:-1]
-    size = own.shape[1]
-    variance = process.variance
-    total = here[0] + float((innovations / rest).sum())
-    by_variance = 0.5 * (size * len(here) - total / variance)
-    by_phi = (phi * innovations / rest**2 - (ahead - phi * here[:-1]) / rest) / variance
+    values = states[:, group.states]
+    size = values.shape[1]
+    # Expected squares of each pose, and products of each pose with the pose before.
+    squares = np.einsum("nii->n", covariance[:, group.states, group.states])
+    squares += np.einsum("nij,nij->n", values, values)
+    products = np.einsum("nii->n", below[:, group.states, group.states])
+    products += np.einsum("nij,nij->n", values[1:], values[:-1])
+    innovations = squares[1:] - 2.0 * phi * products + phi**2 * squares[:-1]
+    total = squares[0] + float((innovations / rest).sum())
+    by_variance = 0.5 * (size * len(squares) - total / group.variance)
+    by_phi = phi * innovations / rest**2 - (products - phi * squares[:-1]) / rest
+    by_phi /= group.variance
     by_phi -= size * phi / rest
-    return np.array([by_variance, float((by_phi * process.slope).sum())])
+    return np.array([by_variance, float((by_phi * group.slope).sum())])
 
 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
+    """Average information (m, m) at the smoothed states (N, d) and walk (n, 6)."""
     space = posterior.space
     variances = np.exp(posterior.levels)
-    n_white = len(space.white)
+    n_white = len(space.white_bases)
+    # f_k through the states: their covariance's derivative times the forces on them.
     moved = np.zeros((*states.shape, len(variances)))
-    pulled = (posterior.white @ states[:, :WHITE, None])[:, :, 0]
-    pulled[space.weights == 0.0] = 0.0
-    for index, basis in enumerate(space.white):
-        moved[:, :WHITE, index] = variances[index] * (basis @ pulled[:, :, None])[:, :, 0]
-    along = variances[n_white] * (space.twists * pulled).sum(axis=1)
+    forces = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
+    forces[space.weights == 0.0] = 0.0
+    for level, basis in enumerate(space.white_bases):
+        moved[:, :WHITE, level] = variances[level] * (basis @ forces[:, :, None])[:, :, 0]
+    along = variances[n_white] * (space.twists * forces).sum(axis=1)
     moved[:, :WHITE, n_white] = along[:, None] * space.twists
-    for at, process in enumerate(posterior.markov):
-        level = n_white + 1 + len(space.walk) + 2 * at
-        values = states[:, process.states]
-        moved[:, process.states, level] = values
-        moved[:, process.states, level + 1] = process.by_tau(values)
-    columns = space.observed(moved)
-    pushed = walk @ posterior.walk
-    for index, basis in enumerate(space.walk, start=n_white + 1):
-        columns[:, :, index] = variances[index] * pushed @ basis
+    first_of_groups = n_white + 1 + len(space.walk_bases)
+    for level, group in zip(
+        range(first_of_groups, len(variances), 2), posterior.groups, strict=True
+    ):
+        values = states[:, group.states]
+        moved[:, group.states, level] = values
+        moved[:, group.states, level + 1] = group.derivative_by_log_tau(values)
+    columns = space.apply_u(moved)
+    # f_k of the walk, which acts on the increments directly.
+    forces = walk @ posterior.walk_precision
+    for level, basis in enumerate(space.walk_bases, start=n_white + 1):
+        columns[:, :, level] = variances[level] * forces @ basis
     columns[space.cut] = 0.0
-    weighed, whitened = posterior.halves(columns)
-    own = multiplied(columns, weighed) - multiplied(whitened, whitened)
-    shared = multiplied(space.columns, weighed) - multiplied(posterior.whitened, whitened)
+    weighted, whitened = posterior.forward_half(columns)
+    own = multiplied(columns, weighted) - multiplied(whitened, whitened)
+    shared = multiplied(space.columns, weighted) - multiplied(posterior.whitened, whitened)
     shared = shared[:-1]
     information = 0.5 * (own - shared.T @ posterior.normal.covariance @ shared)
     return 0.5 * (information + information.T)

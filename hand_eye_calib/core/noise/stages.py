@@ -1,22 +1,23 @@
 """Stages of the adaptive search, in order.
 
 A :class:`Problem` holds the data and never changes. A :class:`Fit` is a state of the search: X, the
-noise model, outliers and systematic errors; it never changes either. A :class:`Workspace` keeps the
-factorisation for the last fit. :func:`start` makes the first fit; each stage takes a workspace and
-a fit, and returns another fit. Noise levels come before outliers, which need them; time-correlated
-errors are searched for without outliers; systematic errors are chosen under the noise model.
+noise model, outliers and systematic errors; a fit never changes either. A :class:`Workspace` keeps
+the factorisation for the last fit. :func:`start` makes the first fit. Each stage takes a workspace
+and a fit, and returns another fit. The order has reasons: outliers need noise levels,
+time-correlated errors must not explain outliers, and systematic errors need the noise model.
+docs/adaptive.md describes each stage.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import compress
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import reml
@@ -35,11 +36,9 @@ from hand_eye_calib.core.noise.noise_model import (
     LASTING,
     LOWEST_VARIANCE,
     N_FAST,
+    PARTS,
     ROTATION,
-    TRANSLATION,
     VARIANCES,
-    WALK_ROTATION,
-    WALK_TRANSLATION,
     WALKS,
     WHITES,
     NoiseModel,
@@ -59,11 +58,11 @@ from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.registry import Method
 
-# No lever arm is that long (m).
+# Longest step of the translation of X (m). No lever arm is that long.
 _LONGEST_STEP_M = 1000.0
 
-# Steps of X below this (m, rad) are rounding.
-_SETTLED_STEP = 1e-9
+# Longest step of X (m, rad) that is rounding.
+_ROUNDING_STEP = 1e-9
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,10 @@ class Problem:
     ----------
     streams : Streams
     columns : list of int
-        Parameters of the systematic errors in the model.
+        Parameters of the systematic errors in the model, see
+        :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     is_clock_free : bool
-        Whether the time offset is not known beforehand.
+        Whether the time offset was estimated from the same poses.
     without : frozenset of str
         Names of the stages to leave out.
     tuning : Tuning
@@ -88,40 +88,30 @@ class Problem:
     without: frozenset[str] = frozenset()
     tuning: Tuning = TUNING
 
-    def known(self, fit: Fit) -> FloatArray:
+    def prior(self, fit: Fit) -> FloatArray:
         """Products (p + 1, p + 1) of the prior of the parameters."""
         values = fit.parameters[self.columns]
-        weights = fit.sigmas[self.columns] ** -2.0
-        return known_products(range(6, 6 + len(values)), values, weights, 7 + len(values))
+        return prior_products(values, fit.sigmas[self.columns], 7 + len(values))
 
-    def space(
-        self, fit: Fit, kept: IntArray | None = None, model: NoiseModel | None = None
-    ) -> StateSpace:
-        """State space of all or some of the poses, with a model other than that of the fit."""
-        poses = fit.poses
-        course = fit.course
-        error = fit.error
-        weights = fit.weights
-        outliers = fit.outliers
+    def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
+        """State space of all poses, or of some."""
         if kept is not None:
-            poses = poses[kept]
-            course = course[kept]
-            error = error[kept]
-            weights = weights[kept]
-            outliers = outliers.across(kept, self.tuning.longest_gap)
-        known = error if error.any() else None
-        return (model or fit.model).state_space(
-            poses,
-            linearise(poses, course, fit.T, fit.parameters, self.columns, known),
-            course.twists,
+            fit = fit.at_poses(kept, self.tuning.longest_gap)
+        linearisation = linearise(
+            fit.poses, fit.course, fit.T, fit.parameters, self.columns, fit.error
+        )
+        return fit.model.state_space(
+            fit.poses,
+            linearisation,
+            fit.course.twists,
             fit.T,
-            np.where(outliers.spikes, 0.0, weights),
-            outliers.jumps,
-            self.known(fit),
+            np.where(fit.outliers.spikes, 0.0, fit.weights),
+            fit.outliers.jumps,
+            self.prior(fit),
         )
 
     def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
-        """Course of the given poses, steps smoothed as far as noise of these levels asks for."""
+        """Course of the streams, smoothed as far as noise of these levels requires."""
         noise_m = float(np.exp(0.5 * whole(levels)[0]))
         return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
 
@@ -132,7 +122,7 @@ class Problem:
 
 
 class Workspace:
-    """What is computed for a problem and kept: the factorisation for the last fit.
+    """A problem, and the factorisation for the last fit.
 
     Attributes
     ----------
@@ -141,7 +131,7 @@ class Workspace:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        # One alone: a posterior of all poses is large.
+        # Only of the last fit: a posterior of all poses is large.
         self._fit: Fit | None = None
         self._posterior: Posterior | None = None
 
@@ -164,15 +154,16 @@ class Fit:
     poses : Streams
         Without the errors estimated so far, outlier poses bridged.
     error : (N, 6) array
-        The errors taken out of the poses.
+        Errors c that were taken out of the poses.
     course : Course
     T : (4, 4) array
         X.
-    model, levels
-        Noise model and its log levels.
+    model : NoiseModel
+    levels : (m,) array
+        Log levels of the model.
     outliers : Outliers
     weights : (N,) array
-        Of white errors; other than 1 where tails are heavy.
+        Of white errors; other than 1 if tails are heavy.
     sigmas : (8,) array
         Prior standard deviations of systematic errors.
     has_heavy_tails : bool
@@ -192,60 +183,79 @@ class Fit:
     has_heavy_tails: bool = False
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
 
+    def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
+        """Return the fit of a subset of poses, see :meth:`Outliers.across`."""
+        return replace(
+            self,
+            poses=self.poses[kept],
+            error=self.error[kept],
+            course=self.course[kept],
+            outliers=self.outliers.across(kept, longest_gap),
+            weights=self.weights[kept],
+        )
+
     def moved(self, step: FloatArray, columns: list[int]) -> Fit:
         """Return the fit after a step of xi and of the parameters of some columns.
 
         X stays if the step is longer than any lever arm: noise along a direction that the motion
-        hardly shows.
+        hardly excites.
         """
-        is_long = np.linalg.norm(step[:3]) >= _LONGEST_STEP_M
         parameters = self.parameters.copy()
         parameters[columns] += step[6:]
-        T = self.T if is_long else self.T @ se3.exp(step[:6])
-        return replace(self, T=T, parameters=parameters)
+        if np.linalg.norm(step[:3]) >= _LONGEST_STEP_M:
+            return replace(self, parameters=parameters)
+        return replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
 
-    def freed(self, streams: Streams, states: FloatArray) -> Fit:
-        """Return the fit with the errors of latent states (N, d) taken out of the given poses.
+    def corrected(self, streams: Streams, states: FloatArray) -> Fit:
+        """Return the fit with the errors of states (N, d) taken out of the given poses.
 
         White errors are split between the sensors by their covariances, which holds for errors of
         these covariances only. A lasting error of some centimetres beside white noise of a
-        millimetre would be taken for large and opposite rotations, so other errors are split in
-        halves; outlier poses, too.
+        millimetre would become large and opposite rotations. So other errors are split in halves,
+        and those of outlier poses, too.
         """
         spikes = self.outliers.spikes
         T = self.T
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
         error = states[:, :WHITE] + self.model.lasting(states, self.poses, T)
         other_error = error - white_error
-        of_white = se3.times(self.model.shares(self.levels, self.poses, T), white_error)
-        by_parent = of_white + 0.5 * other_error
-        by_child = of_white - white_error - 0.5 * other_error
-        given = bridged(streams, T, spikes)
+        shares = self.model.shares(self.levels, self.poses, T)
+        white_of_parent = se3.times(shares, white_error)
+        of_parent = white_of_parent + 0.5 * other_error
+        of_child = white_of_parent - white_error - 0.5 * other_error
+        measured = bridged(streams, T, spikes)
         poses = Streams(
             streams.stamps_s,
-            given.Ts_pw_p @ se3.exp(-by_parent @ se3.adjoint(T).T),
-            given.Ts_cw_c @ se3.exp(-by_child),
+            measured.Ts_pw_p @ se3.exp(-of_parent @ se3.adjoint(T).T),
+            measured.Ts_cw_c @ se3.exp(-of_child),
         )
         return replace(self, poses=poses, error=error)
 
 
-def known_products(
-    at: Sequence[int], values: FloatArray, weights: FloatArray, size: int
-) -> FloatArray:
-    """Products (size, size) of a prior: parameters at some indices are zero.
+def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatArray:
+    """Products (size, size) of a prior: parameters are zero with some standard deviations.
 
-    ``values`` are the present values of these parameters, ``weights`` the precisions of the prior.
+    Parameters
+    ----------
+    values : (k,) array
+        Present values of the last k parameters.
+    sigmas : (k,) array
+        Prior standard deviations.
+    size : int
+        Number of all parameters, plus 1 for the residuals.
     """
     products = np.zeros((size, size))
-    indices = list(at)
+    indices = np.arange(size - 1 - len(values), size - 1)
+    weights = sigmas**-2.0
     products[indices, indices] = weights
-    products[indices, -1] = products[-1, indices] = weights * values
+    products[indices, -1] = weights * values
+    products[-1, indices] = weights * values
     products[-1, -1] = weights @ values**2
     return products
 
 
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
-    """Poses to fit noise levels with: evenly spread bursts. None for all poses."""
+    """Return poses to fit noise levels with: evenly spread bursts. None means all poses."""
     most = tuning.most_poses
     if n_poses <= most:
         return None
@@ -262,19 +272,19 @@ def start(problem: Problem) -> Fit:
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
-    residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ()).columns[:, :, -1]
+    residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ()).residuals
     outliers = first_outliers(streams, course, T, residuals, tuning)
     interval_s = median(np.diff(streams.stamps_s))
     duration_s = float(np.ptp(streams.stamps_s))
     centre = _centre(streams, T, residuals, tuning.decisive_centre)
-    beside = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
+    left_out = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
         poses=bridged(streams, T, outliers.spikes),
         error=np.zeros((len(streams), 6)),
         course=course,
         T=T,
         model=NoiseModel((), centre, interval_s, duration_s, tuning),
-        levels=rough_levels(residuals, beside, tuning),
+        levels=rough_levels(residuals, left_out, tuning),
         outliers=outliers,
         weights=np.ones(len(streams)),
         sigmas=np.array(tuning.first_sizes),
@@ -282,46 +292,52 @@ def start(problem: Problem) -> Fit:
 
 
 def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: float) -> str:
-    """Centre of white rotation noise, see ``noise_model.CENTRES``."""
+    """Centre of white rotation noise, see :data:`~hand_eye_calib.core.noise.noise_model.CENTRES`.
+
+    It is the origin of a world if residuals there are clearly smaller.
+    """
     worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
     sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
     for centre, poses in worlds.items():
         to_origin = se3.inverse(poses)[:, :3, 3]
-        there = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
-        sizes[centre] = median(np.linalg.norm(there, axis=1))
+        at_origin = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
+        sizes[centre] = median(np.linalg.norm(at_origin, axis=1))
     best = min(CENTRES, key=lambda centre: sizes[centre])
     return best if sizes[best] < decisive * sizes["sensors"] else "sensors"
 
 
-def rough_levels(residuals: FloatArray, left_out: np.ndarray, tuning: Tuning) -> FloatArray:
-    """Log levels (5,) to start at, from scatter and correlation.
+def rough_levels(residuals: FloatArray, left_out: BoolArray, tuning: Tuning) -> FloatArray:
+    """Return log levels (5,) to start at, from scatter and correlation of residuals (n, 6).
 
     Differences of white noise have variance 2 s^2 and a covariance of -s^2 with their neighbours;
-    the walk adds variance alone.
+    the walk adds only variance.
     """
     kept = ~left_out
-    together = kept[1:] & kept[:-1]
+    are_neighbours = kept[1:] & kept[:-1]
     levels = np.full(N_FAST, tuning.jitter)
-    least = LOWEST_VARIANCE
-    at = (TRANSLATION, WALK_TRANSLATION), (ROTATION, WALK_ROTATION)
-    for (of_white, of_walk), of_part in zip(at, np.split(residuals, 2, axis=1), strict=True):
-        total = np.mean(of_part[kept] ** 2) if kept.any() else least
-        total = max(float(total), 100 * least)
-        products = of_part[1:][together] * of_part[:-1][together]
-        neighbours = np.mean(products) if together.any() else -total / 2
-        white = float(np.clip(-neighbours, *np.multiply(tuning.first_white, total)))
-        levels[of_white] = np.log(white)
-        levels[of_walk] = np.log(max(total - 2 * white, tuning.first_walk * total))
+    whites = levels[WHITES]
+    walks = levels[WALKS]
+    for at, rows in enumerate(PARTS.values()):
+        values = residuals[:, rows]
+        total = np.mean(values[kept] ** 2) if kept.any() else LOWEST_VARIANCE
+        total = max(float(total), 100 * LOWEST_VARIANCE)
+        covariance = -total / 2
+        if are_neighbours.any():
+            products = values[1:][are_neighbours] * values[:-1][are_neighbours]
+            covariance = float(np.mean(products))
+        white = float(np.clip(-covariance, *np.multiply(tuning.first_white, total)))
+        whites[at] = np.log(white)
+        walks[at] = np.log(max(total - 2 * white, tuning.first_walk * total))
     return levels
 
 
 def noise(workspace: Workspace, fit: Fit) -> Fit:
     """Fit the levels of white noise and walk, then take one step of X."""
     problem = workspace.problem
-    kept = sample(len(problem.streams), problem.tuning)
-    space = problem.space(fit, kept)
+    tuning = problem.tuning
+    space = problem.space(fit, sample(len(problem.streams), tuning))
     prior = fit.model.prior(fit.levels)
-    fitted, _ = reml.fit(space, fit.levels, prior, problem.tuning)
+    fitted, _ = reml.fit(space, fit.levels, prior, tuning.settled_loss)
     xi_and_residual = [*range(6), -1]
     products_of_xi = fitted.products[np.ix_(xi_and_residual, xi_and_residual)]
     moved = fit.moved(NormalEquations(products_of_xi).step, [])
@@ -336,12 +352,12 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
     searched = _with_outliers(workspace, fit, tuning.outlier_rounds)
     if searched.outliers.differs_by(fit.outliers) > tuning.negligible:
         searched = _with_outliers(workspace, noise(workspace, searched), 1)
-    if np.mean(searched.outliers.spikes) > tuning.most_spikes:
-        # Whole stretches are noisy, no single pose is wrong: all get less weight, none is left out.
-        no_spikes = np.zeros_like(searched.outliers.spikes)
+    spikes = searched.outliers.spikes
+    if np.mean(spikes) > tuning.most_spikes:
+        # Whole stretches are noisy, and no single pose is wrong. All poses get less weight instead.
         searched = replace(
             searched,
-            outliers=Outliers(searched.outliers.jumps, no_spikes),
+            outliers=Outliers(searched.outliers.jumps, np.zeros_like(spikes)),
             poses=problem.streams,
             has_heavy_tails=True,
         )
@@ -358,7 +374,7 @@ def _with_outliers(workspace: Workspace, fit: Fit, rounds: int, with_spikes: boo
     for _ in range(rounds):
         if problem.is_noisy(fit):
             posterior = workspace.posterior(fit)
-            fit = fit.freed(problem.streams, posterior.states_after(posterior.normal.step))
+            fit = fit.corrected(problem.streams, posterior.states_after(posterior.normal.step))
         of_walk, of_white = innovations(workspace.posterior(fit), fit.outliers.spikes)
         detected = judged(fit.outliers, of_walk, of_white, tuning, with_spikes)
         change = detected.differs_by(fit.outliers)
@@ -389,7 +405,10 @@ def tails(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def lasting(workspace: Workspace, fit: Fit) -> Fit:
-    """Add time-correlated errors to the model if the data ask for them."""
+    """Add time-correlated errors to the model if the data ask for them.
+
+    The search begins with all processes, and drops a process once it makes no difference.
+    """
     problem = workspace.problem
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning)
@@ -399,84 +418,64 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
     levels[WHITES] = np.maximum(levels[WHITES], total + np.log(tuning.audible))
     levels[WALKS] = np.maximum(levels[WALKS], total + np.log(tuning.audible_walk))
     model, levels = fit.model.with_lasting(LASTING, levels)
-    # Biases are free here: a bias would be taken for drift and never be found.
-    free = replace(fit, sigmas=np.array(tuning.sizes))
+    # Large biases are possible here. Otherwise a bias would become drift and never be found.
+    free = replace(fit, sigmas=np.array(tuning.sizes), model=model)
     prior = model.prior(levels)
     faint_levels = levels - tuning.faded
 
-    def without_faint(levels: FloatArray, information: FloatArray) -> reml.Rest:
+    def without_faint(levels: FloatArray, information: FloatArray) -> reml.Reduced:
         """Drop processes below their faint level that make no difference."""
-        nonlocal model, prior, faint_levels
+        nonlocal free, prior, faint_levels
         matters = np.diag(information)[VARIANCES] > tuning.least_information
         matters |= (levels >= faint_levels)[VARIANCES]
         if matters.all():
             return None
         is_kept = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
-        model = replace(model, slow=tuple(compress(model.slow, matters)))
-        faint_levels = faint_levels[is_kept]
+        slow = tuple(compress(free.model.slow, matters))
+        free = replace(free, model=replace(free.model, slow=slow))
         prior = reml.Prior(*np.array(prior)[:, is_kept])
-        return problem.space(free, kept, model), levels[is_kept], prior
+        faint_levels = faint_levels[is_kept]
+        return problem.space(free, kept), levels[is_kept], prior
 
     settled_loss = tuning.settled_loss * len(levels)
-    space = problem.space(free, kept, model)
-    fitted, information = reml.fit(space, levels, prior, tuning, settled_loss, without_faint)
-    before = Posterior(problem.space(free, kept), fit.levels)
-    if before.loss - fitted.loss < tuning.least_gain:
+    space = problem.space(free, kept)
+    fitted, information = reml.fit(space, levels, prior, settled_loss, without_faint)
+    before = replace(free, model=fit.model)
+    loss_before = Posterior(problem.space(before, kept), fit.levels).loss
+    if loss_before - fitted.loss < tuning.least_gain:
         return fit
+    # The search has ended: the level of a process no longer counts.
     faint_levels = np.full(len(fitted.levels), np.inf)
-    rest = without_faint(fitted.levels, information)
-    return replace(fit, model=model, levels=rest[1] if rest else fitted.levels)
+    reduced = without_faint(fitted.levels, information)
+    levels = reduced[1] if reduced else fitted.levels
+    return replace(fit, model=free.model, levels=levels)
 
 
 class _Hypothesis(NamedTuple):
-    """Systematic errors that may be there: the loss with them, and the step that they make."""
+    """Systematic errors that may be present: the fit, its solution and its loss."""
 
-    loss: float
     fit: Fit
     normal: NormalEquations
+    loss: float
 
 
 def systematic(workspace: Workspace, fit: Fit) -> Fit:
-    """Choose the likeliest systematic errors, then take a step of X and of these.
+    """Choose the likeliest systematic errors, then take a step of X and of their parameters.
 
     The child's path has a scale, or a bias along one of its axes, or neither. The step is taken at
-    poses freed of their errors.
+    poses without their errors.
     """
     problem = workspace.problem
     tuning = problem.tuning
-    columns = problem.columns
     posterior = workspace.posterior(fit)
-    products = posterior.products - problem.known(fit)
-    log_odds = np.log(tuning.odds)
-    choices_of_time = [[], [TIME]] if TIME in columns else [[]]
-    if problem.is_clock_free:
-        # A time offset that is not known beforehand is there.
-        choices_of_time = choices_of_time[-1:]
-    # The levels may be those of other systematic errors: they are known as by so much evidence.
-    n_rows = 6.0 * len(problem.streams)
-
-    def likeliest(path_columns: list[int]) -> _Hypothesis:
-        """Return the likelier hypothesis: these errors of the path with or without an offset."""
-        hypotheses = []
-        for time_columns in choices_of_time:
-            present = path_columns + time_columns
-            is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
-            rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.none))
-            normal = NormalEquations(products + problem.known(rival))
-            loss = 2.0 * n_rows * np.log1p(max(float(normal.cost), 0.0) / n_rows)
-            loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
-            loss -= 2.0 * log_odds * len(present)
-            hypotheses.append(_Hypothesis(loss, rival, normal))
-        return min(hypotheses, key=lambda hypothesis: hypothesis.loss)
-
-    plain = likeliest([])
+    plain = _likeliest(problem, fit, posterior, [])
     plain_information = np.linalg.pinv(plain.normal.covariance[:6, :6], hermitian=True)
     best = plain
     largest_gain = 0.0
-    for column in columns:
+    for column in problem.columns:
         if column >= TIME:
             continue
-        rival = likeliest([column])
+        rival = _likeliest(problem, fit, posterior, [column])
         gain = plain.loss - rival.loss
         if column != SCALE:
             gain *= tuning.like_scale
@@ -486,13 +485,43 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
             best = rival
             largest_gain = gain
     step = best.normal.step
-    moved = best.fit.moved(step, columns)
+    moved = best.fit.moved(step, problem.columns)
     moved = replace(moved, course=problem.course(moved.T, fit.levels))
-    return moved.freed(problem.streams, posterior.states_after(step))
+    return moved.corrected(problem.streams, posterior.states_after(step))
+
+
+def _likeliest(
+    problem: Problem, fit: Fit, posterior: Posterior, path_columns: list[int]
+) -> _Hypothesis:
+    """Return the likelier hypothesis: errors of the path with or without a time offset.
+
+    The loss is minus twice the log evidence. The noise levels may be those of other systematic
+    errors, so a common factor of all variances is integrated out: its prior counts as much as all
+    residuals, and makes the evidence one of Student's t distribution.
+    """
+    tuning = problem.tuning
+    choices_of_time = [[], [TIME]] if TIME in problem.columns else [[]]
+    if problem.is_clock_free:
+        # A time offset that is not known beforehand is present.
+        choices_of_time = choices_of_time[-1:]
+    products = posterior.products - problem.prior(fit)
+    log_odds = np.log(tuning.odds)
+    n_rows = 6.0 * len(problem.streams)
+    hypotheses = []
+    for time_columns in choices_of_time:
+        present = path_columns + time_columns
+        is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
+        rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.none))
+        normal = NormalEquations(products + problem.prior(rival))
+        loss = 2.0 * n_rows * np.log1p(max(float(normal.cost), 0.0) / n_rows)
+        loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
+        loss -= 2.0 * log_odds * len(present)
+        hypotheses.append(_Hypothesis(rival, normal, loss))
+    return min(hypotheses, key=lambda hypothesis: hypothesis.loss)
 
 
 def polish(workspace: Workspace, fit: Fit) -> Fit:
-    """Follow X to the end, with derivatives at poses freed of their errors."""
+    """Follow X until it settles, with derivatives at poses without their errors."""
     problem = workspace.problem
     for _ in range(problem.tuning.max_rounds - 1):
         posterior = workspace.posterior(fit)
@@ -502,23 +531,25 @@ def polish(workspace: Workspace, fit: Fit) -> Fit:
             fit = replace(fit, weights=tail_weights(posterior, problem.tuning))
         step = posterior.normal.step
         moved = fit.moved(step, problem.columns)
-        fit = moved.freed(problem.streams, posterior.states_after(step))
+        fit = moved.corrected(problem.streams, posterior.states_after(step))
     return fit
 
 
 def is_settled(workspace: Workspace, fit: Fit) -> bool:
     """Return whether the next step is small beside its standard deviations.
 
-    Translations that the motion does not show need not settle.
+    Translations that the motion does not excite need not settle.
     """
     tuning = workspace.problem.tuning
     normal = workspace.posterior(fit).normal
     variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
     steps = np.r_[axes.T @ normal.step[:3], normal.step[3:]]
     sigmas = np.sqrt(np.maximum(np.r_[variances, np.diag(normal.covariance)[3:]], 0.0))
-    limits = np.maximum(tuning.settled_sigmas * sigmas, _SETTLED_STEP)
+    limits = np.maximum(tuning.settled_sigmas * sigmas, _ROUNDING_STEP)
     limits[:3][sigmas[:3] > tuning.unknown_m] = np.inf
     return bool((np.abs(steps) < limits).all())
 
 
-STAGES = (noise, outliers, tails, lasting, systematic, polish)
+# A stage of the search.
+Stage: TypeAlias = Callable[[Workspace, Fit], Fit]
+STAGES: tuple[Stage, ...] = (noise, outliers, tails, lasting, systematic, polish)

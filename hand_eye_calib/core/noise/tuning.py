@@ -10,26 +10,26 @@ from dataclasses import dataclass
 class Tuning:
     """Numbers of the search.
 
-    ``solve(tuning=...)`` of poses and of positions reads all of them from here and nothing from
-    the default. ``python -m reproduction.ablation`` shows what each stage gains,
-    ``benchmarks/constants.csv`` what each number changes if it is halved or doubled. Bounds against
-    rounding are constants of the modules that need them.
+    ``solve(tuning=...)`` of poses and of positions reads every number from here and none from the
+    default. ``python -m reproduction.ablation`` measures what each stage gains, and
+    ``benchmarks/constants.csv`` what each number changes if it is halved or doubled. Bounds of
+    rounding and steps of the numerical search are constants of the modules that need them.
     """
 
     # -- The start --
-    # Reference of DNLO for the robust start: sees through jumps, and needs no noise levels.
+    # Reference of DNLO for the robust start. It sees through jumps, and needs no noise levels.
     start_reference: str = "B3"
     # Rotation noise turns about the origin of a world if residuals from there are smaller than
     # this share of the residuals at the sensors.
     decisive_centre: float = 0.7
 
     # -- Noise levels, which are logarithms of variances --
-    # Most poses to fit noise levels with.
+    # Largest number of poses to fit noise levels with.
     most_poses: int = 300
-    # Poses of one burst, the bursts spread evenly: bursts show the fast errors, the time between
-    # them the slow ones.
+    # Poses of one burst; the bursts are spread evenly. Bursts contain the fast errors, the time
+    # between bursts the slow ones.
     burst: tuple[int, ...] = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)
-    # Poses farther apart than this are no evidence of noise levels: over such a gap a walk of the
+    # Poses farther apart than this are no evidence of noise levels. Over such a gap a walk of the
     # rotation shifts positions in a way that the model of one increment does not follow. In
     # recordings of thousands of poses the walk fitted was a tenth of the true one.
     longest_gap: int = 60
@@ -39,102 +39,88 @@ class Tuning:
     jitter_precision: float = 0.05
     # Prior precision of the levels of time constants.
     tau_precision: float = 0.3
-    # Bounds of a walk's variance over an increment, in units of a typical one: neither a gap nor
-    # twin stamps may dominate.
-    relative: tuple[float, float] = (0.1, 100.0)
     # Bounds of white noise at the start, as shares of the whole.
     first_white: tuple[float, float] = (0.05, 0.5)
-    # Least share of the walk in the whole at the start.
+    # Smallest share of the walk in the whole at the start.
     first_walk: float = 0.02
     # Steps of the child count as noise until their squared differences from their neighbours
     # exceed the noise variance by this factor.
     caution: float = 10.0
-
-    # -- Newton steps of the levels --
-    # They end if a step promises to lower the loss by less: noise levels need no more than a few
-    # per cent. The search for time-correlated errors: by less per level.
+    # Newton steps of the levels end if a step promises to lower the loss by less: noise levels need
+    # a few per cent. The search for time-correlated errors ends by less per level.
     settled_loss: float = 0.05
-    # First and largest radius of a step.
-    first_radius: float = 1.5
-    largest_radius: float = 3.0
-    # The radius grows if a step keeps more than the share ``good`` of what it promises, and shrinks
-    # if it keeps less than ``poor``.
-    good: float = 0.5
-    poor: float = 0.2
-    # The radius shrinks to this share of a step that raises the loss.
-    shrink: float = 0.3
-    # Prior information on every level: bounds the step along levels that do not matter.
-    least_curvature: float = 0.05
 
     # -- Outliers and heavy tails --
-    # Most rounds of detecting outliers, and rounds of weighting tails.
+    # Largest number of rounds of detecting outliers.
     outlier_rounds: int = 4
+    # Rounds of weighting tails.
     tail_rounds: int = 3
     # False alarms expected in a whole recording.
     false_alarms: float = 0.01
-    # A large step of a walk with heavy tails is a jump if it exceeds the level of false alarms by
-    # this factor.
+    # A large step of a walk with heavy tails is a jump if its chi-square exceeds that of false
+    # alarms by this factor.
     decisive: float = 2.5
     # Tails are heavy if the fourth moment exceeds the square of the second by this factor (4/3 for
-    # normal errors): of the steps of the walk below the level of false alarms, and of the white
-    # errors.
+    # normal errors): of the steps of the walk below the level of false alarms.
     walk_kurtosis: float = 1.5
+    # The same of the white errors.
     heavy_kurtosis: float = 1.7
-    # First look for jumps: increments this many robust standard deviations out. Wide, because the
-    # noise levels are not known yet.
+    # First search for jumps: increments this many robust standard deviations out. The limit is wide
+    # because the noise levels are not known yet.
     first_jump_sigmas: float = 5.0
-    # At most this share of the poses are outliers.
+    # Largest share of poses that are outliers.
     most_spikes: float = 0.2
-    # The noise levels are fitted again only if more than this share of poses changed status.
+    # The noise levels are fitted again if more than this share of poses changed status.
     negligible: float = 0.005
     # Poses on either side that may share a level of the white errors.
     widths: tuple[int, ...] = (2, 5, 12, 30)
-    # A level that changes is believed if it lowers the loss per pose by this.
+    # A level that changes is accepted if it lowers the loss per pose by this.
     least_gain_of_widths: float = 0.1
 
-    # -- Rotation beside its noise --
+    # -- Rotation noise that is large beside the rotation --
     # Rotation noise is not small if it exceeds this share of the rotation between poses.
     noisy: float = 0.2
-    # Strides tried if rotation noise exceeds the rotation between poses. Without, primesense is
-    # 20 mm off at a stated 2 mm.
+    # Strides tried if rotation noise exceeds the rotation between poses. Without them, the
+    # recording primesense is 20 mm off at a sigma of 2 mm.
     strides: tuple[int, ...] = (3, 10, 30)
     # Fewest poses that a stride may leave.
     fewest_strides: int = 50
 
     # -- Time-correlated errors --
-    # They are part of the model if that lowers the loss by this: two levels each, by Akaike and
-    # more.
+    # They are part of the model if they lower the loss by this: two levels each, by Akaike's
+    # criterion and more.
     least_gain: float = 4.0
     # A process makes no difference if the data have less information than this on its level.
     least_information: float = 0.3
-    # The search goes on without such a process once its level has fallen by this.
+    # Such a process is dropped once its level has fallen by this.
     faded: float = 0.2
     # Time constants are between an interval and this share of the recording.
     longest_share: float = 0.25
-    # The search begins with processes of this share of the white and walking noise; white noise is
-    # not smaller then.
+    # The search begins with processes of this share of the white and walking noise. White noise is
+    # at least as large then.
     audible: float = 0.1
-    # Least share of the walk in the whole during that search.
+    # Smallest share of the walk in the whole during that search.
     audible_walk: float = 1e-3
     # Level of a drifting scale and direction of travel at which the search begins.
     first_of_path: float = -10.0
-    # The search begins at a time constant between this many intervals and this share of the time.
+    # The search begins at a time constant between this many intervals ...
     first_tau: float = 10.0
+    # ... and this share of the recording.
     last_tau: float = 0.06
-    # Share of the variance of detected body-fixed errors that undetected ones have. Such errors
+    # Variance of undetected body-fixed errors, as a share of that of detected ones. Such errors
     # have all time scales (flicker). Errors about as long as the recording are not detected; X
     # contains their mean.
     unseen_share: float = 0.05
 
     # -- Systematic errors --
-    # Prior standard deviations if the error is there: of a scale, of a bias along each axis (m/m),
-    # of a time offset (s), of a bias of rates (rad/s).
+    # Prior standard deviations if the error is present: of a scale, of a bias along each axis
+    # (m/m), of a time offset (s), of a bias of rates (rad/s).
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
-    # The same before it is decided which errors are there: biases are usually small.
+    # The same before errors are selected: biases are usually small.
     first_sizes: tuple[float, ...] = (0.03, 0.0026, 0.0026, 0.0026, 0.1, 1.0, 1.0, 1.0)
-    # Prior odds that a systematic error is there.
+    # Prior odds that a systematic error is present.
     odds: float = 0.03
-    # Prior standard deviation of an error that is not there.
+    # Prior standard deviation of an error that is absent.
     none: float = 1e-6
     # A bias of the path counts with this share of its gain against a scale: a scale, or a bias
     # along the direction of travel, explains most of it.
@@ -145,11 +131,11 @@ class Tuning:
     most_growth: float = 3.0
 
     # -- The end --
-    # X is followed for at most this many rounds.
+    # Largest number of steps of X at the end.
     max_rounds: int = 6
     # X is settled if it moves by less than this share of its standard deviation.
     settled_sigmas: float = 0.1
-    # A translation that is not known to this (m) need not settle: noise moves it on and on.
+    # A translation with a larger standard deviation (m) need not settle: noise moves it on and on.
     unknown_m: float = 0.2
 
     # -- Positions (LeverArmSolution) --

@@ -44,7 +44,7 @@ from hand_eye_calib.core.noise.noise_model import (
 )
 from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.noise.outliers import Outliers, bridged, innovations, judged
-from hand_eye_calib.core.noise.stages import known_products, rough_levels, sample
+from hand_eye_calib.core.noise.stages import prior_products, rough_levels, sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
@@ -228,7 +228,7 @@ class _State:
             imprecise=np.zeros(n + 1, dtype=bool),
             tuning=tuning,
         )
-        residuals = state.linearised().columns[:, :, -1]
+        residuals = state.linearised().residuals
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         square_of_position = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
         imprecise = _imprecise(np.concatenate(square_of_position), tuning, LOWEST_VARIANCE)
@@ -275,7 +275,7 @@ class _State:
         It has no rotation to estimate, orientations without bounds, and the odometry's walk.
         """
         values = np.r_[self.X[:3, 3], self.parameters[[*_SHARED, RESPONSE]]]
-        prior = known_products(range(len(values)), values, self.sigmas**-2.0, len(values) + 1)
+        prior = prior_products(values, self.sigmas, len(values) + 1)
         space = (model or self.model).state_space(
             self.streams,
             self.linearised(),
@@ -288,9 +288,9 @@ class _State:
         to_child = se3.adjoint(se3.inverse(self.X))
         return replace(
             space,
-            relative=space.relative * self.walk_factors,
-            white=(TRANSLATIONS[None], ROTATIONS[None]),
-            walk=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
+            walk_factors=space.walk_factors * self.walk_factors,
+            white_bases=(TRANSLATIONS[None], ROTATIONS[None]),
+            walk_bases=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
         )
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
@@ -315,13 +315,13 @@ class _State:
         """
         tuning = self.tuning
         prior = _level_prior(self.model, self.levels)
-        fit, _ = reml.fit(self.sampled_space(), self.levels, prior, tuning)
+        fit, _ = reml.fit(self.sampled_space(), self.levels, prior, tuning.settled_loss)
         best = replace(self, levels=fit.levels)
         loss = fit.loss - tuning.least_gain
         for kind in kinds:
             model, levels = self.model.with_lasting(((kind, "translation"),), fit.levels)
             prior = _level_prior(model, levels)
-            rival, _ = reml.fit(self.sampled_space(model), levels, prior, tuning)
+            rival, _ = reml.fit(self.sampled_space(model), levels, prior, tuning.settled_loss)
             if rival.loss < loss:
                 best = replace(self, model=model, levels=rival.levels)
                 loss = rival.loss
