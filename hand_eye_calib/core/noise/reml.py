@@ -195,8 +195,8 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     traces.append(float((along * space.twists).sum()))
     moments = posterior.walk_covariances() + walk @ transposed(walk)
     total = np.tensordot(posterior.evidence, moments, axes=1)
-    precision = posterior.walk_precision
-    excess = (~space.cut).sum() * precision - precision @ total @ precision
+    walk_precision = posterior.walk_precision
+    excess = (~space.cut).sum() * walk_precision - walk_precision @ total @ walk_precision
     traces += [float((excess * basis).sum()) for basis in space.walk_bases]
     gradient = [0.5 * np.exp(posterior.levels[: len(traces)]) * traces]
     gradient += [_group_gradient(posterior, group, states) for group in posterior.groups]

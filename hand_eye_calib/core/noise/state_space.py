@@ -233,7 +233,7 @@ class Posterior:
         # The logarithm of this determinant is zero.
         self._white_precisions[is_free] = np.eye(WHITE)
         self.walk_covariance = total_covariance(levels[n_white:], space.walk_bases)
-        self.walk_precision: FloatArray = np.linalg.inv(self.walk_covariance)
+        self.walk_precision = np.linalg.inv(self.walk_covariance)
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.walk_factors)
         self._walk_precisions = self.evidence[:, None, None] * self.walk_precision
         self.groups = self._groups(n_white + len(space.walk_bases))
