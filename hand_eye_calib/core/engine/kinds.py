@@ -19,19 +19,19 @@ from hand_eye_calib.core.results.calibration import Calibration
 class Kind:
     """What differs between kinds of data.
 
-    A snapshot is one of :mod:`hand_eye_calib.core.engine.snapshot`, which imports this module.
+    :mod:`hand_eye_calib.core.engine.snapshot` has the snapshots, and imports this module.
 
     Attributes
     ----------
     solve : callable
         ``solve(snapshot, cross_check)`` returns a calibration without frame names. The snapshot has
-        a time offset in seconds and enough pairs. A ``cross_check`` of None follows the options.
+        a time offset in seconds and enough pairs. If ``cross_check`` is None, the options decide.
     check : callable
         ``check(snapshot, calibration)`` checks the streams; the calibration may be None.
     least_clock_change_s : float
         Change of the time offset (s) from which on the poses are paired anew.
     is_timed_by_speed : bool
-        Whether speeds show the time offset, rather than angular rates.
+        Whether the time offset is estimated from speeds, rather than from angular rates.
     allowed : mapping
         Options that have a meaning for whole poses only: the names of their fields, and the values
         that may be set.
@@ -61,6 +61,6 @@ class Kind:
 
 
 def kind_of(config: CalibratorConfig) -> Kind:
-    """Return the kind of data of two streams, from what the options say that both measure."""
+    """Return the kind of data that two streams with these options make together."""
     kind: Kind = KINDS[config.measured]()
     return kind

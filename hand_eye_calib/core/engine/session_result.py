@@ -1,4 +1,4 @@
-"""A result of a session of the node, as it goes to the process that writes its pages."""
+"""Results of a session of the node, for the process that writes its pages."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,8 +10,19 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 @dataclass(frozen=True)
 class SessionResult:
-    """A result of the node, the poses that gave it, and where these came from; whether a report is
-    wanted, and the poses of further child sensors, each with those of the parent.
+    """A result of the node with its data.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    snapshot : Snapshot
+        The poses and options of the result.
+    inputs : dict
+        Sources of the poses, in plain values.
+    with_report : bool
+        Whether to write a report.
+    others : mapping of str to Snapshot
+        Snapshots of further child sensors with the same parent, by the names of their inputs.
     """
 
     calibration: Calibration

@@ -1,4 +1,4 @@
-"""A snapshot of the engine: all that an estimate needs, independent of the poses that follow."""
+"""Snapshots: the poses and options of an estimate, independent of poses that come later."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,41 +24,40 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
-# A model moves poses along their velocities by a smaller time offset (s). From this one on, the
-# poses are paired anew instead.
+# Smallest time offset (s) after which the poses are paired anew. The noise model moves poses along
+# their velocities by smaller ones.
 MOST_MOVED_S = 0.003
 
-# A time offset (s) that nobody asked for is not taken without doubt from this one on.
+# Smallest time offset (s) that gives a warning if the user did not ask for an estimate.
 UNASKED_S = 1.0
 
-# Pose pairs of whole trajectories that are used unless an option says otherwise: the noise model
-# takes 8 kB for each, and hours at ten a second hold as many.
+# Largest number of pose pairs of whole trajectories, unless the user sets `max_pairs`: three hours
+# at 10 Hz. The noise model needs 8 kB for each.
 _MOST_PAIRS = 100_000
 
-# Gaps that the stream checks may interpolate across, in median intervals between pairs: pairs that
-# were downsampled are farther apart than poses.
+# Longest gap that the stream checks interpolate across, in median intervals between kept pairs.
+# Downsampled pairs are farther apart than poses.
 _GAP_INTERVALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """All that an estimate needs. It can be estimated in any thread or process, while poses keep
-    coming in.
+    """Poses and options of an estimate, which may run in any thread or process.
 
     Attributes
     ----------
     config : CalibratorConfig
     kept : PosePairs
-        Pairs that were made before.
+        Pose pairs that were made before.
     buffered_parent, buffered_child : Trajectory
-        Poses that are not paired yet, as they came in.
+        Poses that are not paired yet, as they were received.
     paired_at : {"parent", "child"} or None
         Stream whose stamps the pairs have; the slower one if None.
     parent_names, child_names : StreamFrames
         Names of the frames of each stream.
     warnings : tuple of str
     time_offset : TimeOffset or None
-        The offset of the kept pairs if it was estimated.
+        The time offset of the kept pairs, if it was estimated.
     """
 
     config: CalibratorConfig
@@ -82,7 +81,7 @@ class Snapshot:
         return self._frame("child")
 
     def _frame(self, stream: str) -> str:
-        """Name of a stream's sensor frame; a default if it is not known."""
+        """Return the name of a stream's sensor frame; a default if the frame has no name."""
         names, other = self._names(stream)
         name = names.name
         if getattr(self.config, f"{stream}_invert") == "poses" and names.inverse_name != other.name:
@@ -90,13 +89,14 @@ class Snapshot:
         return name or f"{stream}_sensor"
 
     def _names(self, stream: str) -> tuple[StreamFrames, StreamFrames]:
-        """Names of the frames of a stream, and those of the other stream."""
-        both = self.parent_names, self.child_names
-        return both if stream == "parent" else both[::-1]
+        """Return the names of the frames of a stream, and those of the other stream."""
+        if stream == "parent":
+            return self.parent_names, self.child_names
+        return self.child_names, self.parent_names
 
     @property
     def frame_warnings(self) -> tuple[str, ...]:
-        """Warnings about sensor frames: without a name, or with that of the inverse poses."""
+        """Warnings about sensor frames that have no name, or the name for inverse poses."""
         warnings = []
         for stream, frame in zip(STREAMS, (self.parent_frame, self.child_frame), strict=True):
             names, _ = self._names(stream)
@@ -107,8 +107,8 @@ class Snapshot:
                 )
             elif frame != names.name:
                 observed = names.name or "what it observes"
-                text = f"the {stream} is {frame}: inverted, the poses are those of {frame} in "
-                text += observed
+                text = f"the {stream} is {frame}: inverted, the poses are those of {frame} "
+                text += f"in {observed}"
                 if names.option:
                     text += f", which {stream}_frame names"
                 warnings.append(text)
@@ -116,13 +116,14 @@ class Snapshot:
 
     def _check_frames(self) -> None:
         """Raise InputError if the names of the frames contradict each other."""
+        nameless = "a sensor without name"
         for stream in STREAMS:
             names, other = self._names(stream)
             if names.option not in ("", names.sensor) and names.option == other.sensor:
                 raise InputError(
                     f"{stream}_frame is {names.option}, but that is the frame of the other stream: "
-                    f"the parent stream is of {self.parent_names.sensor or 'a sensor without name'}"
-                    f", the child stream of {self.child_names.sensor or 'a sensor without name'}; "
+                    f"the parent stream is of {self.parent_names.sensor or nameless}, "
+                    f"the child stream of {self.child_names.sensor or nameless}; "
                     "exchange the two streams, or the two names"
                 )
         if self.parent_frame == self.child_frame:
@@ -133,8 +134,9 @@ class Snapshot:
 
     @property
     def unpaired(self) -> tuple[Trajectory, Trajectory]:
-        """Trajectories of the poses of parent and child that are not paired yet, in the usual
-        convention; the child's stamps are corrected for a clock rate.
+        """Trajectories of the poses of parent and child that are not paired yet.
+
+        The poses are in the usual convention. The child's stamps have no clock rate.
         """
         parent = _put_right(self.buffered_parent, "parent", self.config)
         child = _put_right(self.buffered_child, "child", self.config)
@@ -142,15 +144,21 @@ class Snapshot:
 
     @cached_property
     def resolved(self) -> "Snapshot":
-        """The snapshot with its time offset in seconds, estimated if the options ask for that: from
-        the buffered poses, unless pairs were made with an estimate before. NotEnoughDataError if it
-        cannot be estimated.
+        """The snapshot with its time offset in seconds.
+
+        If the options ask for an estimate, the estimate comes from the buffered poses, unless pairs
+        were made with an estimate before.
+
+        Raises
+        ------
+        NotEnoughDataError
+            If the time offset cannot be estimated.
         """
         if not isinstance(self.config.time_offset, str):
             return self
-        found = self.time_offset or estimated_time_offset(self.config, *self.unpaired)
-        config = replace(self.config, time_offset=found.seconds)
-        return replace(self, config=config, time_offset=found)
+        offset = self.time_offset or estimated_time_offset(self.config, *self.unpaired)
+        config = replace(self.config, time_offset=offset.seconds)
+        return replace(self, config=config, time_offset=offset)
 
     @cached_property
     def correlation(self) -> Correlation:
@@ -161,15 +169,16 @@ class Snapshot:
 
     @property
     def max_gap_s(self) -> float:
-        """Longest time between two poses of the streams that interpolation may bridge, s."""
+        """Longest gap (s) of the streams that is interpolated across."""
         if not len(self.kept):
             return self.config.max_gap
         return max(self.config.max_gap, _GAP_INTERVALS * self.streams[0].interval_s)
 
     @cached_property
     def pose_pairs(self) -> PosePairs:
-        """Synchronised pose pairs: the kept ones, and those of the buffered poses; errors as of
-        :attr:`resolved`.
+        """Synchronised pose pairs: the kept pairs, and pairs of the buffered poses.
+
+        Errors as of :attr:`resolved`.
         """
         if self.resolved is not self:
             return self.resolved.pose_pairs
@@ -191,15 +200,16 @@ class Snapshot:
         Parameters
         ----------
         cross_check : bool, optional
-            Whether to compare the result with other references and with both halves; by default
-            unless the user set the reference.
+            Whether to compare the result with other references and with both halves. The default
+            is True unless the user set the reference.
 
         Raises
         ------
         NotEnoughDataError
             If fewer than ``min_pairs`` poses can be paired; the message says what is missing.
         InputError
-            If both streams have the same sensor frame, or an option gives one of them the other's.
+            If both streams have the same sensor frame, or an option names the frame of the other
+            stream.
         ConfigError
             If an option has no meaning for what the streams measure.
         """
@@ -209,7 +219,7 @@ class Snapshot:
         resolved = self.resolved
         pairs = self.pose_pairs
         if len(pairs) < resolved.config.min_pairs:
-            raise NotEnoughDataError(resolved._what_is_missing(len(pairs)))
+            raise NotEnoughDataError(resolved._missing_data(len(pairs)))
         result = kind.solve(resolved, cross_check)
         return replace(
             result,
@@ -220,22 +230,24 @@ class Snapshot:
 
     @cached_property
     def streams(self) -> tuple[Trajectory, Trajectory]:
-        """Trajectories of the whole session, each on its own clock: as they came in, or at the
-        stamps of the pairs if some were made.
+        """Trajectories of the whole session, each on its own clock.
+
+        If pairs were made, the trajectories have the stamps of the pairs; otherwise those of the
+        poses as received.
         """
-        streams = [*self.unpaired]
+        parent, child = self.unpaired
         if len(self.kept):
             pairs = self.pose_pairs
-            offset_s = float(self.resolved.config.time_offset)
-            streams = [Trajectory(pairs.stamps_ns, Ts) for Ts in (pairs.Ts_pw_p, pairs.Ts_cw_c)]
-            streams[1] = streams[1].shifted(-offset_s)
-        for k, stream in enumerate(STREAMS):
-            measures = getattr(self.config, f"{stream}_measures")
-            if measures not in ("auto", streams[k].measures):
-                streams[k] = replace(streams[k], measures=measures)
-        return streams[0], streams[1]
+            parent = Trajectory(pairs.stamps_ns, pairs.Ts_pw_p)
+            child = Trajectory(pairs.stamps_ns, pairs.Ts_cw_c)
+            child = child.shifted(-float(self.resolved.config.time_offset))
+        return (
+            _measuring(parent, self.config.parent_measures),
+            _measuring(child, self.config.child_measures),
+        )
 
-    def _what_is_missing(self, n_pairs: int) -> str:
+    def _missing_data(self, n_pairs: int) -> str:
+        """Say which data are missing, if too few poses can be paired."""
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
         parent, child = self.unpaired
         child = child.shifted(float(self.config.time_offset))
@@ -257,8 +269,21 @@ class Snapshot:
         )
 
 
+def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
+    """Return the trajectory with what the options say that it measures."""
+    if measures in ("auto", trajectory.measures):
+        return trajectory
+    return replace(trajectory, measures=measures)
+
+
 def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
-    """The trajectory of a stream in the usual convention, from that of the options."""
+    """Return a trajectory in the usual convention, converted from that of the options.
+
+    Raises
+    ------
+    ConfigError
+        If the stream does not measure what the options convert.
+    """
     invert = getattr(config, f"{stream}_invert")
     order = getattr(config, f"{stream}_quaternion")
     if (invert, order) != ("none", "xyzw"):
@@ -266,17 +291,23 @@ def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) ->
         if kind not in ("poses", "rotations") or (invert, kind) == ("poses", "rotations"):
             options = f"{stream}_invert {invert}, {stream}_quaternion {order}"
             raise ConfigError(f"{options} cannot be: the {stream} measures {kind}")
-        right = se3.put_right(trajectory.poses, invert, order)
-        trajectory = replace(trajectory, poses=right)
-    is_scaled = stream == "parent" and config.parent_scale != 1.0
-    return trajectory.scaled(config.parent_scale) if is_scaled else trajectory
+        trajectory = replace(trajectory, poses=se3.put_right(trajectory.poses, invert, order))
+    if stream == "parent" and config.parent_scale != 1.0:
+        return trajectory.scaled(config.parent_scale)
+    return trajectory
 
 
 def whole_snapshot(
     parent: Trajectory, child: Trajectory, options: Mapping[str, object]
 ) -> Snapshot:
-    """The Snapshot of two whole trajectories, with options by their public names: all pairs up to
-    100,000 unless they set another limit.
+    """Return the Snapshot of two whole trajectories.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+    options : mapping
+        Options by their public names. All pairs up to 100,000 are used unless ``max_pairs`` is
+        among them.
     """
     of_streams = {
         "max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS),
@@ -298,7 +329,7 @@ def whole_snapshot(
 
 
 def names_of(config: CalibratorConfig, stream: str, sensor: str, world: str) -> StreamFrames:
-    """Names of the frames of a stream, from its messages and the options."""
+    """Return the names of the frames of a stream, from its messages and the options."""
     option = getattr(config, f"{stream}_frame")
     return StreamFrames(frame_name(sensor), frame_name(world), frame_name(option))
 
@@ -306,14 +337,16 @@ def names_of(config: CalibratorConfig, stream: str, sensor: str, world: str) -> 
 def estimated_time_offset(
     config: CalibratorConfig, parent: Trajectory, child: Trajectory
 ) -> TimeOffset:
-    """The time offset of two streams, from what the options say that both measure."""
+    """Estimate the time offset of two streams of the kind that the options name."""
     of_speed = kind_of(config).is_timed_by_speed
     return estimate_time_offset(parent, child, config.max_gap, of_speed)
 
 
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
-    """At most ``max_pairs`` of the pose pairs: of every second one, those with the least rotation
-    of the parent around them are dropped first.
+    """Return at most ``max_pairs`` of the pose pairs.
+
+    Every second pair may be dropped; those with the least rotation of the parent between their
+    neighbours are dropped first.
     """
     while len(pose_pairs) > max_pairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
@@ -334,12 +367,26 @@ def pair_poses(
     at: str | None,
     kept: PosePairs,
 ) -> PosePairs:
-    """Pose pairs of two trajectories that are keyframes, after the last pair of ``kept``."""
+    """Return the pose pairs of two trajectories that are keyframes and follow those ``kept``.
+
+    Parameters
+    ----------
+    config : CalibratorConfig
+        With a time offset in seconds.
+    parent, child : Trajectory
+        Each on its own clock.
+    at : {"parent", "child"} or None
+        Stream whose stamps the pairs have; the slower one if None.
+    kept : PosePairs
+    """
     made = synchronise(parent, child.shifted(float(config.time_offset)), config.max_gap, at)
     if len(kept):
         made = made[made.stamps_ns > kept.stamps_ns[-1]]
-    least = config.keyframe_min_translation, config.keyframe_min_rotation
-    least_s = config.keyframe_min_interval
-    if not any((*least, least_s)):
-        return made
-    return made[select_keyframes(made, *least, least_s, previous=kept[-1:])]
+    keyframes = select_keyframes(
+        made,
+        config.keyframe_min_translation,
+        config.keyframe_min_rotation,
+        config.keyframe_min_interval,
+        previous=kept[-1:],
+    )
+    return made if len(keyframes) == len(made) else made[keyframes]
