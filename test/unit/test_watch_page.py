@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hand_eye_calib.online.watch import board, web
+from hand_eye_calib.online.watch import view, web
 
 FOLDER = Path(web.__file__).parent / "page"
 SCRIPT = (FOLDER / "page.js").read_text(encoding="utf-8")
@@ -96,7 +96,7 @@ def test_the_script_finds_what_it_looks_for():
     assert set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
     assert set(re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)) <= set(page.tags)
     assert page.data["data-file"] == list(web.SAVED)
-    assert sorted(page.data["data-request"]) == sorted(board.KEYS)
+    assert sorted(page.data["data-request"]) == sorted(view.KEYS)
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
     assert len(page.data["data-sure"]) == 3
 

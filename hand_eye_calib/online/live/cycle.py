@@ -13,7 +13,6 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.text import duration, listing, parse_targets
-from hand_eye_calib.core.checks.findings import gravest_first
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
 from hand_eye_calib.core.engine.snapshot import Snapshot
@@ -36,7 +35,7 @@ from hand_eye_calib.online.live.state import (
     Standing,
     by_axis,
 )
-from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks
+from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks, merged
 
 # Callback with the success of a solve and a line of text about it.
 OnSolved: TypeAlias = Callable[[bool, str], None]
@@ -368,13 +367,8 @@ class SolveCycle:
         """
         findings = self.checks.findings
         if calibration.measured != "poses":
-            own = {(finding.code, finding.stream) for finding in calibration.findings}
-            added = [
-                finding
-                for finding in findings
-                if (finding.code, finding.stream) not in own and finding.code in RAW_POSE_CODES
-            ]
-            findings = gravest_first([*calibration.findings, *added])
+            raw = [finding for finding in findings if finding.code in RAW_POSE_CODES]
+            findings = merged(calibration.findings, raw)
         if calibration.findings == findings:
             return calibration
         return replace(calibration, findings=findings)
@@ -472,9 +466,6 @@ class SolveCycle:
             Severity and reason if no poses arrive; see :func:`pause_of`.
         """
         progress = self.goal.progress
-        comparison = self.result.comparison if self.result is not None else None
-        if comparison is None and why_not_compared:
-            comparison = Comparison(sentence=f"not compared yet: {why_not_compared}")
         needs_change = progress.is_faulty or progress.will_not_get_there
         is_well = self.standing is Standing.CURRENT and not needs_change
         level = Level.OK if is_well else Level.WARN
@@ -492,8 +483,14 @@ class SolveCycle:
             text=text,
             is_paused=is_paused,
             progress=progress,
-            comparison=comparison,
+            comparison=self._comparison(why_not_compared),
         )
+
+    def _comparison(self, why_not: str) -> Comparison | None:
+        """Return the comparison with the installed transform, or why there is none yet."""
+        if self.result is not None and self.result.comparison is not None:
+            return self.result.comparison
+        return Comparison(sentence=f"not compared yet: {why_not}") if why_not else None
 
 
 def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Level, str]:

@@ -26,7 +26,7 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataErro
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.python_path import trusted_environment
 from hand_eye_calib.core.checks.check import MIN_DURATION_S, CheckResult, can_check
-from hand_eye_calib.core.checks.findings import answered, gravest_first
+from hand_eye_calib.core.checks.findings import Finding, answered
 from hand_eye_calib.core.checks.streams import check_positions, check_stream
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
@@ -35,6 +35,7 @@ from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.state import GRACE_S
+from hand_eye_calib.online.live.stream_checks import merged
 
 # Not `-m`: the classes would belong to the module __main__, which the node does not have.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
@@ -184,21 +185,18 @@ def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
     if not len(snapshot.kept):
         return result
     config = snapshot.config
-    findings = [*result.findings]
+    errors: list[Finding] = []
     for stream, trajectory in zip(STREAMS, snapshot.unpaired, strict=True):
         if len(trajectory) < _FEWEST_RAW or trajectory.duration_s < MIN_DURATION_S / 2:
             continue
         if config.measured == "poses":
-            raw_findings = check_stream(trajectory, stream, config.max_gap)
+            findings = check_stream(trajectory, stream, config.max_gap)
         else:
             # Unless both streams have positions, the positions of a stream are no measurements.
             scale = 1.0 if config.measured == "positions" else 0.0
-            raw_findings = check_positions(trajectory.scaled(scale), stream, config.max_gap)
-        keys = {(finding.code, finding.stream) for finding in findings}
-        for finding in answered(raw_findings, config):
-            if finding.makes_unusable and (finding.code, finding.stream) not in keys:
-                findings.append(finding)
-    return replace(result, findings=gravest_first(findings))
+            findings = check_positions(trajectory.scaled(scale), stream, config.max_gap)
+        errors += [finding for finding in answered(findings, config) if finding.makes_unusable]
+    return replace(result, findings=merged(result.findings, errors))
 
 
 def _failure(error: Exception) -> Failure:

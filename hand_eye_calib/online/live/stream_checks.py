@@ -1,6 +1,7 @@
 """Findings of the stream checks of a live session."""
 
 import time
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -75,11 +76,6 @@ class StreamChecks:
         """Findings that count against these streams, the gravest first."""
         return tuple(self._faults.values())
 
-    def _earlier_findings(self, result: CheckResult) -> list[Finding]:
-        """Lasting findings that this check does not report."""
-        keys = {(finding.code, finding.stream) for finding in result.findings}
-        return [finding for key, finding in self._lasting.items() if key not in keys]
-
     def faults(self) -> tuple[str, ...]:
         """Text of the findings that count, one line each, with the parameters to set."""
         return tuple(map(_in_parameters, self.findings))
@@ -92,7 +88,7 @@ class StreamChecks:
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
             return ChecksState(level=Level.WARN, text=text)
-        findings = gravest_first([*self._result.findings, *self._earlier_findings(self._result)])
+        findings = merged(self._result.findings, self._lasting.values())
         return ChecksState(
             level=Level.WARN if self._faults else Level.OK,
             text="; ".join(self.faults()) or "both streams can be of one rigid body",
@@ -101,6 +97,16 @@ class StreamChecks:
                 f"{finding.severity.value}: {_in_parameters(finding)}" for finding in findings
             ),
         )
+
+
+def merged(newest: Sequence[Finding], earlier: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings without earlier ones that the newest repeat, the gravest first.
+
+    A finding repeats another one of the same code and stream.
+    """
+    keys = {(finding.code, finding.stream) for finding in newest}
+    kept = [finding for finding in earlier if (finding.code, finding.stream) not in keys]
+    return gravest_first([*newest, *kept])
 
 
 def _in_parameters(finding: Finding) -> str:

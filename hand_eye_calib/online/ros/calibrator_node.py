@@ -89,14 +89,7 @@ class CalibratorNode(Node):
             tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
-        self._session.topics = {source.name: source.topic for source in self._inputs[:2]}
-        topics = [source.topic for source in self._inputs]
-        if len(set(topics)) < len(topics):
-            text = "two inputs have one topic: remap one to another sensor's"
-            raise ConfigError(f"{text}: {listing(topics)}")
-        self._session.start_journal(options, is_first=True)
-        for source in self._inputs:
-            source.resume()
+        self._start_session()
         self._results = ResultTopics(self)
         self._states = StateTopics(self)
         self._tf.switch(options.publish_tf)
@@ -135,6 +128,23 @@ class CalibratorNode(Node):
         return is_saved
 
     # ---------------------------------------------------------------- set-up
+
+    def _start_session(self) -> None:
+        """Start or resume the session with its journal.
+
+        Raises
+        ------
+        ConfigError
+            If two inputs have one topic.
+        """
+        topics = {source.name: source.topic for source in self._inputs}
+        if len(set(topics.values())) < len(topics):
+            text = "two inputs have one topic: remap one to another sensor's"
+            raise ConfigError(f"{text}: {listing([*topics.values()])}")
+        self._session.topics = {name: topics[name] for name in ("parent", "child")}
+        self._session.start_journal(self._options.node, is_first=True)
+        for source in self._inputs:
+            source.resume()
 
     def _log_start(self) -> None:
         """Log topics, directory and options in one line."""

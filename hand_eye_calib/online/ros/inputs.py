@@ -100,24 +100,30 @@ class TopicInput(RosInput):
             if self._type_name in ("", publisher.topic_type)
         )
         self.problem = self._wrong_qos(publishers) or counted(len(publishers), "publisher")
-        is_wanted = self._wanted_type != "auto"
-        wanted = [self._wanted_type] if is_wanted else _TYPES
-        offered = {publisher.topic_type for publisher in publishers}
+        type_name = self._choose_type({publisher.topic_type for publisher in publishers})
+        if self._subscribed or not type_name:
+            return
+        try:
+            self._subscribe(type_name)
+        except ConfigError as error:
+            if self._wanted_type != "auto":
+                raise
+            self.problem = str(error)
+            self._log.error(f"{self.topic} is not used: {error}")
+
+    def _choose_type(self, offered: set[str]) -> str:
+        """Return the message type to subscribe to; empty if no offered type is usable."""
+        is_auto = self._wanted_type == "auto"
+        wanted = _TYPES if is_auto else (self._wanted_type,)
         usable = [type_name for type_name in wanted if type_name in offered]
         if offered and not usable:
             self.problem = f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
             self._log.warning(
                 f"{self.topic}: {self.problem}: remap {self._relative_topic} to a topic with poses"
             )
-        if self._subscribed or not (usable or is_wanted):
-            return
-        try:
-            self._subscribe(usable[0] if usable else self._wanted_type)
-        except ConfigError as error:
-            if is_wanted:
-                raise
-            self.problem = str(error)
-            self._log.error(f"{self.topic} is not used: {error}")
+        if is_auto:
+            return usable[0] if usable else ""
+        return self._wanted_type
 
     def _wrong_qos(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Return why the middleware delivers no message of these publishers; empty otherwise."""

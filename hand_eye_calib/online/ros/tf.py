@@ -7,10 +7,9 @@ The installed transform and the base frame are read from the tree. The result is
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -29,9 +28,6 @@ from hand_eye_calib.formats.installed import open_installed, stated
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import Broadcast
 from hand_eye_calib.online.ros.conversions import LATCHED, LISTENING, quick, to_transform
-
-# Function of parent and child frame.
-ReadExtrinsic: TypeAlias = Callable[[str, str], Extrinsic]
 
 # Value of the option ``installed`` for the transform on /tf_static.
 TF = "tf"
@@ -142,10 +138,8 @@ class Robot:
         # Installed transform between the two frames of the last result.
         self._installed: Extrinsic | None = None
         self._installed_for = ("", "")
-        if self._source in ("", TF):
-            self._read: ReadExtrinsic = partial(stated, frames.pose, STATIC_TOPIC)
-        else:
-            self._read = open_installed(self._source)
+        from_tree = partial(stated, frames.pose, STATIC_TOPIC)
+        self._read = from_tree if self._source in ("", TF) else open_installed(self._source)
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
         """Return the installed transform; None if it is unknown, or if no option asks for it."""

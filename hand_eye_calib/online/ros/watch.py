@@ -14,7 +14,8 @@ from io import StringIO
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hand_eye_calib.online.watch.board import Board, View
+    from hand_eye_calib.online.watch.board import Board
+    from hand_eye_calib.online.watch.view import View
 
 EXAMPLES = """\
 examples:
@@ -105,7 +106,7 @@ class Session:
     def __init__(
         self, board: "Board", requests: "queue.SimpleQueue[str]", keys: Callable[[], str]
     ) -> None:
-        from hand_eye_calib.online.watch.board import KEYS
+        from hand_eye_calib.online.watch.view import KEYS
 
         self.is_over = False
         self.shows_code = False

@@ -7,10 +7,9 @@ or a browser.
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
-from enum import Enum
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import from_plain
@@ -32,22 +31,13 @@ from hand_eye_calib.online.live.state import (
     SavedState,
     Standing,
 )
+from hand_eye_calib.online.watch.view import AxisTexts, Bar, Line, Texts, Tone, View
 
 # Age (s) of the newest state at which a node counts as silent: three reports are missing.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 # Time (s) for which the answer to a button is displayed.
 ANSWER_FOR_S = 20.0
-
-# Requests that a person can make, with their keys on a terminal.
-KEYS = {
-    "solve": "s",
-    "save": "w",
-    "reset": "r",
-    "recalibrate": "c",
-    "acknowledge": "a",
-    "forget": "f",
-}
 
 # Words of headlines that decide about buttons.
 MOVED = "MOUNT MOVED"
@@ -74,16 +64,6 @@ _ON_A_VEHICLE = {
 }
 
 
-class Tone(Enum):
-    """Severity, with its sign: a colour alone is not readable by everybody."""
-
-    GOOD = "✓"
-    BUSY = "▶"
-    ACT = "!"
-    BAD = "✗"
-    UNKNOWN = "?"
-
-
 # Tones of levels, verdicts, comparisons and broadcasts.
 _TONES: dict[object, Tone] = {
     **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
@@ -99,109 +79,6 @@ class Headline(NamedTuple):
     tone: Tone
     word: str
     sentence: str
-
-
-@dataclass(frozen=True)
-class Line:
-    """One line with its sign, such as the health of an input."""
-
-    tone: Tone
-    name: str
-    text: str
-
-
-Lines: TypeAlias = tuple[Line, ...]
-Texts: TypeAlias = tuple[str, ...]
-# Pairs of an axis and a text.
-AxisTexts: TypeAlias = tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True)
-class Bar:
-    """Progress of one axis of the parent sensor's frame towards its target.
-
-    Attributes
-    ----------
-    name : str
-        The axis, such as "about z".
-    meaning : str
-        The axis on a vehicle, such as "turn"; empty if the motion is not that of a vehicle.
-    share : float
-        Share of the information that the target needs, 0 to 1.
-    tone : Tone
-    word : str
-        Progress in words, such as "30 s left".
-    against : str
-        Standard deviation and target, such as "± 0.065 deg of 0.3 deg".
-    difference : str
-        Difference from the installed transform; empty if unknown.
-    """
-
-    name: str
-    meaning: str
-    share: float
-    tone: Tone
-    word: str
-    against: str
-    difference: str
-
-
-@dataclass(frozen=True)
-class View:
-    """Everything that is displayed of one node.
-
-    Attributes
-    ----------
-    node : str
-        Fully qualified name of the node.
-    tone, word, sentence
-        The headline.
-    facts : str
-        Amount of motion, and age of the result.
-    title : str
-        Name of the pose in ``values``.
-    values : tuple of (str, str)
-        Axes and values of the pose as printed.
-    bars : tuple of Bar
-        Progress of each axis; empty if the node monitors the mount.
-    watched : tuple of Line
-        Axes of a monitored mount; empty if the node calibrates.
-    result, reasons
-        Verdict, priors, comparison and files of the result; reasons of the verdict.
-    health : tuple of Line
-        Inputs, stream checks and journal.
-    topics : tuple of str
-        Topics with poses, if an input lacks poses.
-    buttons : tuple of str
-        Requests that are possible now, the recommended request first.
-    by_hand : tuple of str
-        Axes whose value may be measured by hand or corrected, the most important first.
-    priors : tuple of (str, str)
-        Axes and priors as typed by the user.
-    saved_in : str
-        Directory of the saved files; empty if nothing is saved.
-    answer : tuple of Line
-        Answer to the last button, for some seconds.
-    """
-
-    node: str
-    tone: Tone
-    word: str
-    sentence: str
-    facts: str = ""
-    title: str = ""
-    values: AxisTexts = ()
-    bars: tuple[Bar, ...] = ()
-    watched: Lines = ()
-    result: Lines = ()
-    reasons: Texts = ()
-    health: Lines = ()
-    topics: Texts = ()
-    buttons: Texts = ()
-    by_hand: Texts = ()
-    priors: AxisTexts = ()
-    saved_in: str = ""
-    answer: Lines = ()
 
 
 class Board:
@@ -285,7 +162,8 @@ def _priors_of(state: NodeState) -> AxisTexts:
     """Return axes and priors that are set, as typed by the user."""
     if state.extrinsic is None:
         return ()
-    return tuple(item for item in state.extrinsic.priors.items() if item[0] in AXES)
+    priors = state.extrinsic.priors
+    return tuple((axis, priors[axis]) for axis in AXES if axis in priors)
 
 
 def _view(state: NodeState, silent_s: float) -> View:
@@ -305,18 +183,27 @@ def _view(state: NodeState, silent_s: float) -> View:
     )
     if state.mount is not None:
         return _with_mount(view, state.mount)
-    view = replace(view, facts=_facts(state, is_old), result=tuple(_result(state)))
-    if result := state.result:
-        view = replace(view, reasons=result.reasons)
-        if state.standing is not Standing.REFUTED:
-            title = f"pose of {result.child_frame} in {result.parent_frame}"
-            view = replace(view, title=title, values=tuple(_values(result)))
+    view = _with_result(view, state)
+    view = replace(view, facts=_facts(state, is_old), by_hand=_axes_by_hand(state, view.word))
     if at := state.progress:
         bars = tuple(_bar(axis, at, state.extrinsic) for axis in AXES)
-        view = replace(view, bars=bars, by_hand=_axes_by_hand(state, view.word))
+        view = replace(view, bars=bars)
     if is_old:
         return view
     return replace(view, priors=_priors_of(state), buttons=_buttons(state, view.word))
+
+
+def _with_result(view: View, state: NodeState) -> View:
+    """Return the view of a node that calibrates, with its result."""
+    view = replace(view, result=tuple(_result(state)))
+    result = state.result
+    if result is None:
+        return view
+    view = replace(view, reasons=result.reasons)
+    if state.standing is Standing.REFUTED:
+        return view
+    title = f"pose of {result.child_frame} in {result.parent_frame}"
+    return replace(view, title=title, values=tuple(_values(result)))
 
 
 def _with_mount(view: View, mount: MountState) -> View:
@@ -378,7 +265,8 @@ def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | Non
     extrinsic = state.extrinsic
     checks = state.checks
     at = state.progress
-    inputs = [state.inputs[name] for name in ("parent", "child") if name in state.inputs]
+    # Further child sensors have lines of their own, but no headline.
+    inputs = [stream for name, stream in state.inputs.items() if name in ("parent", "child")]
     yield Tone.BAD, "BROKEN", Level.ERROR, extrinsic
     yield Tone.BAD, MOVED, Level.ERROR, state.mount
     if extrinsic and extrinsic.contradicted:
@@ -386,8 +274,8 @@ def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | Non
     for stream in inputs:
         yield Tone.BAD, "BAD INPUT", Level.ERROR, stream
     # A crash loses nothing once the final result is saved.
-    if not (at and at.progress.done and state.saved):
-        yield Tone.BAD, "BROKEN", Level.ERROR, state.journal
+    is_safe = at and at.progress.done and state.saved
+    yield Tone.BAD, "BROKEN", Level.ERROR, None if is_safe else state.journal
     for stream in inputs:
         yield Tone.ACT, "PAUSED" if at and stream.is_paused else "CHECK INPUT", Level.WARN, stream
     if checks and checks.age_s is not None:
@@ -594,8 +482,13 @@ def _result(state: NodeState) -> Iterator[Line]:
     if result:
         for warning in result.warnings:
             yield Line(Tone.ACT, "note", _typeset(warning))
-    if state.extrinsic:
-        yield from _priors(state.extrinsic)
+    contradicted = state.extrinsic.contradicted if state.extrinsic else ()
+    for axis, prior in _priors_of(state):
+        text = f"{axis} = {prior.replace('+/-', ' ± ')}"
+        if axis in contradicted:
+            yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
+        else:
+            yield Line(Tone.BUSY, "prior", text)
     if state.progress and (comparison := state.progress.comparison):
         tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
         yield Line(tone, "compared with what is installed", _typeset(comparison.sentence))
@@ -615,18 +508,6 @@ def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
         tone = Tone.ACT
         text = "nothing: the node has ended"
     return Line(tone, "on /tf_static", text)
-
-
-def _priors(extrinsic: ExtrinsicState) -> Iterator[Line]:
-    """Yield the priors that are set, with contradictions to the motion."""
-    for axis in AXES:
-        if axis not in extrinsic.priors:
-            continue
-        text = f"{axis} = {extrinsic.priors[axis].replace('+/-', ' ± ')}"
-        if axis in extrinsic.contradicted:
-            yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
-        else:
-            yield Line(Tone.BUSY, "prior", text)
 
 
 def state_of(text: str) -> NodeState | None:

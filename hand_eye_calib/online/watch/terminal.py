@@ -6,7 +6,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hand_eye_calib.online.watch.board import KEYS, Line, Tone, View
+from hand_eye_calib.online.watch.view import KEYS, Line, Tone, View
 
 _STYLES = {
     Tone.GOOD: "bold green",

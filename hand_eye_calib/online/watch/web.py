@@ -26,7 +26,8 @@ from urllib.parse import parse_qs, urlsplit
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.text import AXIS_UNITS, capital, prior_as_typed
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S
-from hand_eye_calib.online.watch.board import KEYS, Bar, Board, Line, Tone, View
+from hand_eye_calib.online.watch.board import Board
+from hand_eye_calib.online.watch.view import KEYS, Bar, Line, Tone, View
 
 # Period (s) at which the server looks for changes of the view.
 _LOOK_S = 0.25
@@ -84,7 +85,7 @@ class WebServer(ThreadingHTTPServer):
     ----------
     board : Board
     ask : callable
-        Called in another thread with a request of ``board.KEYS``, or with a parameter and its value
+        Called in another thread with a request of ``view.KEYS``, or with a parameter and its value
         such as ``prior.z:=1.85m+/-0.02m``; ``prior.z:=`` removes the prior.
     address : (str, int)
         Host and port. An empty host stands for all addresses of the computer, port 0 for any free

@@ -1,0 +1,128 @@
+"""What ``watch`` displays of one node, whether on a terminal or in a browser."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TypeAlias
+
+# Requests that a person can make, with their keys on a terminal.
+KEYS = {
+    "solve": "s",
+    "save": "w",
+    "reset": "r",
+    "recalibrate": "c",
+    "acknowledge": "a",
+    "forget": "f",
+}
+
+
+class Tone(Enum):
+    """Severity, with its sign: a colour alone is not readable by everybody."""
+
+    GOOD = "✓"
+    BUSY = "▶"
+    ACT = "!"
+    BAD = "✗"
+    UNKNOWN = "?"
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line with its sign, such as the health of an input."""
+
+    tone: Tone
+    name: str
+    text: str
+
+
+Lines: TypeAlias = tuple[Line, ...]
+Texts: TypeAlias = tuple[str, ...]
+# Pairs of an axis and a text.
+AxisTexts: TypeAlias = tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Progress of one axis of the parent sensor's frame towards its target.
+
+    Attributes
+    ----------
+    name : str
+        The axis, such as "about z".
+    meaning : str
+        The axis on a vehicle, such as "turn"; empty if the motion is not that of a vehicle.
+    share : float
+        Share of the information that the target needs, 0 to 1.
+    tone : Tone
+    word : str
+        Progress in words, such as "30 s left".
+    against : str
+        Standard deviation and target, such as "± 0.065 deg of 0.3 deg".
+    difference : str
+        Difference from the installed transform; empty if unknown.
+    """
+
+    name: str
+    meaning: str
+    share: float
+    tone: Tone
+    word: str
+    against: str
+    difference: str
+
+
+@dataclass(frozen=True)
+class View:
+    """Everything that is displayed of one node.
+
+    Attributes
+    ----------
+    node : str
+        Fully qualified name of the node.
+    tone, word, sentence
+        The headline.
+    facts : str
+        Amount of motion, and age of the result.
+    title : str
+        Name of the pose in ``values``.
+    values : tuple of (str, str)
+        Axes and values of the pose as printed.
+    bars : tuple of Bar
+        Progress of each axis; empty if the node monitors the mount.
+    watched : tuple of Line
+        Axes of a monitored mount; empty if the node calibrates.
+    result, reasons
+        Verdict, priors, comparison and files of the result; reasons of the verdict.
+    health : tuple of Line
+        Inputs, stream checks and journal.
+    topics : tuple of str
+        Topics with poses, if an input lacks poses.
+    buttons : tuple of str
+        Requests that are possible now, the recommended request first.
+    by_hand : tuple of str
+        Axes whose value may be measured by hand or corrected, the most important first.
+    priors : tuple of (str, str)
+        Axes and priors as typed by the user.
+    saved_in : str
+        Directory of the saved files; empty if nothing is saved.
+    answer : tuple of Line
+        Answer to the last button, for some seconds.
+    """
+
+    node: str
+    tone: Tone
+    word: str
+    sentence: str
+    facts: str = ""
+    title: str = ""
+    values: AxisTexts = ()
+    bars: tuple[Bar, ...] = ()
+    watched: Lines = ()
+    result: Lines = ()
+    reasons: Texts = ()
+    health: Lines = ()
+    topics: Texts = ()
+    buttons: Texts = ()
+    by_hand: Texts = ()
+    priors: AxisTexts = ()
+    saved_in: str = ""
+    answer: Lines = ()
