@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.stops.robot_world import Stops, solve
+from hand_eye_calib.extras.stops.closed_form import Stops
+from hand_eye_calib.extras.stops.robot_world import solve
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from reproduction.recordings import between
 from reproduction.writing import markdown_table, study_parser

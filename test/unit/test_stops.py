@@ -12,7 +12,8 @@ from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
-from hand_eye_calib.extras.stops.robot_world import Stops, solve
+from hand_eye_calib.extras.stops.closed_form import Stops
+from hand_eye_calib.extras.stops.robot_world import solve
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.offline.cli.main import main
 

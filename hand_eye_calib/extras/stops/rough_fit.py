@@ -15,7 +15,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, medians, robust_regression, robust_weights
 from hand_eye_calib.core.checks.findings import CONVENTIONS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.stops.robot_world import Stops, closest_rotations
+from hand_eye_calib.extras.stops.closed_form import Stops, closest_rotations
 
 # Largest number of stops that are compared with each other: the time grows with its square.
 MOST_COMPARED = 150

@@ -13,7 +13,8 @@ from hand_eye_calib.core.checks.findings import Finding, finding, repair_message
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import gravest_first
 from hand_eye_calib.extras.stops.checks import LEAST_LEAD, Examination, examine
-from hand_eye_calib.extras.stops.robot_world import RobotWorld, Stops, solve
+from hand_eye_calib.extras.stops.closed_form import Stops
+from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
 from hand_eye_calib.extras.stops.rough_fit import (
     Mistakes,
     StopPoses,

@@ -1,0 +1,154 @@
+"""Stops, and closed forms of X and Z of ``A_i X = Z B_i`` as starts of a fit.
+
+Rotations maximise the sum of ``tr(R_X' R_A_i' R_Z R_B_i)``: M. Shah, *Solving the
+robot-world/hand-eye calibration problem using the Kronecker product*, Journal of Mechanisms and
+Robotics 5(3), 2013, eq. 18. Translations follow from ``R_A_i t_X - t_Z = R_Z t_B_i - t_A_i`` by
+linear least squares.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.geometry import se3
+
+# Starts from a few random stops each: two in three are clean with a tenth of outliers.
+_N_STARTS = 12
+_STOPS_PER_START = 5
+
+
+@dataclass(frozen=True)
+class Stops:
+    """Poses of both sensors at N stops.
+
+    Parameters
+    ----------
+    Ts_world_parent : (N, 4, 4) array
+        A_i, in the parent's world.
+    Ts_world_child : (N, 4, 4) array
+        B_i, in the child's world.
+    child, world : (N,) int arrays
+        Numbers of the child sensor (camera) and of its world (target); zeros if there is one.
+    """
+
+    Ts_world_parent: FloatArray
+    Ts_world_child: FloatArray
+    child: IntArray
+    world: IntArray
+
+    @classmethod
+    def of_one(cls, Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> "Stops":
+        """Return stops of one child and one world of it."""
+        zeros = np.zeros(len(Ts_world_parent), dtype=np.int64)
+        return cls(Ts_world_parent, Ts_world_child, zeros, zeros)
+
+    def __len__(self) -> int:
+        return len(self.child)
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> "Stops":
+        A = self.Ts_world_parent[rows]
+        B = self.Ts_world_child[rows]
+        return Stops(A, B, self.child[rows], self.world[rows])
+
+
+def closest_rotations(
+    R_a: FloatArray, R_b: FloatArray, weights: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the rotations X and Z (3, 3) that bring ``R_a X`` and ``Z R_b`` closest.
+
+    Parameters
+    ----------
+    R_a, R_b : (N, 3, 3) arrays
+    weights : (N,) array, optional
+        Weights of the stops.
+    """
+    weighted = R_a if weights is None else weights[:, None, None] * R_a
+    # The sum of tr(X' R_a' Z R_b), as a bilinear form of X and Z.
+    form = np.einsum("nji,nka->iajk", weighted, R_b).reshape(9, 9)
+    left, _, right = np.linalg.svd(form)
+    matrices = np.stack([left[:, 0].reshape(3, 3), right[0].reshape(3, 3)])
+    sign = -1.0 if np.linalg.det(matrices[0]) < 0 else 1.0
+    X, Z = se3.nearest_rotation(sign * matrices)
+    return X, Z
+
+
+def start_poses(stops: Stops, counts: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return X (C, 4, 4) of all children and Z (W, 4, 4) of all worlds.
+
+    The pair with most stops is first; then pairs follow of which one side has a pose.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If some pairs share no child or world with the others, directly or through further ones.
+    """
+    n_children, n_worlds = counts.shape
+    Xs = np.zeros((n_children, 4, 4))
+    Zs = np.zeros((n_worlds, 4, 4))
+    has_X = np.zeros(n_children, dtype=bool)
+    has_Z = np.zeros(n_worlds, dtype=bool)
+    while not (has_X.all() and has_Z.all()):
+        is_next = has_X[:, None] ^ has_Z
+        next_counts = np.where(is_next, counts, 0) if has_X.any() else counts
+        if not next_counts.any():
+            raise NotEnoughDataError("the stops of some sensors or targets are tied to no others")
+        child, world = np.unravel_index(np.argmax(next_counts), counts.shape)
+        pair = stops[(stops.child == child) & (stops.world == world)]
+        A = pair.Ts_world_parent
+        B = pair.Ts_world_child
+        if has_X[child]:
+            Zs[world] = _most_central(A @ Xs[child] @ se3.inverse(B))
+        elif has_Z[world]:
+            Xs[child] = _most_central(se3.inverse(A) @ Zs[world] @ B)
+        else:
+            Xs[child], Zs[world] = _robust_start(pair)
+        has_X[child] = True
+        has_Z[world] = True
+    return Xs, Zs
+
+
+def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
+    """Return X and Z (4, 4) of one child and one world."""
+    R_A = stops.Ts_world_parent[:, :3, :3]
+    R_B = stops.Ts_world_child[:, :3, :3]
+    R_X, R_Z = closest_rotations(R_A, R_B)
+    # R_A t_X - t_Z = R_Z t_B - t_A
+    minus_one = -np.broadcast_to(np.eye(3), (len(stops), 3, 3))
+    columns = np.concatenate([R_A, minus_one], axis=2)
+    values = stops.Ts_world_child[:, :3, 3] @ R_Z.T - stops.Ts_world_parent[:, :3, 3]
+    translations = np.linalg.lstsq(columns.reshape(-1, 6), values.ravel(), rcond=1e-9)[0]
+    X = se3.from_rotation_translation(R_X, translations[:3])
+    Z = se3.from_rotation_translation(R_Z, translations[3:])
+    return X, Z
+
+
+def _robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
+    """Return the best of the closed forms of all stops and of a few, by the median error."""
+    random = np.random.default_rng(0)
+    n = len(stops)
+    candidates = [_closed_form(stops)]
+    if n > 2 * _STOPS_PER_START:
+        for _ in range(_N_STARTS):
+            rows = random.choice(n, _STOPS_PER_START, replace=False)
+            candidates.append(_closed_form(stops[rows]))
+    errors = []
+    for X, Z in candidates:
+        between = se3.inverse(stops.Ts_world_child) @ se3.inverse(Z)
+        errors.append(between @ stops.Ts_world_parent @ X)
+    return candidates[int(np.argmin(_logs_of_medians(np.stack(errors))))]
+
+
+def _most_central(Ts: FloatArray) -> FloatArray:
+    """Return the transform (4, 4) of (N, 4, 4) with the smallest median distance to the others."""
+    between = se3.inverse(Ts)[:, None] @ Ts
+    return Ts[int(np.argmin(_logs_of_medians(between)))]
+
+
+def _logs_of_medians(errors: FloatArray) -> FloatArray:
+    """Return the logarithm (M,) of median distance times median angle of errors (M, N, 4, 4)."""
+    tiny = np.finfo(float).tiny
+    distances_m = np.median(np.linalg.norm(errors[..., :3, 3], axis=-1), axis=1)
+    angles_rad = np.median(se3.rotation_angle(errors[..., :3, :3]), axis=1)
+    return np.asarray(np.log(distances_m + tiny) + np.log(angles_rad + tiny))
