@@ -5,8 +5,8 @@
 >>> result.T_parent_child.shape, result.verdict.value
 ((4, 4), 'USE')
 
-Names are imported when they are first used, so that importing the package takes no time and needs
-nothing but Python.
+Names are imported at their first use, so that ``import hand_eye_calib`` takes no time and needs
+only Python.
 """
 
 from importlib import import_module
@@ -15,7 +15,7 @@ from typing import Any
 from hand_eye_calib import core, extras, formats, offline, online
 from hand_eye_calib.core.base.registry import PUBLIC_NAMES
 
-# Module of every public name; the extras register theirs.
+# Module of every public name of core, formats and offline; extras register their names.
 _MODULES = {
     "CalibratorConfig": "hand_eye_calib.core.base.config",
     "Calibrator": "hand_eye_calib.core.engine.calibrator",

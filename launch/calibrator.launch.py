@@ -1,9 +1,9 @@
-"""Starts the node ``calibrator`` on two topics with poses.
+"""Launch file of the node ``calibrator``, on two topics with poses.
 
 ros2 launch hand_eye_calib calibrator.launch.py parent_topic:=/lidar/odom child_topic:=/camera/odom
 
-Every parameter of the node is an argument of the same name; one that is not given is left to the
-parameter file.
+Every parameter of the node is an argument of the same name. An argument that is not set leaves its
+parameter to the parameter file.
 """
 
 import contextlib
@@ -26,15 +26,15 @@ PARAMETERS = {
     for field in dataclasses.fields(config)
 }
 
-# Beside this folder, in the repository as in an installed package.
+# The folder config is next to the folder launch, in the repository and when installed.
 CONFIG_FILE = Path(__file__).parents[1] / "config" / "calibrator.yaml"
 
-# Topics that may be other ones: argument to the node's own name.
+# Topics that may be remapped: arguments of this file, and names in the node.
 REMAPPED = {"parent_topic": "parent_odom", "child_topic": "child_odom"}
 REMAPPED |= {f"{name}_topic": f"{name}_odom" for name in other_names()}
 REMAPPED |= {"tf_topic": "/tf", "tf_static_topic": "/tf_static"}
 
-# Name, default and description of the arguments that are not parameters of the node's own.
+# Arguments that are no parameters of the node: name, default and description.
 ARGUMENTS = {name: (topic, f"Topic in place of {topic}.") for name, topic in REMAPPED.items()} | {
     "config_file": (str(CONFIG_FILE), "File with the node's parameters."),
     "name": ("calibrator", "Name of the node."),
@@ -46,12 +46,12 @@ ARGUMENTS = {name: (topic, f"Topic in place of {topic}.") for name, topic in REM
 
 
 def value_of(text: str, field: dataclasses.Field) -> bool | int | float | str:
-    """Value of a parameter as it is typed.
+    """Return the value of a parameter from its text.
 
     Raises
     ------
     ConfigError
-        If it is not allowed.
+        If the value is not allowed.
     """
     kind = float if field.metadata["words"] else type(field.default)
     value: bool | int | float | str = text
@@ -64,52 +64,53 @@ def value_of(text: str, field: dataclasses.Field) -> bool | int | float | str:
 
 
 def describe(field: dataclasses.Field) -> str:
-    """Help for a parameter's argument."""
+    """Return the help of the argument of a parameter."""
     choices = field.metadata["choices"]
     allowed = f" One of {', '.join(choices)}." if choices else ""
     return f"{field.metadata['doc']}{allowed} Empty leaves it to the parameter file."
 
 
-def given(context: LaunchContext, name: str) -> str:
-    """The value of an argument; empty if it was not given."""
+def argument(context: LaunchContext, name: str) -> str:
+    """Return the value of an argument; empty if it is not set."""
     return LaunchConfiguration(name).perform(context)
 
 
 def logger_name(context: LaunchContext) -> str:
-    """Of the node: its namespaces, which a group around this file may add to, and its name."""
+    """Return the name of the node's logger, with the namespaces of groups around this file."""
     outer = context.launch_configurations.get("ros_namespace", "")
-    own = given(context, "namespace")
-    parts = [own] if own.startswith("/") else [outer, own]
-    words = [word for part in parts for word in part.split("/") if word]
-    return ".".join([*words, given(context, "name")])
+    own = argument(context, "namespace")
+    namespace = own if own.startswith("/") else f"{outer}/{own}"
+    names = [*namespace.split("/"), argument(context, "name")]
+    return ".".join(filter(None, names))
 
 
 def is_true(context: LaunchContext, name: str) -> bool:
-    """Whether an argument is true.
+    """Return whether an argument is true.
 
     Raises
     ------
     ConfigError
-        If it is neither true nor false.
+        If the argument is neither true nor false.
     """
-    text = given(context, name).lower()
+    text = argument(context, name).lower()
     if text not in ("true", "false"):
         raise ConfigError(f"{name} must be true or false; got '{text}'")
     return text == "true"
 
 
 def calibrator(context: LaunchContext) -> list[Node]:
-    """The node, with the parameters that were given."""
+    """Return the node, with the parameters that are set."""
     parameters = {}
     for name, field in PARAMETERS.items():
-        if text := given(context, name):
+        if text := argument(context, name):
             value = value_of(text, field)
-            is_text = isinstance(value, str)  # which launch would read as YAML
-            as_it_is = ParameterValue(LaunchConfiguration(name), value_type=str)
-            parameters[name] = as_it_is if is_text else value
-    if given(context, "use_sim_time"):
+            # launch would read a text as YAML.
+            if isinstance(value, str):
+                value = ParameterValue(LaunchConfiguration(name), value_type=str)
+            parameters[name] = value
+    if argument(context, "use_sim_time"):
         parameters["use_sim_time"] = is_true(context, "use_sim_time")
-    level = given(context, "log_level")
+    level = argument(context, "log_level")
     return [
         Node(
             package="hand_eye_calib",
@@ -126,7 +127,7 @@ def calibrator(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments and node."""
+    """Return arguments and node."""
     arguments = ARGUMENTS | {name: ("", describe(field)) for name, field in PARAMETERS.items()}
     return LaunchDescription(
         [

@@ -1,4 +1,4 @@
-"""The live session, the ROS node around it, and what shows it."""
+"""The live session, the ROS node around it, and its views for a person."""
 
 from typing import Any
 

@@ -69,9 +69,9 @@ class SolveCycle:
     ----------
     is_solving : bool
     result : Calibration or None
-        Result of the session: the newest usable one, or, once the goal is reached, the one that the
-        goal keeps. The warnings explain why a newer result was not taken. If the motion contradicts
-        a prior, a result with the verdict DO NOT USE replaces it.
+        Result of the session: the newest usable result or, once the goal is reached, the result
+        that the goal keeps. The warnings explain why a newer result was not taken. If the motion
+        contradicts a prior, a result with the verdict DO NOT USE replaces it.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class SolveCycle:
         """Start over with other options than before, and check at once.
 
         If only targets have changed, the result stays and gets a new verdict at once, because the
-        robot may stand still by now.
+        robot may be parked by now.
         """
         self._certain = {}
         self._option_warnings = ()
@@ -181,7 +181,7 @@ class SolveCycle:
         )
 
     def result_to_save(self) -> Calibration | None:
-        """Return the result, with a warning if every solve since has failed; None without one."""
+        """Return the result, with a warning if every solve since has failed, or None."""
         if self.result is None or self.standing is not Standing.OUTDATED:
             return self.result
         return replace(self.result, warnings=(*self.result.warnings, self.problem))
@@ -317,7 +317,7 @@ class SolveCycle:
         self._failing_since_s = None
 
     def _take(self, newest: Calibration) -> tuple[bool, str]:
-        """Make a usable calibration the session's result, unless the goal keeps a better one."""
+        """Make a usable calibration the session's result, unless the goal keeps a better result."""
         was_done = self.goal.progress.done
         progress = self.goal.add(newest, self._motion, self.checks.faults())
         result = self.goal.best or newest
@@ -338,7 +338,7 @@ class SolveCycle:
         return result.status is SolveStatus.OK, self._describe(result, every_s)
 
     def _describe(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
-        """Return a line about a calibration with its reasons and warnings, and log new ones.
+        """Return a line about a calibration with its reasons and warnings, and log what is new.
 
         Reasons are logged only if more motion would not help; before, the progress names what to
         do.

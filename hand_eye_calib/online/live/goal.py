@@ -1,5 +1,7 @@
-"""Progress of a recording session: distance to the target on each axis, time left, most helpful
-motion, and whether the present motion can reach the target.
+"""Progress of a recording session.
+
+It has the distance to the target on each axis, the time left, the most helpful motion, and whether
+the present motion can reach the target.
 
 A single standard deviation below the target is no reason to stop, because a short recording does
 not contain the time-correlated errors yet. The rule was tuned on recordings with known truth, see
@@ -34,7 +36,7 @@ _CORRELATION_TIMES = 10.0
 # finite step, the present motion cannot reach the target.
 _STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, np.inf])
 
-# Largest ratio of standard deviations at which a newer result replaces the best one: standard
+# Largest ratio of standard deviations at which a newer result replaces the best result: standard
 # deviations are estimates, and the newer result has more motion.
 _AS_GOOD = 1.25
 
@@ -62,7 +64,8 @@ class Goal:
     """Goal of a session, compared with each new result.
 
     Once the goal is reached, it stays reached, unless a result is refuted or the options change.
-    ``best`` is the newest result that reaches the goal, unless an earlier one is clearly better.
+    ``best`` is the newest result that reaches the goal, unless an earlier result is clearly
+    better.
 
     Parameters
     ----------
@@ -97,14 +100,14 @@ class Goal:
         self.progress = self._nothing_yet(sentence)
 
     def wait(self, sentence: str) -> None:
-        """Store the reason why there is no result yet; ignored once there is one."""
+        """Store the reason why there is no result yet; ignored once there is a result."""
         if self._newest is None:
             self.progress = self._nothing_yet(sentence)
 
     def follow(self, targets: Targets) -> None:
         """Start over with these targets, because options have changed.
 
-        Earlier results still confirm the next one, because the robot may stand still by now.
+        Earlier results still confirm the next result, because the robot may be parked by now.
         """
         self._targets = np.asarray(targets, dtype=float)
         self._start_over("Solving with the new options." if self._newest else _NO_RESULT)
@@ -136,7 +139,7 @@ class Goal:
             Findings of the stream checks. The goal is not reached while there are any.
         """
         newest = _Result(calibration, motion, faults or _own_faults(calibration))
-        # A result without more motion cannot confirm the one before: the robot stands still.
+        # Without more motion a result cannot confirm the previous result: the robot is parked.
         if motion.motion_s > self._motion_s:
             self._before = self._newest
             self._motion_s = motion.motion_s
@@ -167,7 +170,7 @@ class Goal:
         return self.progress
 
     def _update_best(self, newest: _Result, ratio: float) -> None:
-        """Make the newest result the best one if it reaches the goal, unless it is clearly worse.
+        """Make the newest result the best result if it reaches the goal and is not clearly worse.
 
         Parameters
         ----------
@@ -191,8 +194,8 @@ class Goal:
     def _is_confirmed(self, newest: Calibration) -> bool:
         """Whether the previous result, from less motion, reaches the goal, too.
 
-        Its allowance and priors are replaced by those of the newest result, because options may
-        have changed in between.
+        Allowance and priors are taken from the newest result, because options may have changed in
+        between.
         """
         before = self._before
         if before is None or before.faults or not before.is_long:
@@ -205,7 +208,7 @@ class Goal:
         """Ratios (6,) of the measured variances to the variances that are allowed for them.
 
         The wanted variance includes the allowance, which no motion reduces: the rest is allowed for
-        the measured variance. Allowance and priors are those of the newest result.
+        the measured variance. Allowance and priors are taken from the newest result.
         """
         wanted = _SHARE * self._targets
         room = np.maximum(wanted**2 - newest.allowance**2, _LEAST_ROOM * wanted**2)

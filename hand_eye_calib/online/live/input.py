@@ -220,7 +220,7 @@ class PoseInput:
         self._session = session
         self._log = log
         self._on_jump_back = on_jump_back
-        # What the sensor measures, by the options.
+        # Kind of measurements, by the options.
         self._wanted = "auto"
         self._guard = StampGuard()
         self._refused = Counter[str]()
@@ -489,7 +489,7 @@ class PoseInput:
 
 
 def repeated_stamps(stamp_ns: int) -> str:
-    """Return fault and remedy of a stream whose stamps repeat, one of which is ``stamp_ns``."""
+    """Return fault and remedy of a stream whose stamps repeat, such as ``stamp_ns``."""
     kind = "repeat" if stamp_ns % STAMP_UNITS["s"] else "have whole seconds only"
     return f"the stamps {kind}: have the publisher set header.stamp for every message"
 

@@ -116,7 +116,7 @@ class SessionJournal:
             self._jobs.put(partial(self._write, poses, self._about()))
 
     def begin(self) -> None:
-        """Start a new session without poses, and keep the present one aside."""
+        """Start a new session without poses, and keep the present session aside."""
         self.flush()
         self.error = ""
         self._jobs.put(self._close)

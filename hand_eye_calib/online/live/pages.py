@@ -1,4 +1,4 @@
-"""The process beside the node that writes the pages of a session."""
+"""The process that writes the pages of a session, apart from the node."""
 
 import os
 import pickle
@@ -9,7 +9,7 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError, printable
 from hand_eye_calib.core.base.registry import SESSION_PAGES
 from hand_eye_calib.core.engine.session_result import SessionResult
 
-# Priority of the process. With 15 the pages took half a minute beside busy programs.
+# Priority of the process. The pages took half a minute with 15, while other programs were busy.
 _NICENESS = 3
 
 

@@ -95,7 +95,7 @@ class LiveSession:
         Raises
         ------
         ConfigError
-            If the session cannot use such a stream, or not beside the other stream.
+            If the session cannot use such a stream, or not together with the other stream.
         """
         is_pair = stream in STREAMS
         if measures != "poses" and not (is_pair and self._is_solved):
@@ -235,7 +235,7 @@ def _for_other_child(config: CalibratorConfig) -> CalibratorConfig:
     """Return the options for a further child sensor: defaults for all values of the child."""
     names = {item.name for item in fields(config) if item.name.startswith(("prior_", "child_"))}
     for name in ("time_offset", "scale"):
-        # A text such as "estimate" holds for all child sensors.
+        # A text such as "estimate" applies to all child sensors.
         if not isinstance(getattr(config, name), str):
             names.add(name)
     return replace(config, given=config.given - names, **defaults_of(names))

@@ -1,4 +1,4 @@
-"""The solving process beside the node: its jobs, its answers, and both ends of its pipes.
+"""The solving process of the node: its jobs, its answers, and both ends of its pipes.
 
 A solve in a thread would share the interpreter with the callbacks: on a slow machine their latency
 rises to a second. The process imports the engine and nothing of ROS. Jobs and answers are pickles,
@@ -40,8 +40,8 @@ from hand_eye_calib.online.live.stream_checks import merged
 # Not `-m`: the classes would belong to the module __main__, which the node does not have.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
 
-# Priority of the process: other programs get twice its share of a processor. With a higher value a
-# solve takes minutes beside busy programs; the latency of the callbacks is the same with any value.
+# Priority of the process: other programs get twice its share of a processor. A higher value makes a
+# solve take minutes while other programs are busy. The latency of callbacks does not depend on it.
 _NICENESS = 3
 
 # Time (s) after which a job counts as hung: live sessions are solved in seconds.
@@ -179,8 +179,8 @@ def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
     """Add errors in the newest poses as they were received, if older poses are paired already.
 
     A check of a session uses the pairs, for which one stream is interpolated. Interpolation hides
-    poses of two sources that alternate. None of 232 windows of sound recordings has such an error;
-    1 of 15 has enough jumps for a warning, which is left to the check of the pairs.
+    poses of two sources that alternate. None of 232 windows of sound recordings has such an error.
+    Warnings are left to the check of the pairs, because 1 of 15 windows has enough jumps for one.
     """
     if not len(snapshot.kept):
         return result

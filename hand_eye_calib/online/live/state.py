@@ -1,7 +1,7 @@
 """The state of the node as one document.
 
 It is published as JSON, and ``/diagnostics`` and ``watch`` are made from it. All values are in SI
-units. Mappings by axis have x, y, z, roll, pitch and yaw. None stands for an unknown value.
+units. Mappings by axis have x, y, z, roll, pitch and yaw. None means unknown.
 """
 
 from collections.abc import Iterator, Mapping
@@ -28,7 +28,7 @@ AxisValues: TypeAlias = Mapping[str, float | None]
 
 
 def by_axis(values: FloatArray) -> AxisValues:
-    """Return values (6,) by axis; None for those that are not finite."""
+    """Return values (6,) by axis; None for a value that is not finite."""
     return dict(zip(AXES, plain(values), strict=True))
 
 
@@ -80,8 +80,8 @@ class ResultState:
     Attributes
     ----------
     pose, pose_sigma : mapping of str to float or None
-        x, y, z (m), roll, pitch, yaw (rad) and their standard deviations as printed; None for an
-        axis that is not determined.
+        x, y, z (m), roll, pitch, yaw (rad) as printed, and standard deviations. None for an axis
+        that is not determined.
     age_s : float
         Time since the solve (s).
     """
@@ -270,7 +270,7 @@ class NodeState:
 
     @property
     def result(self) -> ResultState | None:
-        """The session's result; None without one."""
+        """The session's result, or None."""
         return self.extrinsic.result if self.extrinsic else None
 
     @property

@@ -46,7 +46,7 @@ class StreamChecks:
         self._lasting = open_findings
 
     def take(self, result: CheckResult) -> None:
-        """Store the result of a check, and log new findings and those that are gone."""
+        """Store the result of a check, and log findings that are new or gone."""
         before = self._faults
         self._result = result
         self._checked_at_s = time.monotonic()
@@ -64,7 +64,7 @@ class StreamChecks:
         for key, finding in self._faults.items():
             if finding.makes_unusable and finding.code in RAW_POSE_CODES:
                 self._lasting[key] = finding
-        # Findings of this check replace lasting ones: their values are newer.
+        # Findings of this check replace lasting findings: their values are newer.
         self._faults = {**self._lasting, **self._faults}
         for key in self._faults.keys() - before.keys():
             self._log.warning(_in_parameters(self._faults[key]))
@@ -100,7 +100,7 @@ class StreamChecks:
 
 
 def merged(newest: Sequence[Finding], earlier: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings without earlier ones that the newest repeat, the gravest first.
+    """Return all findings except earlier ones that the newest repeat, the gravest first.
 
     A finding repeats another one of the same code and stream.
     """

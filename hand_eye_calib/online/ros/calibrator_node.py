@@ -73,7 +73,7 @@ class CalibratorNode(Node):
         options = self._options.node
         config = self._options.calibrator
         self._config = config
-        # From now on, participants may choose a directory below this one.
+        # From now on, participants may only choose a directory below this directory.
         self._output_base = output_path(options.output_directory or ".").resolve()
         if options.monitor:
             config.require_poses("monitor")
@@ -256,14 +256,14 @@ class CalibratorNode(Node):
         name = self.get_fully_qualified_name()
         steady_s = time.monotonic()
         accepts_poses = self._inputs[0].is_enabled
-        # A robot may stand still once there is a result. A topic without a publisher is worth a
-        # look, unless the goal is reached.
+        # A robot may be parked once there is a result. A topic without a publisher is worth a look,
+        # unless the goal is reached.
         silent = [source.is_silent(steady_s) for source in self._inputs[:2]]
-        stands_still = cycle.published is not None and all(silent)
+        is_parked = cycle.published is not None and all(silent)
         is_done = cycle.goal.progress.done
         inputs = {}
         for source in self._inputs:
-            may_rest = stands_still and (is_done or source.publishers != ())
+            may_rest = is_parked and (is_done or source.publishers != ())
             inputs[source.name] = source.state(steady_s, may_rest)
         if self._mount is not None:
             return NodeState(node=name, mount=self._mount.state(), inputs=inputs)

@@ -47,7 +47,7 @@ class RosInput(PoseInput):
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
-        # Each with its callback, which takes a message and the information about it.
+        # Subscriptions and callbacks; a callback takes a message and information about the message.
         self._subscribed: list[tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]] = []
 
     def take_waiting(self) -> bool:
@@ -146,8 +146,8 @@ class TopicInput(RosInput):
                 self._relative_topic,
                 callback,
                 quick(),
-                # As bytes: to make the objects of a message takes ten times as long as to read the
-                # pose out of its bytes.
+                # Messages come as bytes. To make the objects of a message takes ten times as long
+                # as to read the pose from its bytes.
                 raw=True,
                 qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
             )

@@ -27,7 +27,7 @@ def main(args: list[str] | None = None) -> int:
     Parameters
     ----------
     args : list of str, optional
-        Arguments without the name of the program; by default those of the process.
+        Arguments without the name of the program; by default the arguments of the process.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def _run_node(signals: int) -> int:
 
     def wait_for_signal() -> None:
         os.read(signals, 1)
-        # As a task: executor.wake() alone does not make spin_once() return.
+        # A task is needed: executor.wake() alone does not make spin_once() return.
         executor.create_task(stopping.set)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()

@@ -186,7 +186,7 @@ class Robot:
 
 
 def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
-    """Return a result whose only unobservable axis, of the translation, is the installed one."""
+    """Return a result with the installed value on its only unobservable axis of translation."""
     hidden = calibration.unobservable()
     if len(hidden) != 1 or hidden[0] in (*ROTATIONS, *calibration.out_of_reach):
         return calibration

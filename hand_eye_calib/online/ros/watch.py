@@ -150,8 +150,8 @@ class Session:
 def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     """Function that displays a view, or the QR code of the page's address.
 
-    A terminal has the view on its whole screen. A file or a pipe receives lines, and no line again
-    that differs from an earlier one only in its numbers.
+    A terminal displays the view on its whole screen. A file or a pipe receives lines. A line that
+    differs from the last lines only in its numbers is not repeated.
     """
     from rich.live import Live
     from rich.text import Text

@@ -25,7 +25,7 @@ from hand_eye_calib.online.ros.conversions import LATCHED
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.online.watch.board import Board, state_of
 
-# Nodes that are heard, and topics with poses that are listed, at most.
+# Largest number of nodes whose state is received, and of topics with poses in the list.
 _MAX_NAMES = 20
 
 # Time (s) after which a request counts as unanswered.

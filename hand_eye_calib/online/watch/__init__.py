@@ -1,1 +1,1 @@
-"""The live node as a person sees it: one model, shown on a terminal and in a browser."""
+"""The live node for a person: one view, on a terminal and in a browser."""

@@ -99,7 +99,8 @@ class Board:
     def __init__(self, wanted: str = "") -> None:
         self.topics: Texts = ()
         self._wanted = wanted
-        # Each with its time (s). A pair is assigned at once, so that no thread reads half of it.
+        # State and answer with their times (s). A tuple is assigned at once, so that no thread
+        # reads half of it.
         self._newest: tuple[NodeState, float] | None = None
         self._answer: tuple[Line, float] | None = None
         self._acknowledged: tuple[str, int | None] | None = None
@@ -466,7 +467,7 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
             continue
         tone = _TONES[part.level]
         text = part.text
-        # Nobody has to act before the first check.
+        # No action is needed before the first check.
         if part is state.checks and state.checks.age_s is None:
             tone = Tone.BUSY
         if isinstance(part, InputState) and part.topic not in text:

@@ -25,7 +25,7 @@ _WIDE = 76
 # Reasons that are displayed at most.
 _MAX_REASONS = 3
 
-# Label of a request beside its key, where it is not the name of the request.
+# Labels of requests that differ from their names.
 _LABELS = {"forget": "forget priors"}
 
 
@@ -38,7 +38,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
     width : int
         Width of the terminal (columns).
     footer : str
-        Text beside the keys, such as the address of the page.
+        Text after the keys, such as the address of the page.
     """
     word = f" {view.tone.value} {view.word} "
     parts: list[RenderableType] = [

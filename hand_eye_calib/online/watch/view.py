@@ -1,4 +1,4 @@
-"""What ``watch`` displays of one node, whether on a terminal or in a browser."""
+"""The content that ``watch`` displays of a node, on a terminal or in a browser."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -72,7 +72,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class View:
-    """Everything that is displayed of one node.
+    """The whole content of one node.
 
     Attributes
     ----------

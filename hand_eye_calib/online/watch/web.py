@@ -1,8 +1,8 @@
 """A view in a browser: a server of one page, which loads nothing from the internet.
 
-The server sends the view as server-sent events, each a fragment of HTML that replaces the last one.
-Buttons of the page send requests back. Every request needs the key in the address of the page, so
-that other pages in the same browser cannot use the server.
+The server sends the view as server-sent events; an event is a fragment of HTML that replaces the
+last fragment. Buttons of the page send requests back. Every request needs the key in the address of
+the page, so that other pages in the same browser cannot use the server.
 """
 
 import contextlib
@@ -59,7 +59,7 @@ _POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancesto
 def _user_key() -> str:
     """Return the key of this user, the same at every start, so that an open page reconnects.
 
-    The key is a new one if no file that only this user can read can store it.
+    The key is new if it cannot be stored in a file that only this user can read.
     """
     new_key = secrets.token_urlsafe(6)
     with contextlib.suppress(OSError, RuntimeError, ValueError):
@@ -88,8 +88,7 @@ class WebServer(ThreadingHTTPServer):
         Called in another thread with a request of ``view.KEYS``, or with a parameter and its value
         such as ``prior.z:=1.85m+/-0.02m``; ``prior.z:=`` removes the prior.
     address : (str, int)
-        Host and port. An empty host stands for all addresses of the computer, port 0 for any free
-        port.
+        Host and port. An empty host means all addresses of the computer, port 0 any free port.
 
     Raises
     ------
@@ -117,7 +116,7 @@ class WebServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, name="web", daemon=True).start()
 
     def addresses(self) -> list[str]:
-        """Return addresses of the page; the first one works on other computers too."""
+        """Return addresses of the page; the first address works on other computers too."""
         hosts = [self._host or "localhost"]
         probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         # A computer without a network raises.
@@ -251,7 +250,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     """Return the HTML of a view without buttons and links.
 
     Buttons and links stay in the page, because a button that is replaced under a finger misses the
-    press. Attributes of the first element list those to be displayed.
+    press. Attributes of the first element list the buttons and links to display.
 
     Parameters
     ----------
