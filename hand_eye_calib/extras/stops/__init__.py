@@ -43,15 +43,16 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _are_stops(arguments: Any) -> bool:
-    if not arguments.child_topic and bool(arguments.target) != bool(arguments.camera):
+    """Return whether arguments ask for stops; refuse contradictions."""
+    are_images = bool(arguments.target) and not arguments.child_topic
+    if not arguments.child_topic and are_images != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
-    are_images = arguments.target and not arguments.child_topic
     are_samples = len(arguments.paths) == 1 and arguments.paths[0].suffix in _SAMPLES
     if arguments.setup and not (are_samples or are_images):
         raise ConfigError(
             "--setup says where the camera of an arm is; it needs the samples of an arm or --target"
         )
-    return bool(are_samples or are_images or arguments.order == "none")
+    return are_samples or are_images or arguments.order == "none"
 
 
 def _calibrate(arguments: Any, _: Any) -> int:

@@ -1,9 +1,11 @@
-"""Stops for ``calibrate``: the samples of an arm, the poses of two files by their rows, or poses of
-a hand and images of a target.
+"""Command ``calibrate`` for stops.
+
+Stops are the samples of an arm, the poses of two files by their rows, or the poses of a hand and
+images of a target.
 """
 
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,77 +30,110 @@ from hand_eye_calib.offline.cli.reading import read_files
 
 
 def solved(arguments: Namespace) -> tuple[Calibration, Document]:
-    """The calibration, and where the poses came from in plain values."""
+    """Return the calibration, and the sources of the poses in plain values."""
     options = options_from(arguments)
     config = CalibratorConfig.from_options(options)
     _refuse_ignored(arguments)
-    if len(arguments.paths) == 1:
-        path = arguments.paths[0]
-        samples = read_arm_samples(path)
-        inputs = {"samples": {"file": str(path), "poses": len(samples.robot)}}
-        result = calibrate_arm(
-            samples.robot, samples.tracking, config, samples.frames, arguments.setup
-        )
-        return result, inputs
-    if len(arguments.paths) != 2:
+    paths = [Path(path) for path in arguments.paths]
+    if len(paths) == 1:
+        samples = read_arm_samples(paths[0])
+        setup = arguments.setup
+        result = calibrate_arm(samples.robot, samples.tracking, config, samples.frames, setup)
+        return result, {"samples": _input(paths[0], len(samples.robot))}
+    if len(paths) != 2:
         raise ConfigError("--order none takes two trajectory files, or the samples of an arm")
-    parent_path, child_path = map(Path, arguments.paths)
-    images: list[Path] = []
-    if arguments.target:
-        target_images = TARGET_IMAGES["folder"]()
-        if not child_path.is_dir():
-            raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
-        images = target_images.images_in(child_path)
-    of_poses = [parent_path] if arguments.target else arguments.paths
     arguments.pair_by = arguments.pair_by or "row"
-    files = read_files(arguments, of_poses, options)
+    if arguments.target:
+        return _from_images(arguments, config, options)
+    return _from_two_files(arguments, config, options)
+
+
+def _from_two_files(
+    arguments: Namespace, config: CalibratorConfig, options: Options
+) -> tuple[Calibration, Document]:
+    """Calibrate two sensors from the rows of two files."""
+    parent, child = _read(arguments, arguments.paths, options)
+    _require_equal(arguments.paths, len(parent), len(child))
+    config = _measuring(config, {"parent": parent, "child": child})
+    result = calibrate_stops(parent.poses, child.poses, config)
+    return result, _inputs(arguments, len(parent), len(child))
+
+
+def _from_images(
+    arguments: Namespace, config: CalibratorConfig, options: Options
+) -> tuple[Calibration, Document]:
+    """Calibrate an arm from a file of the poses of its hand and a folder of images of a target."""
+    hand_path, folder = map(Path, arguments.paths)
+    target_images = TARGET_IMAGES["folder"]()
+    if not folder.is_dir():
+        raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
+    images = target_images.images_in(folder)
+    (hand,) = _read(arguments, [hand_path], options)
+    _require_equal(arguments.paths, len(hand), len(images))
+    config = _measuring(config, {"parent": hand})
+    target = target_images.Target.parse(arguments.target)
+    finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
+    for image in with_progress(images, len(images), "finding the target"):
+        finder.look(target_images.read_image(image))
+    detections = finder.found()
+    note(str(detections))
+    result = calibrate_arm(
+        hand.poses[detections.images], detections.Ts_camera_target, config, setup=arguments.setup
+    )
+    return result, _inputs(arguments, len(hand), len(detections.images))
+
+
+def _read(
+    arguments: Namespace, paths: Sequence[str | Path], options: Options
+) -> Sequence[Trajectory]:
+    """Read trajectory files, and print what was repaired."""
+    files = read_files(arguments, paths, options)
     note(*files.repairs, *files.warnings)
-    parent, *others = files.trajectories
-    n_child = len(others[0]) if others else len(images)
-    if len(parent) != n_child:
+    return files.trajectories
+
+
+def _require_equal(paths: Sequence[str | Path], n_parent: int, n_child: int) -> None:
+    """Check that both sides have as many stops."""
+    if n_parent != n_child:
         raise InputError(
-            f"{parent_path} has {len(parent)} poses and {child_path} {n_child}: stops are paired "
-            "by the rows, and by the names of images; give as many of both"
+            f"{paths[0]} has {n_parent} poses and {paths[1]} {n_child}: stops are paired by the "
+            "rows, and by the names of images; give as many of both"
         )
-    config = _measuring(config, dict(zip(STREAMS, (parent, *others), strict=False)))
-    if others:
-        found = calibrate_stops(parent.poses, others[0].poses, config)
-    else:
-        target = target_images.Target.parse(arguments.target)
-        finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
-        for image in with_progress(images, len(images), "finding the target"):
-            finder.look(target_images.read_image(image))
-        seen = finder.found()
-        n_child = len(seen.images)
-        note(str(seen))
-        found = calibrate_arm(
-            parent.poses[seen.images], seen.Ts_camera_target, config, setup=arguments.setup
-        )
-    counts = zip(STREAMS, arguments.paths, (len(parent), n_child), strict=True)
-    return found, {each: {"file": str(path), "poses": count} for each, path, count in counts}
+
+
+def _input(path: str | Path, n_poses: int) -> Document:
+    return {"file": str(path), "poses": n_poses}
+
+
+def _inputs(arguments: Namespace, n_parent: int, n_child: int) -> Document:
+    """Return the sources of both sides in plain values."""
+    parent_path, child_path = arguments.paths
+    return {"parent": _input(parent_path, n_parent), "child": _input(child_path, n_child)}
 
 
 def _refuse_ignored(arguments: Namespace) -> None:
-    """Refuse arguments that stops have no use for."""
-    names = ["topics", *(f"{stream}_{name}" for stream in STREAMS for name in ("topic", "fields"))]
+    """Refuse arguments that have no meaning for stops."""
     if arguments.pair_by == "time":
         raise ConfigError("--pair-by time has no meaning for stops, which have no stamps; give row")
+    names = ["topics"]
+    of_streams = ["topic", "fields"]
     if len(arguments.paths) == 1:
         names += [*FILE_OPTIONS, "pair_by"]
-        names += [f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS]
+        of_streams += FILE_OPTIONS
+    names += [f"{stream}_{name}" for stream in STREAMS for name in of_streams]
     for name in names:
         if getattr(arguments, name, None):
             raise ConfigError(f"--{flag(name)} has no meaning for stops; leave it out")
 
 
 def _measuring(config: CalibratorConfig, streams: Mapping[str, Trajectory]) -> CalibratorConfig:
-    """The options with what the files measure, where the user has not said it."""
+    """Return the options with what the files measure, unless the user set it."""
     for stream, trajectory in streams.items():
-        name = f"{stream}_measures"
         if trajectory.measures not in ("poses", "rotations"):
             raise ConfigError(
                 f"stops need poses or rotations; those of the {stream} are {trajectory.measures}"
             )
+        name = f"{stream}_measures"
         if name not in config.given or getattr(config, name) == "auto":
             measures: Options = {name: trajectory.measures}
             config = replace(config, **measures)

@@ -1,13 +1,17 @@
-"""Samples of a robot arm: at each stop the pose of the hand, and that of a target before a camera.
+"""Samples of a robot arm: at each stop the pose of the hand and that of a target in a camera.
 
-Read are the samples of MoveIt's calibration (YAML of ``effector_wrt_world``,
-``object_wrt_sensor``, or JSON of pairs of matrices), of easy_handeye and easy_handeye2, pairs
-``T1_0``, ``T2_0`` ... in a FileStorage of OpenCV, the stacks ``robot`` and ``tracking`` of an
-``.npz``, and the arguments of OpenCV's ``calibrateHandEye`` by their names, in any of these files.
+Files that are read:
+
+- MoveIt's calibration: YAML of ``effector_wrt_world`` and ``object_wrt_sensor``, or JSON of pairs
+  of matrices;
+- easy_handeye and easy_handeye2;
+- pairs ``T1_0``, ``T2_0``, ... in a FileStorage of OpenCV;
+- the stacks ``robot`` and ``tracking`` of an ``.npz``;
+- the arguments of OpenCV's ``calibrateHandEye`` by their names, in any of these files.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +26,10 @@ from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.npz import read_arrays
 from hand_eye_calib.formats.yaml_files import read_yaml
 
-# Names of both poses of a sample, the robot's first.
+# Names of both poses of a sample: the robot's, the target's.
 _NAMES = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"), ("robot", "optical"))
 
-# Frames in files of easy_handeye and easy_handeye2.
+# Names of frames in files of easy_handeye and easy_handeye2.
 _FRAMES = {
     "base": "robot_base_frame",
     "hand": "robot_effector_frame",
@@ -39,8 +43,8 @@ _EXPECTED = (
     "R_gripper2base, t_gripper2base, R_target2cam, t_target2cam (OpenCV)"
 )
 
-# Names of the arguments of OpenCV's solvers: the quantity, and the frames it leads from and to.
-_OF_OPENCV = re.compile(r"([a-z]+)_([a-z]+)2([a-z]+)")
+# Argument of OpenCV's solvers: the quantity, and the frames that it leads from and to.
+_OPENCV_NAME = re.compile(r"([a-z]+)_([a-z]+)2([a-z]+)")
 _QUANTITIES = {
     "r": "rotation",
     "rvec": "rotation",
@@ -59,13 +63,33 @@ _OPENCV_FRAMES = {
 
 @dataclass(frozen=True)
 class ArmSamples:
-    """Samples of an arm: poses (N, 4, 4) of the hand in the robot's base and of the target in the
-    camera, and the names of base, hand, camera and target, as far as the file has them.
+    """Samples of an arm.
+
+    Attributes
+    ----------
+    robot : (N, 4, 4) array
+        Poses of the hand in the robot's base.
+    tracking : (N, 4, 4) array
+        Poses of the target in the camera.
+    frames : mapping of str to str
+        Names of base, hand, camera and target, if the file has them.
+
+    Raises
+    ------
+    InputError
+        If there are not as many poses of the robot as of the target.
     """
 
     robot: FloatArray
     tracking: FloatArray
     frames: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        if len(self.robot) != len(self.tracking):
+            raise InputError(
+                f"{len(self.robot)} poses of the robot, {len(self.tracking)} of the target: each "
+                "stop needs one of both"
+            )
 
 
 def read_arm_samples(path: str | Path) -> ArmSamples:
@@ -91,88 +115,89 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     document: Any = read_arrays(path) if is_npz else read_yaml(path, _EXPECTED)
     if isinstance(document, Mapping):
         with located(path):
-            if samples := _of_opencv(document):
-                return samples
-    if is_npz:
-        document = _rows_of_stacks(path, document)
+            samples = _opencv_samples(document)
+            if is_npz:
+                samples = samples or _stacked_samples(document)
+        if samples:
+            return samples
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
-        of_file = document.get("parameters") or {}
-        frames = {name: of_file[key] for name, key in _FRAMES.items() if of_file.get(key)}
+        parameters = document.get("parameters") or {}
+        frames = {name: parameters[key] for name, key in _FRAMES.items() if parameters.get(key)}
         # ``robot`` is the pose of the base in the hand then.
-        is_inverse = of_file.get("calibration_type") == "eye_on_base"
+        is_inverse = parameters.get("calibration_type") == "eye_on_base"
         document = document["samples"]
     elif isinstance(document, Mapping):
-        pairs = ((document.get(f"T1_{k}"), document.get(f"T2_{k}")) for k in range(len(document)))
-        document = [pair for pair in pairs if None not in pair]
+        document = [*_numbered_pairs(document)]
     if not isinstance(document, list) or not document:
         raise InputError(f"{path}: expected {_EXPECTED}")
     poses = []
     for number, sample in enumerate(document, 1):
         with located(f"{path}, sample {number}"):
-            poses.append([pose_of(value) for value in _pair(sample)])
+            poses.append([pose_of(value) for value in _both_poses(sample)])
     robot, tracking = np.swapaxes(poses, 0, 1)
-    return ArmSamples(se3.inverse(robot) if is_inverse else robot, tracking, frames)
+    if is_inverse:
+        robot = se3.inverse(robot)
+    return ArmSamples(robot, tracking, frames)
 
 
-def _rows_of_stacks(
-    path: str | Path, stacks: Mapping[str, FloatArray]
-) -> list[dict[str, FloatArray]]:
-    """The samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
-    names = next((names for names in _NAMES if {*names} <= stacks.keys()), None)
-    if names is None or any(stacks[name].ndim < 2 for name in names):
-        raise InputError(f"{path}: expected {_EXPECTED}; found {', '.join(stacks) or 'nothing'}")
-    robot, tracking = (stacks[name] for name in names)
-    if len(robot) != len(tracking):
-        raise InputError(
-            f"{path}: {len(robot)} poses of the robot, {len(tracking)} of the target: each stop "
-            "needs one of both"
-        )
-    pairs = zip(robot, tracking, strict=True)
-    return [dict(zip(names, pair, strict=True)) for pair in pairs]
+def _stacked_samples(stacks: Mapping[str, FloatArray]) -> ArmSamples:
+    """Return the samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
+    for names in _NAMES:
+        if {*names} <= stacks.keys():
+            robot, tracking = (pose_stack(stacks[name], name) for name in names)
+            return ArmSamples(robot, tracking, {})
+    raise InputError(f"expected {_EXPECTED}; found {', '.join(stacks) or 'nothing'}")
 
 
-def _of_opencv(document: Mapping[str, Any]) -> ArmSamples | None:
-    """The samples of OpenCV's arguments, such as R_gripper2base; None if there are none."""
-    parts: dict[tuple[str, str], dict[str, Any]] = {}
-    for name, value in document.items():
-        match = _OF_OPENCV.fullmatch(str(name)[:LONGEST_NAME].lower())
-        if match is None or match[1] not in _QUANTITIES:
-            continue
-        frames = _OPENCV_FRAMES.get(match[2], ""), _OPENCV_FRAMES.get(match[3], "")
-        parts.setdefault(frames, {})[_QUANTITIES[match[1]]] = value
-    robot = _joined(parts, "hand", "base")
-    tracking = _joined(parts, "target", "camera")
-    if robot is None or tracking is None:
-        return None
-    if len(robot) != len(tracking):
-        raise InputError(
-            f"{len(robot)} poses of the robot, {len(tracking)} of the target: each stop needs one "
-            "of both"
-        )
-    return ArmSamples(robot, tracking, {})
+def _numbered_pairs(document: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield the pairs T1_0, T2_0, T1_1, T2_1, ... of a document."""
+    for number in range(len(document)):
+        robot = document.get(f"T1_{number}")
+        tracking = document.get(f"T2_{number}")
+        if robot is not None and tracking is not None:
+            yield robot, tracking
 
 
-def _joined(
-    parts: Mapping[tuple[str, str], Mapping[str, Any]], source: str, target: str
-) -> FloatArray | None:
-    """Poses (N, 4, 4) of one frame in another, of rotations and translations either way."""
-    for frames in ((source, target), (target, source)):
-        pair = parts.get(frames, {})
-        if "rotation" in pair and "translation" in pair:
-            rotation = pair["rotation"]
-            translation = pair["translation"]
-            Ts = pose_stack((rotation, translation), f"{frames[0]} in {frames[1]}")
-            return Ts if frames == (source, target) else se3.inverse(Ts)
-    return None
-
-
-def _pair(sample: Any) -> Sequence[Any]:
-    """Both poses of a sample."""
+def _both_poses(sample: Any) -> Sequence[Any]:
+    """Return both poses of a sample, the robot's first."""
     if isinstance(sample, Mapping):
-        found = (names for names in _NAMES if all(name in sample for name in names))
-        sample = [sample[name] for name in next(found, ())]
+        names = next((names for names in _NAMES if {*names} <= sample.keys()), ())
+        sample = [sample[name] for name in names]
     if not isinstance(sample, Sequence) or len(sample) != 2:
         raise InputError(f"expected {_EXPECTED}")
     return sample
+
+
+# ------------------------------------------------------------------ arguments of OpenCV
+
+
+def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
+    """Return the samples of OpenCV's arguments, such as R_gripper2base; None if there are none."""
+    # Rotation and translation by the frames that they lead from and to.
+    transforms: dict[tuple[str, str], dict[str, Any]] = {}
+    for name, value in document.items():
+        match = _OPENCV_NAME.fullmatch(str(name)[:LONGEST_NAME].lower())
+        if match is None or match[1] not in _QUANTITIES:
+            continue
+        frames = _OPENCV_FRAMES.get(match[2], ""), _OPENCV_FRAMES.get(match[3], "")
+        transforms.setdefault(frames, {})[_QUANTITIES[match[1]]] = value
+    robot = _opencv_poses(transforms, "hand", "base")
+    tracking = _opencv_poses(transforms, "target", "camera")
+    if robot is None or tracking is None:
+        return None
+    return ArmSamples(robot, tracking, {})
+
+
+def _opencv_poses(
+    transforms: Mapping[tuple[str, str], Mapping[str, Any]], source: str, target: str
+) -> FloatArray | None:
+    """Return poses (N, 4, 4) of a frame in another; None if they are given neither way."""
+    for frames in ((source, target), (target, source)):
+        transform = transforms.get(frames, {})
+        if {"rotation", "translation"} <= transform.keys():
+            pair = transform["rotation"], transform["translation"]
+            Ts = pose_stack(pair, f"{frames[0]} in {frames[1]}")
+            return Ts if frames == (source, target) else se3.inverse(Ts)
+    return None
