@@ -1,23 +1,24 @@
 """Solvers that weigh all motion pairs alike, and what every solver returns.
 
-Park and Taylor: rotation by aligning rotation vectors, then translation by linear least squares.
+Park and Taylor solve AX = XB of motions A, B in two steps, with rotation vectors a, b of A and B:
 
-The coarse stages of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes, *Spatiotemporal
-camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotics and Automation
-Letters 5(2), 2020, and of Z. Taylor, J. Nieto, *Motion-based calibration of multimodal sensor
-arrays*, IEEE International Conference on Robotics and Automation, 2015, with equal weights for all
-readings. Both solve the same two least-squares problems, and their published results differ by
-rounding only; they have names of their own because the comparison of Välimäki et al. (2023) lists
-both.
+    min sum |a - R b|^2,    then    min sum |(R_A - I) t - (R t_B - t_A)|^2
 
-DNL: direct non-linear optimisation (Välimäki et al. 2023, eq. 4); and Ali, of the translation
-residual alone.
+They are the coarse stages of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes,
+*Spatiotemporal camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotics
+and Automation Letters 5(2), 2020, and of Z. Taylor, J. Nieto, *Motion-based calibration of
+multimodal sensor arrays*, IEEE International Conference on Robotics and Automation, 2015, with
+equal weights for all readings. Both solve the same two least-squares problems, and their published
+results differ by rounding only. They have names of their own because the comparison of Välimäki et
+al. (2023) lists both.
 
-That is cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E. R. Morales, *Methods for simultaneous
-robot-world-hand-eye calibration: a comparative study*, Sensors 19(12), 2019, as its authors'
-program computes it: the rotation residual of a motion pair enters only as the norm of a unit
-quaternion, a constant (Välimäki et al. 2023, section 2). The rest is the translation of AX - XB,
-a quadratic form in the same thirteen variables as dnl's cost.
+DNL minimises ``sum |A X - X B|_F^2``: direct non-linear optimisation (Välimäki et al. 2023, eq. 4).
+
+Ali minimises the translation residual alone. This is cost Xc1 of I. Ali, O. Suominen, A. Gotchev,
+E. R. Morales, *Methods for simultaneous robot-world-hand-eye calibration: a comparative study*,
+Sensors 19(12), 2019, as its authors' program computes it: the rotation residual of a motion pair
+enters only as the norm of a unit quaternion, a constant (Välimäki et al. 2023, section 2). The rest
+is the translation of AX - XB, a quadratic form in the same thirteen variables as dnl's cost.
 """
 
 from dataclasses import dataclass
@@ -29,8 +30,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers import quadratic_form
 
-# Singular values below this share of the largest are rounding: directions that the motion does not
-# reveal; they are not changed.
+# Singular values below this share of the largest one are rounding. They belong to directions that
+# the motion does not excite, which stay at zero.
 RANK_TOLERANCE = 1e-12
 
 
@@ -41,12 +42,12 @@ class Solution:
     Attributes
     ----------
     T_parent_child : (4, 4) array
-        X. Directions that the motion does not excite at all keep zero translation or the rotation
-        of the start.
+        X. Directions that the motion does not excite keep zero translation or the rotation of the
+        start.
     objective : float
         The method's own cost at X.
     converged : bool
-        Whether the iteration settled. If not, X is the best point it reached.
+        Whether the iteration settled. If not, X is the best point that was reached.
     weights : (K,) array
         Weight of each motion pair; 1 for all with methods that do not reject outliers.
     """
@@ -58,31 +59,31 @@ class Solution:
 
 
 def solve_park(pairs: MotionPairs) -> Solution:
-    """Solve AX = XB of K >= 1 pairs in two closed-form stages.
+    """Solve AX = XB of K >= 1 pairs in two closed-form steps.
 
-    ``objective`` is the sum of squared translation residuals, the cost of the second stage, in m^2.
+    ``objective`` is the sum of squared translation residuals, the cost of the second step, in m^2.
     """
-    rotation = align_rotation_vectors(pairs)
-    # (R_A - I) t = R t_B - t_A; 0 along directions that no rotation reveals.
-    moved = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    target = pairs.Ts_childi_childj[:, :3, 3] @ rotation.T - pairs.Ts_parenti_parentj[:, :3, 3]
-    found = np.linalg.lstsq(moved.reshape(-1, 3), target.ravel(), rcond=RANK_TOLERANCE)
-    T_parent_child = se3.from_rotation_translation(rotation, found[0])
+    R = align_rotation_vectors(pairs)
+    A = pairs.Ts_parenti_parentj
+    rows = A[:, :3, :3] - np.eye(3)
+    targets = pairs.Ts_childi_childj[:, :3, 3] @ R.T - A[:, :3, 3]
+    t = np.linalg.lstsq(rows.reshape(-1, 3), targets.ravel(), rcond=RANK_TOLERANCE)[0]
+    T_parent_child = se3.from_rotation_translation(R, t)
     objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
     return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
 
 
 def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
-    """Find the rotation (3, 3) from the child's rotation vectors to the parent's, in least squares.
+    """Estimate the rotation (3, 3) from the child's rotation vectors b to the parent's a.
 
-    ``R_A = R R_B R^T`` means ``log(R_A) = R log(R_B)``. The best R comes from the singular value
+    ``R_A = R R_B R'`` means ``a = R b``. The best R in least squares comes from the singular value
     decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976), mirrored back if it is a
-    reflection. No centroid is subtracted, because the vectors have a common origin. For a rotation
-    by nearly pi, noise decides the sign of the vector.
+    reflection. No centroid is subtracted, because the vectors have a common origin. If a rotation
+    is nearly pi, noise decides the sign of its vector.
     """
-    rotvecs_parent = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
-    rotvecs_child = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
-    return se3.nearest_rotation(rotvecs_parent.T @ rotvecs_child)
+    a = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
+    b = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
+    return se3.nearest_rotation(a.T @ b)
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
@@ -104,8 +105,9 @@ def solve_ali(pairs: MotionPairs) -> Solution:
 
 
 def residual_rows(pairs: MotionPairs) -> FloatArray:
-    """Matrix (3 K, 13) that maps ``x = (vec R, t, 1)``, vec row-major, to the residuals
-    ``R_A t + t_A - R t_B - t``.
+    """Return the matrix (3 K, 13) that takes x to the residuals ``R_A t + t_A - R t_B - t``.
+
+    ``x = (vec R, t, 1)`` with vec row-major.
     """
     rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
     for axis in range(3):
@@ -116,25 +118,25 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
 
 
 def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
-    """The lowest minimum (4, 4) of a form (13, 13) of pairs, and whether the search settled."""
+    """Return the lowest minimum (4, 4) of a form (13, 13), and whether the search settled."""
     Ts, values, converged = quadratic_form.minimise(Q, start_rotations(pairs))
     best = int(np.argmin(values))
     return Ts[best], bool(converged[best])
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
-    """Costs ``|A X - X B|_F^2`` (K,), which cancel less than those of condensed forms."""
+    """Return the costs ``|A X - X B|_F^2`` (K,), with more digits than condensed forms have."""
     return quadratic_form.costs(quadratic_form.coefficients(pairs), T_parent_child)
 
 
 def start_rotations(pairs: MotionPairs) -> FloatArray:
-    """Rotations (4, 3, 3) to start from.
+    """Return rotations (4, 3, 3) to start from.
 
-    The first aligns the child's rotation axes with the parent's: it is close to the answer if there
-    is rotation at all. The others do so after a rotation by pi about an axis of the child, for
-    motion with hardly any rotation.
+    The first one aligns the child's rotation axes with the parent's. It is close to the solution if
+    there is rotation at all. The others do so after a rotation by pi about an axis of the child,
+    for motion with hardly any rotation.
     """
-    # As good as rotation vectors for aligning axes, and faster.
+    # Skew parts align axes as well as rotation vectors do, and faster.
     axes_parent = se3.vee(pairs.Ts_parenti_parentj)
     axes_child = se3.vee(pairs.Ts_childi_childj)
     left, _, right = np.linalg.svd(axes_parent.T @ axes_child)

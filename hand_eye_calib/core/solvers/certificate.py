@@ -1,20 +1,24 @@
 """Proof that a minimum of a quadratic form over SE(3) is the global one.
 
-With the translation eliminated, the cost is ``x^T M x`` in ``x = (vec R, 1)``. A rotation satisfies
+With the translation eliminated, the cost is ``x' M x`` in ``x = (vec R, 1)``. A rotation satisfies
 20 independent quadratic equations (orthonormal rows and columns, right-handed both ways), and the
-last variable is 1; each is a symmetric matrix A_i with ``x^T A_i x = 0`` for every rotation, but
-for a constant. For any multipliers, ``Z = M + sum lambda_i A_i`` therefore has the same values on
-all rotations. Those with ``Z x = 0`` at the minimum leave 14 multipliers free. If some choice makes
-Z positive semidefinite, no rotation has a smaller cost: Lagrangian duality (Briales and
-Gonzalez-Jimenez, *Convex global 3D registration with Lagrangian duality*, CVPR 2017; Giamou et al.,
-*Certifiably globally optimal extrinsic calibration from per-sensor egomotion*, RA-L 2019).
+last variable is 1. Each equation is a symmetric matrix A_i with ``x' A_i x`` constant for every
+rotation. So, for any multipliers,
 
-The coordinates are turned so that the minimum is the identity. All that depends on the equations
-alone is then constant, and what is left is a Newton iteration in 14 variables with matrices of 9 x
-9.
+    Z = M + sum lambda_i A_i,    x' Z x = x' M x + constant    for all rotations.
+
+``Z x = 0`` at the minimum leaves 14 multipliers free. If some choice makes Z positive semidefinite,
+no rotation has a smaller cost: Lagrangian duality (Briales and Gonzalez-Jimenez, *Convex global 3D
+registration with Lagrangian duality*, CVPR 2017; Giamou et al., *Certifiably globally optimal
+extrinsic calibration from per-sensor egomotion*, RA-L 2019).
+
+The coordinates are rotated so that the minimum is the identity. Everything that depends on the
+equations alone is then constant. The rest is a Newton iteration in 14 variables with matrices of
+9 x 9.
 """
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,31 +26,32 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.solvers import quadratic_form
 
-# The bound may exceed the minimum by this share of it, and by this share of the form's mean
-# eigenvalue, which is rounding.
+# The bound may be below the minimum by this share of the minimum ...
 _RELATIVE = 1e-6
+# ... and by this share of the form's mean eigenvalue, which is rounding.
 _ROUNDING = 1e-11
 
+# Largest number of Newton steps.
 _MAX_STEPS = 60
 
-# The barrier's weight, first the square of this, grows by this factor once a Newton step is short,
-# until the bound is this close to the best that any multipliers give.
+# Factor of the barrier's weight once a Newton step is short. The first weight is its square.
 _SHARPENING = 10.0
+# The iteration ends when the bound is this close to the best one.
 _CLOSE = 1e-12
 
 
 def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
-    """Whether the cost at a transform is proved to be the smallest over all of SE(3).
+    """Return whether the cost at a transform is proved to be the smallest over all of SE(3).
 
     Parameters
     ----------
     Q : (13, 13) array
-        The form, see `quadratic_form`.
+        The form, see :mod:`~hand_eye_calib.core.solvers.quadratic_form`.
     T_parent_child : (4, 4) array
         Near a local minimum.
     """
     Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
-    # The form of S in R = rotation S, so that S is the identity at the minimum.
+    # The form of S in R = R_minimum S, so that S is the identity at the minimum.
     turn = np.eye(10)
     turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))
     M = turn.T @ quadratic_form.without_translation(Q[None])[0][0] @ turn
@@ -60,37 +65,39 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
 
 
 def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
-    """The smallest eigenvalue of Z, made as large as multipliers can, or just ``enough``.
+    """Return the smallest eigenvalue of Z, as large as multipliers can make it, or ``enough``.
 
-    A barrier method: minimise t with ``Z + t`` positive definite where it is not zero by
-    construction.
+    A barrier method: minimise t with ``Z + t I`` positive definite across the directions
+    perpendicular to the identity. Along the identity Z is zero by construction.
     """
-    identity, beside, equations, stationary, of_free = _tables()
-    Z = M - np.tensordot(stationary @ (M @ identity), equations, 1)
-    free = beside.T @ Z @ beside
-    derivatives = np.concatenate([beside.T @ of_free @ beside, np.eye(9)[None]])
-    shift = max(-float(np.linalg.eigvalsh(free)[0]), 0.0) + 0.1
-    unknowns = np.append(np.zeros(len(of_free)), shift)
+    tables = _tables()
+    across = tables.across
+    Z = M - np.tensordot(tables.stationary @ (M @ tables.identity), tables.equations, 1)
+    Z_across = across.T @ Z @ across
+    derivatives = np.concatenate([across.T @ tables.free @ across, np.eye(9)[None]])
+    shift = max(-float(np.linalg.eigvalsh(Z_across)[0]), 0.0) + 0.1
+    unknowns = np.append(np.zeros(len(tables.free)), shift)
     weight = _SHARPENING**2
     best = float(np.linalg.eigvalsh(Z)[0])
     for _ in range(_MAX_STEPS):
         if best >= enough:
             break
-        solved = np.linalg.solve(free + np.tensordot(unknowns, derivatives, 1), derivatives)
+        solved = np.linalg.solve(Z_across + np.tensordot(unknowns, derivatives, 1), derivatives)
         step, decrement = _newton_step(solved, weight)
         unknowns = unknowns + step
-        lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], of_free, 1))[0]
+        lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], tables.free, 1))[0]
         best = max(best, float(lowest))
         if decrement < 0.5:
-            if len(free) / weight < _CLOSE:
+            if len(Z_across) / weight < _CLOSE:
                 break
             weight *= _SHARPENING
     return best
 
 
 def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
-    """A Newton step of ``weight t - log det`` that stays inside, and the Newton decrement, by the
-    derivatives (15, 9, 9) of the matrix, its inverse times them.
+    """Return a Newton step (15,) of ``weight t - log det`` inside the cone, and its decrement.
+
+    ``solved`` (15, 9, 9) is the inverse of the matrix times its derivatives.
     """
     gradient = -np.trace(solved, axis1=1, axis2=2)
     gradient[-1] += weight
@@ -98,19 +105,39 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     hessian[np.diag_indices_from(hessian)] += 1e-14 * np.trace(hessian)
     step = -np.linalg.solve(hessian, gradient)
     decrement = float(np.sqrt(max(-gradient @ step, 0.0)))
-    # How far it is to the edge along the step.
+    # The edge of the cone along the step.
     falling = -np.linalg.eigvals(np.tensordot(step, solved, 1)).real.min()
     inside = 0.9 / falling if falling > 0 else 1.0
     return step * min(1.0, max(inside, 1.0 / (1.0 + decrement))), decrement
 
 
-@cache
-def _tables() -> tuple[FloatArray, ...]:
-    """(vec I, 1) (10,), and the directions (10, 9) beside it; symmetric matrices (21, 10, 10) of
-    the equations, independent of each other, the last variable's among them; the multipliers
-    (21, 10) that make ``Z x = 0`` for a given ``M x``, and the matrices (14, 10, 10) that keep it.
+class _Tables(NamedTuple):
+    """Constants of the equations at the identity.
+
+    Attributes
+    ----------
+    identity : (10,) array
+        (vec I, 1).
+    across : (10, 9) array
+        Directions perpendicular to ``identity``.
+    equations : (21, 10, 10) array
+        Independent symmetric matrices A_i, that of the last variable at the end.
+    stationary : (21, 10) array
+        Factors that take ``M x`` to minus the multipliers that make ``Z x = 0``.
+    free : (14, 10, 10) array
+        Combinations of the equations that keep ``Z x = 0``.
     """
-    # The equations are all that hold for many rotations.
+
+    identity: FloatArray
+    across: FloatArray
+    equations: FloatArray
+    stationary: FloatArray
+    free: FloatArray
+
+
+@cache
+def _tables() -> _Tables:
+    """Compute the constants; the equations are those that hold for many random rotations."""
     rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(200, 3)))
     x = np.append(rotations.reshape(-1, 9), np.ones((200, 1)), axis=1)
     upper = np.triu_indices(10)
@@ -120,13 +147,13 @@ def _tables() -> tuple[FloatArray, ...]:
     equations += np.swapaxes(equations, 1, 2)
     equations[20, 9, 9] = 1.0
     identity = np.append(np.eye(3).ravel(), 1.0)
-    beside = np.linalg.svd(identity[None])[2][1:].T
+    across = np.linalg.svd(identity[None])[2][1:].T
     at_identity = (equations @ identity).T
     kept = np.linalg.svd(at_identity)[2][np.linalg.matrix_rank(at_identity) :]
-    return (
-        identity,
-        beside,
-        equations,
-        np.linalg.pinv(at_identity),
-        np.tensordot(kept, equations, 1),
+    return _Tables(
+        identity=identity,
+        across=across,
+        equations=equations,
+        stationary=np.linalg.pinv(at_identity),
+        free=np.tensordot(kept, equations, 1),
     )

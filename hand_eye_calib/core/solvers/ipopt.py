@@ -1,8 +1,8 @@
-"""DNL and DNLO as the paper states them: CasADi expressions minimised by Ipopt (Välimäki et al.
-2023, section 3.2).
+"""DNL and DNLO as in the paper: CasADi expressions minimised by Ipopt.
 
-The fast solvers are tested against these. Unknowns are the rotation vector, the translation and,
-for DNLO, one weight per pair.
+The problems are eqs (4) and (5) of Välimäki et al. 2023, section 3.2. Unknowns are the rotation
+vector, the translation and, for DNLO, one weight per pair. The fast solvers are tested against
+these.
 """
 
 from typing import Any, TypeAlias
@@ -18,7 +18,7 @@ from hand_eye_calib.core.solvers.all_pairs import Solution, pair_costs
 
 casadi = required("casadi", "backend ipopt", "casadi")
 
-# CasADi has no annotations.
+# CasADi has no type annotations.
 _Expression: TypeAlias = Any
 
 _IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
@@ -62,9 +62,9 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
 def _minimum(
     problem: dict[str, _Expression], n_weights: int, **bounds: Any
 ) -> tuple[FloatArray, bool]:
-    """X (4, 4) and whether Ipopt settled, from the identity and weights 1."""
+    """Solve from the identity and weights 1: X (4, 4), and whether Ipopt settled."""
     solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
-    # At zero the rotation angle has no derivative.
+    # The rotation angle has no derivative at zero.
     answer = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
     pose = np.array(answer["x"]).ravel()[:6]
     T_parent_child = se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
@@ -72,7 +72,10 @@ def _minimum(
 
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
-    """(1, K) expression of ``|A X - X B|_F^2``, mapped over the pairs: a small graph."""
+    """Expression (1, K) of ``|A X - X B|_F^2``.
+
+    One function is mapped over the pairs, which keeps the graph small.
+    """
     motion_a = casadi.SX.sym("A", 3, 4)
     motion_b = casadi.SX.sym("B", 3, 4)
     x = casadi.SX.sym("x", 6)
@@ -92,12 +95,12 @@ def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
 
 
 def _columns(transforms: FloatArray) -> FloatArray:
-    """(12, K) array: the top three rows of each transform, column-major as CasADi stores them."""
+    """Top three rows (12, K) of each transform, column-major as CasADi stores matrices."""
     return np.ascontiguousarray(np.swapaxes(transforms[:, :3], 1, 2).reshape(len(transforms), 12).T)
 
 
 def _rodrigues(rotation_vector: _Expression) -> _Expression:
-    """(3, 3) expression of the rotation matrix of a rotation vector."""
+    """Expression (3, 3) of the rotation matrix of a rotation vector."""
     angle = casadi.norm_2(rotation_vector)
     cross = casadi.skew(rotation_vector / angle)
     return casadi.SX.eye(3) + casadi.sin(angle) * cross + (1 - casadi.cos(angle)) * cross @ cross

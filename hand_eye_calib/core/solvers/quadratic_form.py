@@ -1,73 +1,93 @@
 """The cost of a motion pair as a fixed quadratic form, and its minimum over SE(3).
 
-``A X - X B`` is linear in the thirteen variables ``x = (vec R, t, 1)`` (vec is row-major). The cost
-of pair k,
+``A X - X B`` is linear in the thirteen variables ``x = (vec R, t, 1)`` (vec is row-major). So the
+cost of pair k is a quadratic form with a constant symmetric 13 x 13 matrix,
 
-    e_k(X) = | A X - X B |_F^2  (top three rows)  =  x^T Q_k x,
+    e_k(X) = | A X - X B |_F^2  (top three rows)  =  x' Q_k x,
 
-is therefore a quadratic form with a constant symmetric 13 x 13 matrix, and so is every weighted sum
-of pairs. Its minimum takes a Newton iteration in three variables, for any number of pairs.
+and so is every weighted sum of pairs. Its minimum takes a Newton iteration in three variables, for
+any number of pairs.
 
 The residual is linear in the pair, too: it is ``(A - I) X - X (B - I)``, where a pair enters with
-the 24 coefficients u of ``A - I`` and ``B - I``. Residuals, forms and sums of forms are thus matrix
+the 24 coefficients u of ``A - I`` and ``B - I``. Residuals, forms and sums of forms are thus
 products of u with a constant array. Subtracting the identity first keeps the digits of small
 motions.
 """
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.stats import medians
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 
+# Number of variables in x.
 DIMENSION = 13
 
-# Pairs per block, so that the intermediate arrays stay in the cache of the processor.
+# Pairs in one block. The arrays of a block stay in the cache of the processor.
 _BLOCK = 128
 _SUMMED_BLOCK = 1024
 
-# Eigenvalues of the translation block below this share of the largest are rounding: they count as
-# zero.
+# Eigenvalues of the translation block below this share of the largest one are rounding. They count
+# as zero.
 _RANK_TOLERANCE = 1e-10
 
+# Limits of the Newton iteration: number of steps, and length (rad) of the last one.
 _MAX_NEWTON_STEPS = 60
 _STEP_TOLERANCE = 1e-12
 
+# Smallest divisor.
+_TINY = 1e-300
 
-def _tables() -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Arrays that the forms are made of.
+# Positions of the variables x in the sixteen entries of X.
+_X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
 
-    Positions (13,) of x in the sixteen entries of X. Factors (24, 12, 13) of coefficient u of a
-    pair times variable m of x in residual (i, j). D (6, 16) of ``X D``, the derivative of X along
-    each tangent (rho, phi). What X.ravel() times gives x of X D for all six, then x (16, 91).
-    """
-    x_in_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
+# Upper triangle of a form: its rows, its columns, and how often an element counts.
+_ROWS, _COLUMNS = np.triu_indices(DIMENSION)
+_MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
+# Position in the triangle of every element of a form.
+_TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
+_TRIANGLE[_ROWS, _COLUMNS] = np.arange(len(_ROWS))
+_TRIANGLE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
+
+# Generators of rotations about x, y, z.
+_GENERATORS = se3.skew(np.eye(3))
+
+
+def _residual_table() -> FloatArray:
+    """Factors (24, 12, 13) of coefficient u of a pair times variable m of x in residual (i, j)."""
     flat = np.zeros((16, DIMENSION))
-    flat[x_in_T, np.arange(DIMENSION)] = 1.0
+    flat[_X_IN_T, np.arange(DIMENSION)] = 1.0
     entry = flat.reshape(4, 4, DIMENSION)  # X[i, j] = entry[i, j] @ x
-    of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry)
-    of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3])
-    residual = np.concatenate([each.reshape(12, 12, DIMENSION) for each in (of_parent, of_child)])
+    of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry).reshape(12, 12, DIMENSION)
+    of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3]).reshape(12, 12, DIMENSION)
+    return np.concatenate([of_parent, of_child])
+
+
+def _twist_table() -> FloatArray:
+    """Matrices D (6, 4, 4) of ``X D``, the derivative of X along each tangent (rho, phi)."""
     twists = np.zeros((6, 4, 4))
     twists[[0, 1, 2], [0, 1, 2], 3] = 1.0
     twists[3:, :3, :3] = _GENERATORS
-    tangents = np.einsum("in,dkl->nkdil", np.eye(4), np.concatenate([twists, np.eye(4)[None]]))
-    tangents = tangents.reshape(16, 7, 16)[:, :, x_in_T].reshape(16, 7 * DIMENSION)
-    return x_in_T, residual, twists.reshape(6, 16), tangents
+    return twists
 
 
-_ROWS, _COLUMNS = np.triu_indices(DIMENSION)
-_MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
-_TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
-_TRIANGLE[_ROWS, _COLUMNS] = _TRIANGLE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
-_GENERATORS = se3.skew(np.eye(3))
-_X_IN_T, _RESIDUAL, _TWISTS, _TANGENTS = _tables()
+def _tangent_table() -> FloatArray:
+    """Factors (16, 91) that take X.ravel() to the x of all six ``X D``, then to x itself."""
+    maps = np.concatenate([_twist_table(), np.eye(4)[None]])
+    tangents = np.einsum("in,dkl->nkdil", np.eye(4), maps).reshape(16, 7, 16)
+    return tangents[:, :, _X_IN_T].reshape(16, 7 * DIMENSION)
+
+
+_RESIDUAL = _residual_table()
+_TWISTS = _twist_table().reshape(6, 16)
+_TANGENTS = _tangent_table()
 
 
 def condense(pairs: MotionPairs) -> FloatArray:
-    """Upper triangles (K, 91) of every pair's Q_k, in the order of ``numpy.triu_indices(13)``:
-    ``condensed @ monomials(X)`` gives all costs.
+    """Return the upper triangles (K, 91) of the forms Q_k of all pairs.
+
+    Their order is that of ``numpy.triu_indices(13)``: ``condensed @ monomials(X)`` are the costs.
     """
     condensed = np.empty((len(pairs), len(_ROWS)))
     u = coefficients(pairs)
@@ -82,56 +102,53 @@ def condense(pairs: MotionPairs) -> FloatArray:
 
 
 def coefficients(pairs: MotionPairs) -> FloatArray:
-    """Coefficients (K, 24) that the residuals are linear in: the top three rows of A - I, then of
-    B - I, of each pair.
-    """
-    both = pairs.Ts_parenti_parentj, pairs.Ts_childi_childj
-    moved = [(Ts[:, :3] - np.eye(4)[:3]).reshape(-1, 12) for Ts in both]
-    return np.concatenate(moved, axis=1)
+    """Return the coefficients u (K, 24): the top three rows of A - I, then of B - I."""
+    identity = np.eye(4)[:3]
+    of_parent = (pairs.Ts_parenti_parentj[:, :3] - identity).reshape(-1, 12)
+    of_child = (pairs.Ts_childi_childj[:, :3] - identity).reshape(-1, 12)
+    return np.concatenate([of_parent, of_child], axis=1)
 
 
 def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
-    """Costs ``|A X - X B|_F^2`` (K,) at one X, from the :func:`coefficients` of the pairs."""
+    """Return the costs ``|A X - X B|_F^2`` (K,) of pairs with coefficients (K, 24)."""
     residuals = coefficients @ (_RESIDUAL @ T_parent_child.ravel()[_X_IN_T])
     return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
 
 
 def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -> FloatArray:
-    """Medians (S,) of the costs at each X (S, 4, 4), the child's translations times its scale, in
-    the smaller unit of length: otherwise a scale of zero would cost least.
+    """Return the medians (S,) of the costs at each X (S, 4, 4), with the child scaled.
+
+    Each scale (S,) multiplies the child's translations. The costs are in the smaller unit of
+    length; otherwise a scale of zero would cost least.
     """
-    at = np.tensordot(Ts.reshape(-1, 16)[:, _X_IN_T], _RESIDUAL, axes=(1, 2))
-    at.reshape(-1, 2, 3, 4, 12)[:, 1, :, 3] *= scales[:, None, None]
-    return medians(((coefficients @ at) ** 2).sum(axis=2)) / np.minimum(scales, 1.0) ** 2
+    by_u = np.tensordot(Ts.reshape(-1, 16)[:, _X_IN_T], _RESIDUAL, axes=(1, 2))
+    by_u.reshape(-1, 2, 3, 4, 12)[:, 1, :, 3] *= scales[:, None, None]
+    return medians(((coefficients @ by_u) ** 2).sum(axis=2)) / np.minimum(scales, 1.0) ** 2
 
 
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
-    """Sum (13, 13) of the forms with weights (K,), from the :func:`coefficients` of the pairs,
-    without making the forms.
-    """
+    """Return the sum (13, 13) of the forms with weights (K,), without making the forms."""
     moments = np.zeros((24, 24))
     for start in range(0, len(coefficients), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
         moments += (coefficients[block] * weights[block, None]).T @ coefficients[block]
-    return _RESIDUAL.reshape(-1, DIMENSION).T @ (moments @ _RESIDUAL.reshape(24, -1)).reshape(
-        -1, DIMENSION
-    )
+    by_residual = (moments @ _RESIDUAL.reshape(24, -1)).reshape(-1, DIMENSION)
+    return _RESIDUAL.reshape(-1, DIMENSION).T @ by_residual
 
 
 def decrease(
     Q: FloatArray, T_parent_child: FloatArray, T_parent_child_new: FloatArray
 ) -> np.float64:
-    """Decrease of ``x^T Q x`` of one form (13, 13) from one transform (4, 4) to another, accurate
-    for small steps.
-    """
+    """Return the decrease of ``x' Q x`` from one transform to another, exact for small steps."""
     x = T_parent_child.ravel()[_X_IN_T]
     x_new = T_parent_child_new.ravel()[_X_IN_T]
     return np.float64((x - x_new) @ Q @ (x + x_new))
 
 
 def monomials(T_parent_child: FloatArray) -> FloatArray:
-    """Products ``x_i x_j`` (..., 91) of two variables of transforms (..., 4, 4), doubled off the
-    diagonal, which map condensed forms to costs.
+    """Return the products ``x_i x_j`` (..., 91) of the variables of transforms (..., 4, 4).
+
+    They take condensed forms to costs. Products of two different variables are doubled.
     """
     entries = T_parent_child.reshape((*T_parent_child.shape[:-2], 16))
     first = entries.take(_X_IN_T[_ROWS], axis=-1)
@@ -139,12 +156,12 @@ def monomials(T_parent_child: FloatArray) -> FloatArray:
 
 
 def expand(condensed: FloatArray) -> FloatArray:
-    """Symmetric (..., 13, 13) matrices from upper triangles (..., 91)."""
+    """Return the symmetric matrices (..., 13, 13) of upper triangles (..., 91)."""
     return condensed.take(_TRIANGLE, axis=-1)
 
 
 def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Minimise ``x^T Q x`` over SE(3), from several rotations or for several forms at once.
+    """Minimise ``x' Q x`` over SE(3), from several rotations or for several forms at once.
 
     The translation is eliminated exactly. The rest is a quadratic function of the nine entries of
     R, minimised by damped Newton steps ``R <- R Exp(phi)``.
@@ -156,88 +173,106 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
 
     Returns
     -------
-    (B, 4, 4), (B,), (B,) bool arrays
-        Transforms, the forms there, and whether the iteration settled.
+    (B, 4, 4) array
+        Transforms.
+    (B,) array
+        Values of the forms.
+    (B,) bool array
+        Whether the iteration settled.
     """
-    rotation = np.array(rotation_start, dtype=float)
-    Q = np.broadcast_to(Q, (len(rotation), DIMENSION, DIMENSION))
-    reduced, to_translation = without_translation(Q)
-    constant = reduced[:, 9, 9]
-    value, gradient, hessian = _derivatives(reduced, rotation)
-    damping = np.zeros(len(rotation))
-    converged = np.zeros(len(rotation), dtype=bool)
+    R = np.array(rotation_start, dtype=float)
+    forms, to_translation = without_translation(np.broadcast_to(Q, (len(R), DIMENSION, DIMENSION)))
+    constant = forms[:, 9, 9]
+    value, gradient, hessian = _derivatives(forms, R)
+    damping = np.zeros(len(R))
+    converged = np.zeros(len(R), dtype=bool)
     for _ in range(_MAX_NEWTON_STEPS):
         if converged.all():
             break
-        step, length, scale = _newton_step(gradient, hessian, damping)
-        trial = rotation @ se3.rotation_exp(step)
-        trial_value, trial_gradient, trial_hessian = _derivatives(reduced, trial)
-        better = (trial_value < value) & ~converged
+        step, length, curvature = _newton_step(gradient, hessian, damping)
+        R_new = R @ se3.rotation_exp(step)
+        value_new, gradient_new, hessian_new = _derivatives(forms, R_new)
+        better = (value_new < value) & ~converged
         # At the rounding level the value falls no more. A tiny step that hardly raises it is the
         # last.
         rounding = 1e-15 * (np.abs(value) + np.abs(constant))
-        stalled = ~better & (0.5 * scale * length**2 <= rounding)
+        stalled = ~better & (0.5 * curvature * length**2 <= rounding)
         converged |= (length < _STEP_TOLERANCE) | stalled
-        damping = np.where(
-            better, 0.25 * damping * (damping > 1e-9 * scale), np.maximum(4 * damping, 1e-3 * scale)
-        )
-        pick = better[:, None, None]
-        rotation = np.where(pick, trial, rotation)
-        hessian = np.where(pick, trial_hessian, hessian)
-        gradient = np.where(better[:, None], trial_gradient, gradient)
-        value = np.where(better, trial_value, value)
-    vectors = np.append(rotation.reshape(-1, 9), np.ones((len(rotation), 1)), axis=1)
-    translation = -se3.times(to_translation, vectors)
-    Ts = se3.from_rotation_translation(rotation, translation)
+        less_damping = 0.25 * damping * (damping > 1e-9 * curvature)
+        more_damping = np.maximum(4 * damping, 1e-3 * curvature)
+        damping = np.where(better, less_damping, more_damping)
+        R[better] = R_new[better]
+        hessian[better] = hessian_new[better]
+        gradient[better] = gradient_new[better]
+        value[better] = value_new[better]
+    vectors = np.append(R.reshape(-1, 9), np.ones((len(R), 1)), axis=1)
+    Ts = se3.from_rotation_translation(R, -se3.times(to_translation, vectors))
     return Ts, value + constant, converged
 
 
 def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Forms (B, 10, 10) of ``(vec R, 1)`` at the best translation for R, and what gives minus that,
-    m, times ``(vec R, 1)`` (B, 3, 10).
+    """Eliminate the translation from forms (B, 13, 13).
+
+    Returns
+    -------
+    (B, 10, 10) array
+        Forms of ``(vec R, 1)`` at the best translation for R.
+    (B, 3, 10) array
+        Factors that take ``(vec R, 1)`` to minus the best translation, m.
     """
-    of_rest = np.append(np.arange(9), 12)
-    translation_rest = Q[:, 9:12][:, :, of_rest]
+    others = np.append(np.arange(9), 12)
+    coupling = Q[:, 9:12][:, :, others]
     values, vectors = np.linalg.eigh(Q[:, 9:12, 9:12])
-    seen = values > _RANK_TOLERANCE * np.maximum(values[:, -1:], np.finfo(float).tiny)
-    inverse_values = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
-    gain = (vectors * inverse_values[:, None]) @ np.swapaxes(vectors, 1, 2)
-    eliminated = np.swapaxes(translation_rest, 1, 2) @ gain @ translation_rest
-    return Q[:, of_rest[:, None], of_rest] - eliminated, gain @ translation_rest
+    observed = values > _RANK_TOLERANCE * np.maximum(values[:, -1:], np.finfo(float).tiny)
+    inverse_values = np.where(observed, 1.0 / np.where(observed, values, 1.0), 0.0)
+    inverse = (vectors * inverse_values[:, None]) @ np.swapaxes(vectors, 1, 2)
+    eliminated = np.swapaxes(coupling, 1, 2) @ inverse @ coupling
+    return Q[:, others[:, None], others] - eliminated, inverse @ coupling
 
 
 def _newton_step(
     gradient: FloatArray, hessian: FloatArray, damping: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Damped Newton steps (B, 3), rad, of at most 1 rad; their lengths (B,) before that limit, and
-    the largest curvatures (B,).
+    """Return damped Newton steps (B, 3), rad, of at most 1 rad.
+
+    The lengths (B,) before that limit, and the largest curvatures (B,), come with them.
     """
-    curvature, axes = np.linalg.eigh(hessian)
-    # The absolute value follows negative curvature downhill, too; the limit avoids a division by
-    # rounding.
-    size = np.maximum(
-        np.abs(curvature),
-        1e-14 * np.maximum(np.abs(curvature).max(axis=1, keepdims=True), 1e-300),
-    )
+    values, axes = np.linalg.eigh(hessian)
+    # The absolute value follows negative curvature downhill, too.
+    curvatures = np.abs(values)
+    largest = curvatures.max(axis=1)
+    # The limit avoids a division by rounding.
+    curvatures = np.maximum(curvatures, 1e-14 * np.maximum(largest, _TINY)[:, None])
     along = np.swapaxes(axes, 1, 2) @ gradient[:, :, None]
-    step = -(axes @ (along / (size + damping[:, None])[:, :, None]))[:, :, 0]
+    step = -(axes @ (along / (curvatures + damping[:, None])[:, :, None]))[:, :, 0]
     length = np.linalg.norm(step, axis=1)
-    step *= np.minimum(1.0, 1.0 / np.maximum(length, 1e-300))[:, None]
-    return step, length, np.abs(curvature).max(axis=1)
+    step *= np.minimum(1.0, 1.0 / np.maximum(length, _TINY))[:, None]
+    return step, length, largest
 
 
 def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
-    """Transforms (B, 4, 4) after one Gauss-Newton step of each form Q (B, 13, 13), a sum of those
-    of pairs, from its own transform. It is fast, for searches whose result is refined afterwards.
+    """Take one Gauss-Newton step of each form from its own transform.
+
+    The step is fast, for searches whose result is refined afterwards.
+
+    Parameters
+    ----------
+    Q : (B, 13, 13) or (13, 13) array
+        Sums of the forms of pairs.
+    Ts_parent_child : (B, 4, 4) array
+
+    Returns
+    -------
+    (B, 4, 4) array
     """
     n_forms = len(Ts_parent_child)
     # The derivatives of x along the six tangents at X, and x itself, are linear in X.
     tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
-    # Enough damping to leave directions unchanged that the pairs do not reveal, too little to slow
-    # down the others.
+    # Enough damping to keep directions that the pairs do not determine, and too little to slow down
+    # the others.
     diagonal = normal.reshape(n_forms, 49)[:, :48:8]
-    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300
+    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + _TINY
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
     # Cayley's map: a rotation, equal to the exponential up to second order, and faster.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
@@ -245,24 +280,21 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
 
 
-def _derivatives(
-    reduced: FloatArray, rotation: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Value (B,) of forms of (vec R, 1) without the constant, gradient (B, 3) and Hessian (B, 3, 3)
-    under ``R Exp(phi)`` at phi = 0.
+def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the values of forms of (vec R, 1), and their derivatives under ``R Exp(phi)`` at 0.
+
+    The values (B,) are without the constant. The gradient is (B, 3), the Hessian (B, 3, 3).
     """
-    S = reduced[:, :9, :9]
-    linear = reduced[:, :9, 9]
-    flat = rotation.reshape(-1, 9)
-    S_flat = se3.times(S, flat)
-    value = ((S_flat + 2 * linear) * flat).sum(axis=1)
-    product = np.swapaxes(rotation, 1, 2) @ (S_flat + linear).reshape(-1, 3, 3)
+    S = forms[:, :9, :9]
+    linear = forms[:, :9, 9]
+    r = R.reshape(-1, 9)
+    S_r = se3.times(S, r)
+    value = ((S_r + 2 * linear) * r).sum(axis=1)
+    product = np.swapaxes(R, 1, 2) @ (S_r + linear).reshape(-1, 3, 3)
     gradient = 2 * se3.vee(product)
-    tangents = (rotation[:, None] @ _GENERATORS).reshape(-1, 3, 9)
+    tangents = (R[:, None] @ _GENERATORS).reshape(-1, 3, 9)
     trace = np.trace(product, axis1=1, axis2=2)
-    hessian = 2 * (
-        tangents @ S @ np.swapaxes(tangents, 1, 2)
-        + 0.5 * (product + np.swapaxes(product, 1, 2))
-        - trace[:, None, None] * np.eye(3)
-    )
+    symmetric = 0.5 * (product + np.swapaxes(product, 1, 2))
+    hessian = tangents @ S @ np.swapaxes(tangents, 1, 2) + symmetric
+    hessian = 2 * (hessian - trace[:, None, None] * np.eye(3))
     return value, gradient, hessian

@@ -1,4 +1,4 @@
-"""The solvers of AX = XB by the name of their method, with the options they take."""
+"""Solvers of AX = XB by the name of their method, with their options."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers import all_pairs, certificate, dnlo, quadratic_form, zhuang
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-# Of pairs, and of a threshold and the least share of inliers if they reject outliers.
+# Signature: pairs, plus threshold and min_inlier_fraction for methods that reject outliers.
 _SOLVERS: dict[str, Callable[..., Solution]] = {
     "dnlo": dnlo.solve,
     "dnl": all_pairs.solve_dnl,
@@ -25,16 +25,16 @@ _SOLVERS: dict[str, Callable[..., Solution]] = {
 
 @dataclass(frozen=True)
 class Method:
-    """A method with its options set.
+    """A method with its options.
 
     Parameters
     ----------
     name : str
-        Name of a method in :data:`hand_eye_calib.core.base.config.METHODS` that uses a reference.
+        A method of :data:`hand_eye_calib.core.base.config.METHODS` that uses a reference.
     threshold : float
-        c of eq. (5), in m^2. Only dnlo uses it.
+        c of eq. (5), in m^2; only for dnlo.
     min_inlier_fraction : float
-        d of eq. (5) over the number of pairs. Only dnlo uses it.
+        d of eq. (5) over the number of pairs; only for dnlo.
     backend : str
         "fast", or "ipopt" for dnl and dnlo.
 
@@ -68,7 +68,8 @@ class Method:
             )
         solve = _SOLVERS[self.name]
         if self.backend == "ipopt":
-            from hand_eye_calib.core.solvers import ipopt  # takes a second
+            # The import takes a second.
+            from hand_eye_calib.core.solvers import ipopt
 
             solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
         if METHODS[self.name].rejects_outliers:
@@ -76,8 +77,9 @@ class Method:
         return solve(pairs)
 
     def proved_global(self, pairs: MotionPairs, solution: Solution) -> str:
-        """Whether a solution is proved to be the global minimum over the pairs it counts: "yes",
-        "no", or "not tried" for methods that have no proof.
+        """Return whether a solution is proved to be the global minimum over its inliers.
+
+        The result is "yes", "no", or "not tried" for methods without a proof.
         """
         if self.name not in ("dnl", "dnlo"):
             return "not tried"
@@ -87,10 +89,24 @@ class Method:
     def solve_without(
         self, pairs: MotionPairs, solution: Solution, left_out: BoolArray
     ) -> FloatArray:
-        """Answers (B, 4, 4) near a solution for all K pairs, without those in each row of
-        ``left_out`` (B, K), for resampling.
+        """Solve again without some of the pairs, for resampling.
+
+        Parameters
+        ----------
+        pairs : MotionPairs
+            K pairs.
+        solution : Solution
+            The solution with all pairs.
+        left_out : (B, K) bool array
+            Pairs to leave out of each of B solutions.
+
+        Returns
+        -------
+        (B, 4, 4) array
         """
-        if self.name == "dnlo":  # the search is quicker from a solution than from nothing
-            rejection = self.threshold, self.min_inlier_fraction
-            return dnlo.solve_without(pairs, solution, left_out, *rejection)
+        if self.name == "dnlo":
+            # The search is quicker from a solution.
+            return dnlo.solve_without(
+                pairs, solution, left_out, self.threshold, self.min_inlier_fraction
+            )
         return np.stack([self.solve(pairs[~row]).T_parent_child for row in left_out])
