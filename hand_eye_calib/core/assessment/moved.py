@@ -1,25 +1,27 @@
-"""Has it moved? The one kernel behind comparisons of results, parts of a recording and the monitor.
+"""Test for a shift of the mount: the kernel of comparisons, parts of a recording and the monitor.
 
-A change of the extrinsic is judged in two ways, both from its estimate d and the covariance C of
-that. By axis, where a person asks what has moved (:mod:`~hand_eye_calib.core.assessment.change`).
-By probability, where a shift is looked for at many times: with shifts of covariance L expected, the
-logarithm of the likelihood ratio of a shift against none is, with ``H = C^-1`` and ``S = H d``,
+A shift d of the extrinsic, ``X exp(d)``, has an estimate with covariance C: information ``H =
+C^-1``, score ``S = H d``. With shifts of covariance L expected, the log likelihood ratio of a shift
+against none is (a Gaussian form of the generalised likelihood ratio: M. Basseville, I. Nikiforov,
+*Detection of abrupt changes*, 1993, chapter 2)
 
-    1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|,
+    1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|.
 
-both divided before by how much more S scatters than H predicts.
+H and S are divided before by the long-run variance: how much more S scatters than H predicts. This
+ratio serves tests at many times. :mod:`~hand_eye_calib.core.assessment.change` tests each axis,
+where a person asks what has moved.
 
-Answers of one rig scatter from recording to recording by more than each of them states, as no
-recording shows its own constant errors: that belongs to C (docs/session.md has the measurements).
+A motion pair within a recording has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,) at an extrinsic
+X0. If the mount has moved by xi, to ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I -
+Ad(B^-1)``. With the noise covariance C each second has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1
+e``; both add over time. Large residuals have less weight, so a large shift comes out too small:
+compute the information again at the extrinsic that the shift leads to.
 
-Within a recording, a motion pair has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,) at an
-extrinsic X0. If the mount has moved by xi, ``X0 exp(xi)``, then ``e = -J xi + noise`` with
-``J = I - Ad(B^-1)``. With C the covariance of the noise, each second has ``H = sum J' C^-1 J`` and
-``S = -sum J' C^-1 e``; both add over time. Large residuals have less weight, so that a large shift
-comes out too small: take the information again at the extrinsic that it leads to. The noise of
-motions that follow each other is correlated: the long-run variance of S in units of H says how
-much. Errors that wander over minutes, of a map that bends or a bias, give a large ratio, too: the
-stream checks compare how well a world that moves explains the motion.
+Successive motions have correlated noise, which the long-run variance measures. Errors that wander
+over minutes, such as a bias or a map that bends, also give a large ratio. The stream checks compare
+how well a moving world explains the motion. Answers of one rig scatter between recordings by more
+than their covariances, because constant errors do not show within a recording. This scatter belongs
+to C (docs/session.md has the measurements).
 """
 
 from dataclasses import dataclass
@@ -40,100 +42,109 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 
-# Shifts that are looked for: one standard deviation per axis (m, rad).
-SHIFT_M = 0.03
-SHIFT_RAD = float(np.radians(1.0))
+# Expected shifts: one standard deviation per axis (m, rad).
+_SHIFT_M = 0.03
+_SHIFT_RAD = float(np.radians(1.0))
 
-# Scatter between recordings of one rig, per axis (m, rad): of flights and hand-held recordings, and
-# of vehicles. A vehicle turns about one axis, and knows the translation along it so many times
-# worse than along the others.
-_SCATTERS = np.repeat([[0.008, np.radians(0.12)], [0.020, np.radians(0.10)]], 3, axis=1)
+# Scatter between recordings of one rig per axis (m, rad): of flights and hand-held recordings.
+_SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
+# The same of vehicles.
+_SCATTER_OF_VEHICLES = np.repeat([0.020, np.radians(0.10)], 3)
+# A vehicle turns about one axis: the standard deviation of the translation along this axis is
+# larger than the others by this factor.
 _VEHICLE = 4.0
 
-# Motions over this time (ns) are compared, so many of them in it at most, and what they show is
-# added up over it.
+# Time over which motions are compared, and in which their evidence is added (ns).
 _BLOCK_NS = 1_000_000_000
+# Largest number of motions in this time.
 _MOTIONS_PER_BLOCK = 20
 
+# Rounds of the estimate of the noise.
 _ROUNDS = 4
+# Smallest standard deviations of residuals (m, rad).
 _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
 
-# The recording is cut into so many windows of equal duration, whose answers show the long-run
-# variance; a shift separates at least so many of them on either side.
+# The recording is cut into so many windows of equal duration for the long-run variance.
 _WINDOWS = (8, 16)
+# Fewest windows on either side of a shift.
 _LEAST_WINDOWS = 2
+# Shortest window (s).
 _LEAST_WINDOW_S = 3.0
 
 # Log likelihood ratio from which on a shift is significant.
 SIGNIFICANT = 12.0
 
-# Share of the recordings in which a mount moves, before one is looked at, and fewest parts of a
-# recording before and after that. A smaller probability is none.
+# Prior probability that a mount moves within a recording.
 _MOVES = 0.02
+# Fewest parts of a recording before and after a shift.
 _LEAST_PARTS = 4
+# A smaller probability of a shift is zero.
 _LEAST_PROBABILITY = 1e-3
 
-
-def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of the answers of several recordings of one rig, beside that of one, which
-    tells a vehicle from what is held in hand.
-    """
-    variances = np.linalg.eigvalsh(covariance[:3, :3])
-    in_hand, of_vehicle = _SCATTERS
-    is_vehicle = variances[2] > _VEHICLE**2 * variances[1]
-    return np.diag((of_vehicle if is_vehicle else in_hand) ** 2)
-
-
-def shift_covariance(metres: float = SHIFT_M, radians: float = SHIFT_RAD) -> FloatArray:
-    """Covariance L (6, 6) of the shifts that are looked for, from standard deviations per axis."""
-    return np.diag(np.repeat([metres**2, radians**2], 3))
-
-
-# Information (6, 6) of the shifts that are looked for; and the share of it that a shift within a
-# recording has before it is looked for: shifts of many metres count as impossible.
-_OF_SHIFT = inverse(shift_covariance())
+# Information of the expected shifts within a recording, as a share of the full one: without it,
+# shifts of many metres are possible.
 _RIDGE = 1e-6
 
 
-def log_ratio(tables: FloatArray, shift: FloatArray | None = None) -> FloatArray:
-    """Logarithm of the likelihood ratio of a shift against none.
+def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) between recordings of one rig, to be added to that of one.
+
+    The covariance (6, 6) of one recording reveals whether the rig is a vehicle.
+    """
+    variances = np.linalg.eigvalsh(covariance[:3, :3])
+    is_vehicle = variances[2] > _VEHICLE**2 * variances[1]
+    return np.diag((_SCATTER_OF_VEHICLES if is_vehicle else _SCATTER_IN_HAND) ** 2)
+
+
+def shift_covariance(metres: float = _SHIFT_M, radians: float = _SHIFT_RAD) -> FloatArray:
+    """Return the covariance L (6, 6) of expected shifts from standard deviations per axis."""
+    return np.diag(np.repeat([metres**2, radians**2], 3))
+
+
+_EXPECTED_SHIFTS = shift_covariance()
+_SHIFT_INFORMATION = inverse(_EXPECTED_SHIFTS)
+
+
+def log_ratio(tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS) -> FloatArray:
+    """Return the log likelihood ratio (...) of a shift against none.
 
     Parameters
     ----------
     tables : (..., 6, 7) array
-        Evidence ``[H S]`` since the time from which on the mount may have moved.
-    shift : (6, 6) array, optional
-        L; :func:`shift_covariance` if left out.
+        Evidence ``[H S]`` since the possible shift.
+    L : (..., 6, 6) array
+        Covariance of the expected shifts.
     """
-    L = shift_covariance() if shift is None else shift
     H = information(tables)
     S = score(tables)
-    _, log_volume = np.linalg.slogdet(np.eye(6) + L @ H)
-    squared = (S * solve(H + np.linalg.inv(L), S)).sum(axis=-1)
+    log_volume = np.linalg.slogdet(np.eye(6) + L @ H)[1]
+    squared = (S * _solve(H + np.linalg.inv(L), S)).sum(axis=-1)
     return 0.5 * squared - 0.5 * log_volume
 
 
-def solve(H: FloatArray, S: FloatArray) -> FloatArray:
-    """``H^-1 S`` (..., n) of matrices (..., n, n)."""
-    # As many dimensions as the matrices: else NumPy 1 takes the columns for vectors.
+def _solve(H: FloatArray, S: FloatArray) -> FloatArray:
+    """Return ``H^-1 S`` (..., n) of matrices (..., n, n) and vectors (..., n)."""
+    # NumPy 1 takes the columns for vectors unless both arrays have as many dimensions.
     columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[..., None]
     return np.asarray(np.linalg.solve(H, columns)[..., 0])
 
 
 def most_likely(tables: FloatArray, ridge: float) -> FloatArray:
-    """Shifts (..., 6) that evidence ``[H S]`` (..., 6, 7) shows, with a share ``ridge`` of the
-    information of the shifts that are looked for.
+    """Return the most likely shifts (..., 6) by evidence ``[H S]`` (..., 6, 7).
+
+    ``ridge`` is the share of the information of the expected shifts that is added.
     """
-    return solve(information(tables) + ridge * _OF_SHIFT, score(tables))
+    return _solve(information(tables) + ridge * _SHIFT_INFORMATION, score(tables))
 
 
-def squares_about(tables: FloatArray, answers: FloatArray, ridge: float) -> FloatArray:
-    """Squares (...) of the shifts from answers (..., 6) that evidence ``[H S]`` (..., 6, 7) shows,
-    in units of their covariance.
+def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> FloatArray:
+    """Return the squared distances (...) of evidence ``[H S]`` (..., 6, 7) from shifts (..., 6).
+
+    The unit is the covariance of the evidence. ``ridge`` is as in :func:`most_likely`.
     """
     H = information(tables)
-    scores = score(tables) - se3.times(H, answers)
-    return np.asarray((scores * solve(H + ridge * _OF_SHIFT, scores)).sum(axis=-1))
+    scores = score(tables) - se3.times(H, shifts)
+    return np.asarray((scores * _solve(H + ridge * _SHIFT_INFORMATION, scores)).sum(axis=-1))
 
 
 # ---------------------------------------------------------------- within a recording
@@ -141,10 +152,19 @@ def squares_about(tables: FloatArray, answers: FloatArray, ridge: float) -> Floa
 
 @dataclass(frozen=True, kw_only=True)
 class MountChange:
-    """A shift of the mount within a recording, at a stamp of the parent's clock: afterwards the
-    extrinsic is ``X exp(xi)``, with X from before, and xi (6,) = (rho, phi) in the child sensor's
-    frame, m and rad; its covariance (6, 6) with the long-run variance; and the logarithm of the
-    likelihood ratio of this shift against none.
+    """A shift of the mount within a recording.
+
+    Attributes
+    ----------
+    at_ns : int
+        Stamp of the shift on the parent's clock.
+    xi : (6,) array
+        The shift (rho, phi) in the child sensor's frame, m and rad: the extrinsic is ``X`` before
+        and ``X exp(xi)`` afterwards.
+    covariance : (6, 6) array
+        Of xi, with the long-run variance.
+    log_ratio : float
+        Log likelihood ratio of this shift against none.
     """
 
     at_ns: int
@@ -156,18 +176,19 @@ class MountChange:
 def residuals_and_jacobians(
     pairs: MotionPairs, T_parent_child: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals e (K, 6) of motion pairs at an extrinsic, and their negative derivatives J
-    (K, 6, 6) by a shift of it.
+    """Return residuals e (K, 6) of motion pairs and their negative derivatives J (K, 6, 6).
+
+    The derivatives are by a shift of the extrinsic.
     """
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
-    moved = se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
-    return se3.log(Bs_inverse @ moved), np.eye(6) - se3.adjoint(Bs_inverse)
+    Bs_predicted = se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
+    return se3.log(Bs_inverse @ Bs_predicted), np.eye(6) - se3.adjoint(Bs_inverse)
 
 
 def evidence(
     residuals: FloatArray, jacobians: FloatArray, noise: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """Evidence ``[H S]`` (K, p, p + 1) of motion pairs on p parameters.
+    """Return the evidence ``[H S]`` (K, p, p + 1) of motion pairs on p parameters.
 
     Parameters
     ----------
@@ -179,14 +200,14 @@ def evidence(
     weights : (K,) array
     """
     whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(noise)
-    weighted = whitened * weights[:, None, None]
     columns = np.concatenate([jacobians, -residuals[..., None]], axis=2)
-    return weighted @ columns
+    return (whitened * weights[:, None, None]) @ columns
 
 
 def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariance (6, 6) of residuals (K, 6) whose noise is Student's t, and the weight (K,) of
-    each: 1 on average, small for jumps.
+    """Estimate the covariance (6, 6) of residuals (K, 6) with Student's t noise.
+
+    The second value are the weights (K,) of the residuals: 1 on average, small for jumps.
     """
     sigmas = np.repeat([stats.robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3)
     covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
@@ -199,11 +220,11 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChange | None:
-    """The most likely shift of the mount within a recording; None if it is too short to tell.
+    """Return the most likely shift of the mount within a recording; None if it is too short.
 
-    The answers of both sides of every possible time are compared. What each side scatters about its
-    own answer, in windows of a sixteenth and of an eighth of the recording, is the long-run
-    variance: noise that wanders is no shift.
+    The answers before and after every possible time are compared. The scatter of windows about the
+    answer of their side, in windows of a sixteenth and of an eighth of the recording, is the
+    long-run variance: noise that wanders is no shift.
 
     Parameters
     ----------
@@ -212,65 +233,70 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     T_parent_child : (4, 4) array
         X0, near the extrinsic.
     """
-    starts_ns, blocks = _by_second(pose_pairs, T_parent_child)
+    starts_ns, blocks = _evidence_by_second(pose_pairs, T_parent_child)
     n_blocks = len(starts_ns)
     counts = [count for count in _WINDOWS if n_blocks >= count * _LEAST_WINDOW_S]
     if not counts:
         return None
-    long_run = max(1.0, *(_long_run(blocks.merged(count)) for count in counts))
-    shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * _OF_SHIFT)
+    long_run = max(1.0, *(_long_run_variance(blocks.merged(count)) for count in counts))
+    shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * _SHIFT_INFORMATION)
     ratios = log_ratio(shifts / long_run)
     n_edge = max(int(n_blocks * _LEAST_WINDOWS / max(_WINDOWS)), 1)
-    ratios[: n_edge - 1] = ratios[len(ratios) - n_edge + 1 :] = -np.inf
+    ratios[: n_edge - 1] = -np.inf
+    ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
+    damped = information(shifts[best]) + _RIDGE * _SHIFT_INFORMATION
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
         xi=most_likely(shifts[best], _RIDGE),
-        covariance=long_run * inverse(information(shifts[best]) + _RIDGE * _OF_SHIFT),
+        covariance=long_run * inverse(damped),
         log_ratio=float(ratios[best]),
     )
 
 
-def _long_run(windows: Blocks) -> float:
-    """Long-run variance of the scores of windows, in units of their information: about the answers
-    before and since a time, which is chosen so that the variance is smallest.
+def _long_run_variance(windows: Blocks) -> float:
+    """Return the long-run variance of the scores of windows, in units of their information.
+
+    The scores are taken about the answers before and since a time. The time with the smallest
+    variance counts.
     """
-    count = len(windows.sums)
-    cuts = np.arange(_LEAST_WINDOWS, count - _LEAST_WINDOWS + 1)
+    n_windows = len(windows.sums)
+    cuts = np.arange(_LEAST_WINDOWS, n_windows - _LEAST_WINDOWS + 1)
     sides = np.stack([windows.before(cuts), windows.since(cuts)], axis=1)
-    is_since = (np.arange(count) >= cuts[:, None]).astype(int)
-    answers = most_likely(sides, _RIDGE)[np.arange(len(cuts))[:, None], is_since]
-    seen = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
-    squared = squares_about(windows.sums[seen], answers[:, seen], _RIDGE).sum(axis=1)
-    # Six values a window, less those of both answers.
-    return float(squared.min()) / max(6 * int(seen.sum()) - 12, 1)
+    side_of_window = (np.arange(n_windows) >= cuts[:, None]).astype(int)
+    answers = most_likely(sides, _RIDGE)[np.arange(len(cuts))[:, None], side_of_window]
+    has_evidence = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
+    squares = squares_about(windows.sums[has_evidence], answers[:, has_evidence], _RIDGE)
+    # Six values a window, less six of each answer.
+    dof = max(6 * int(has_evidence.sum()) - 12, 1)
+    return float(squares.sum(axis=1).min()) / dof
 
 
-def _by_second(pose_pairs: PosePairs, T_parent_child: FloatArray) -> tuple[IntArray, Blocks]:
-    """Starts (N,) of the seconds of a recording, and the evidence ``[H S]`` of each."""
+def _evidence_by_second(
+    pose_pairs: PosePairs, T_parent_child: FloatArray
+) -> tuple[IntArray, Blocks]:
+    """Return the starts (N,) of the seconds of a recording, and their evidence ``[H S]``."""
     stamps_ns = pose_pairs.stamps_ns
     duration_ns = int(stamps_ns[-1] - stamps_ns[0])
     lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
-    most = max(duration_ns * _MOTIONS_PER_BLOCK // _BLOCK_NS, 2)
-    pairs = pairs_over(pose_pairs, lag_s, most)
+    most_motions = max(duration_ns * _MOTIONS_PER_BLOCK // _BLOCK_NS, 2)
+    pairs = pairs_over(pose_pairs, lag_s, most_motions)
     residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
     covariance, weights = noise_covariance(residuals)
     tables = evidence(residuals, jacobians, covariance, weights)
     middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
-    blocks = (middles_ns - stamps_ns[0]) // _BLOCK_NS
+    block_of_pair = (middles_ns - stamps_ns[0]) // _BLOCK_NS
     n_blocks = duration_ns // _BLOCK_NS + 1
     starts_ns = stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS
-    return starts_ns, Blocks.gathered(tables, blocks, n_blocks)
+    return starts_ns, Blocks.gathered(tables, block_of_pair, n_blocks)
 
 
 def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tuple[str, ...]]:
-    """The shift of the mount that the parts of a recording may show: the covariance (6, 6) of xi in
-    ``X exp(xi)`` because of it, as an answer between both mounts is half of the shift away from
-    either, zeros if it is improbable; and a warning if something has moved, more likely than not,
-    by more than recordings of one rig scatter.
+    """Return the covariance because of a possible shift of the mount, and a warning.
 
-    What the parts before and after each time say of X is compared under the noise model that gave
-    X. The likelihood ratio of a shift, averaged over the times, gives its probability.
+    The answers before and after each time are compared under the noise model of the estimate. The
+    likelihood ratio of a shift, averaged over the times, gives its probability. An answer between
+    both mounts is half of the shift away from either.
 
     Parameters
     ----------
@@ -278,6 +304,13 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
         Of :func:`~hand_eye_calib.core.noise.state_space.part_products`.
     misfit : float
         Factor of the covariances.
+
+    Returns
+    -------
+    covariance : (6, 6) array
+        Of xi in ``X exp(xi)``; zero if a shift is improbable.
+    warnings : tuple of str
+        One if a shift larger than the scatter of recordings is more likely than not.
     """
     cuts = np.arange(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
     before = NormalEquations(Blocks(products).before(cuts))
@@ -285,9 +318,9 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     is_complete = before.is_complete & after.is_complete
     if not is_complete.any():
         return np.zeros((6, 6)), ()
-    joint = max(misfit, 1.0) * (before.covariance + after.covariance)[is_complete, :6, :6]
+    covariances = max(misfit, 1.0) * (before.covariance + after.covariance)[is_complete, :6, :6]
     steps = (after.step - before.step)[is_complete, :6]
-    tables = answer_evidence(steps, joint)
+    tables = answer_evidence(steps, covariances)
     ratios = log_ratio(tables)
     probability = _probability(ratios)
     if probability < _LEAST_PROBABILITY:
@@ -296,8 +329,8 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     spread = probability * squared / 4.0
-    of_recordings = joint + scatter_of_recordings(joint[len(joint) // 2])
-    if _probability(log_ratio(answer_evidence(steps, of_recordings))) < 0.5:
+    scattered = covariances + scatter_of_recordings(covariances[len(covariances) // 2])
+    if _probability(log_ratio(answer_evidence(steps, scattered))) < 0.5:
         return spread, ()
     best = int(np.argmax(ratios))
     share = int(cuts[is_complete][best]) / len(products)
@@ -305,7 +338,7 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
 
 
 def _parts_differ(share: float, xi: FloatArray) -> str:
-    """Warning about a shift xi (6,) after a share of the recording."""
+    """Return the warning about a shift xi (6,) after a share of the recording."""
     metres = length(float(np.linalg.norm(xi[:3])))
     turn = angle(float(np.linalg.norm(xi[3:])))
     return (
@@ -316,7 +349,7 @@ def _parts_differ(share: float, xi: FloatArray) -> str:
 
 
 def _probability(log_ratios: FloatArray) -> float:
-    """Probability of a shift at one of several times, from its logarithmic likelihood ratios."""
+    """Return the probability of a shift at one of several times, by the log likelihood ratios."""
     most = log_ratios.max()
     log_odds = most + np.log(np.exp(log_ratios - most).mean() * _MOVES / (1.0 - _MOVES))
     return float(np.exp(-np.logaddexp(0.0, -log_odds)))
