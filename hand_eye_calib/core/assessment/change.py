@@ -1,6 +1,10 @@
-"""Has it moved? By axis, where a person asks what has: an axis has if it differs by more than
-chance makes of any of six once in 200 comparisons, or all together by what chance makes of them
-once in 1,000; it is the same only if a change that matters would have been seen.
+"""Test by axis whether an extrinsic has moved.
+
+The difference d of two estimates has the covariance C. An axis has moved if ``|d_k| / sigma_k``
+exceeds the value that the largest of six normal variables exceeds once in 200 comparisons. Without
+such an axis, the extrinsic has moved if ``d' C^-1 d`` exceeds the 99.9 % quantile of chi-square
+with 6 degrees of freedom. An axis is the same only if the test would detect a change that matters
+in nine of ten cases.
 """
 
 from collections.abc import Sequence
@@ -15,13 +19,14 @@ from hand_eye_calib.core.base.text import amount, listing
 from hand_eye_calib.core.results.context import AxisDifference
 from hand_eye_calib.core.results.records import AXES
 
-# Standard deviations (m, rad) that stand for "nothing known", and from which on one does.
-UNKNOWN = np.sqrt(np.r_[np.full(3, 100.0), np.full(3, 10.0)])
+# Standard deviations (m, rad) that represent "unknown".
+UNKNOWN = np.sqrt(np.repeat([100.0, 10.0], 3))
+# Standard deviations above which an axis is unknown.
 UNKNOWN_FROM = 0.1 * UNKNOWN
 
 
 class Change(str, Enum):
-    """Whether something has moved."""
+    """Verdict on a difference of two extrinsics."""
 
     SAME = "same"
     MOVED = "moved"
@@ -29,66 +34,81 @@ class Change(str, Enum):
 
     @classmethod
     def of_all(cls, changes: Sequence["Change"]) -> "Change":
-        """The gravest of several."""
-        graver = (each for each in (cls.MOVED, cls.CANNOT_TELL) if each in changes)
-        return next(graver, cls.SAME)
+        """Return the gravest of several verdicts."""
+        if cls.MOVED in changes:
+            return cls.MOVED
+        return cls.CANNOT_TELL if cls.CANNOT_TELL in changes else cls.SAME
 
 
 @dataclass(frozen=True)
 class Moved:
-    """By axis how two estimates of an extrinsic differ, along and about the axes of the parent
-    sensor's frame, and the verdict on all axes together.
+    """Difference of two estimates of an extrinsic.
+
+    Attributes
+    ----------
+    axes : dict of str to AxisDifference
+        Along and about the axes of the parent sensor's frame.
+    verdict : Change
+        On all axes together.
     """
 
     axes: dict[str, AxisDifference]
     verdict: Change
 
-    def _those(self, change: Change) -> list[str]:
-        return [axis for axis, found in self.axes.items() if found.verdict == change]
+    def _axes_that(self, change: Change) -> list[str]:
+        """Return the axes with this verdict."""
+        return [axis for axis, difference in self.axes.items() if difference.verdict == change]
 
     @property
     def sentence(self) -> str:
-        """The verdict in one line, with what it rests on."""
+        """The verdict in one line, with its evidence."""
         if self.verdict is Change.MOVED:
             return f"moved: {self.what}"
-        same = self._those(Change.SAME)
-        unknown = self._those(Change.CANNOT_TELL)
+        same = self._axes_that(Change.SAME)
+        unknown = self._axes_that(Change.CANNOT_TELL)
         if not unknown:
             return f"same: {self._power(same)}"
-        told = f"cannot tell about {listing(unknown)}"
-        return f"{told}; {listing(same)} the same: {self._power(same)}" if same else told
+        sentence = f"cannot tell about {listing(unknown)}"
+        if not same:
+            return sentence
+        return f"{sentence}; {listing(same)} the same: {self._power(same)}"
 
     @property
     def what(self) -> str:
-        """The axes that have moved; the two that differ most if none has on its own."""
-        ratios = {axis: abs(each.difference) / each.sigma for axis, each in self.axes.items()}
-        most = sorted(filter(ratios.get, AXES), key=lambda axis: -ratios[axis])[:2]
-        told = [
-            f"{axis} by {amount(axis, one.difference)} +/- {amount(axis, one.sigma)}"
-            for axis, one in ((axis, self.axes[axis]) for axis in self._those(Change.MOVED) or most)
-        ]
-        return listing(told) or "by what the axes show together, none of them alone"
+        """The axes that have moved; the two that differ most if none has moved on its own."""
+        axes = self._axes_that(Change.MOVED)
+        if not axes:
+            ratios = {axis: abs(each.difference) / each.sigma for axis, each in self.axes.items()}
+            different = [axis for axis in AXES if ratios.get(axis)]
+            axes = sorted(different, key=lambda axis: -ratios[axis])[:2]
+        moves = []
+        for axis in axes:
+            difference = amount(axis, self.axes[axis].difference)
+            sigma = amount(axis, self.axes[axis].sigma)
+            moves.append(f"{axis} by {difference} +/- {sigma}")
+        return listing(moves) or "by what the axes show together, none of them alone"
 
     def _power(self, axes: Sequence[str]) -> str:
-        told = []
+        """Describe the changes of these axes that the test would detect."""
+        changes = []
         for names in (AXES[:3], AXES[3:]):
-            if known := [axis for axis in names if axis in axes]:
-                worst = max(known, key=lambda axis: self.axes[axis].visible)
-                told.append(amount(worst, self.axes[worst].visible))
-        return f"a change of {' or '.join(told)} would have been seen"
+            if tested := [axis for axis in names if axis in axes]:
+                worst = max(tested, key=lambda axis: self.axes[axis].visible)
+                changes.append(amount(worst, self.axes[worst].visible))
+        return f"a change of {' or '.join(changes)} would have been seen"
 
 
 def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Moved:
-    """Judge a difference of two estimates by axis.
+    """Test a difference of two estimates of an extrinsic.
 
     Parameters
     ----------
     values : (6,) array
         Difference along (m) and about (rad) the axes of the parent sensor's frame.
     covariance : (6, 6) array
-        Of both estimates together, with the scatter of recordings if they are of two.
+        Of the difference, with the scatter between recordings if there are two.
     limits : (6,) array
-        Changes that have to be seen before an axis is called the same.
+        Changes that the test must detect before an axis is called the same.
     """
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
@@ -96,11 +116,18 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
     sigmas = np.where(sigmas > UNKNOWN_FROM, np.inf, sigmas)
     largest = stats.LARGEST_OF_SIX
     visible = (largest + stats.NINE_TIMES_OUT_OF_TEN) * sigmas
-    verdicts = [
-        Change.MOVED if ratio > largest else Change.SAME if seen else Change.CANNOT_TELL
-        for ratio, seen in zip(np.abs(values) / sigmas, visible <= limits, strict=True)
-    ]
-    columns = (each.tolist() for each in (values, sigmas, visible))
-    rows = zip(*columns, (each.value for each in verdicts), strict=True)
-    axes = {axis: AxisDifference(*row) for axis, row in zip(AXES, rows, strict=True)}
-    return Moved(axes, Change.MOVED if chi2 > stats.CHI2[0.001][6] else Change.of_all(verdicts))
+    axes = {}
+    verdicts = []
+    for index, axis in enumerate(AXES):
+        difference = float(values[index])
+        sigma = float(sigmas[index])
+        verdict = Change.CANNOT_TELL
+        if abs(difference) / sigma > largest:
+            verdict = Change.MOVED
+        elif visible[index] <= limits[index]:
+            verdict = Change.SAME
+        verdicts.append(verdict)
+        axes[axis] = AxisDifference(difference, sigma, float(visible[index]), verdict.value)
+    if chi2 > stats.CHI2[0.001][6]:
+        return Moved(axes, Change.MOVED)
+    return Moved(axes, Change.of_all(verdicts))

@@ -1,8 +1,8 @@
-"""Comparison of a result with what is installed, or of results with each other."""
+"""Comparison of results with the installed extrinsic, or with each other."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations, count
+from itertools import combinations
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from hand_eye_calib.core.results.verdict import target_of
 
 _Named = tuple[str, Calibration | Extrinsic]
 
-# Largest undetected change of an axis, in targets, with which the axis counts as the same.
+# Largest change of an axis, in targets, that may stay undetected if the axis counts as the same.
 SEEN_TARGETS = 5.0
 
 
@@ -30,15 +30,16 @@ def compare(
     installed: Calibration | Extrinsic | None = None,
     names: Sequence[str] | None = None,
 ) -> Comparison:
-    """Compare results with what is installed, or with each other.
+    """Compare results with the installed extrinsic, or with each other.
 
     Parameters
     ----------
     results : sequence of Calibration
     installed : Calibration or Extrinsic, optional
-        What the robot uses now. Without it: which of several recordings of one rig has moved?
+        The extrinsic that the robot uses. Without it, the results of several recordings of one rig
+        are compared with each other.
     names : sequence of str, optional
-        What to call the results; numbered by default.
+        Names of the results; numbered by default.
 
     Returns
     -------
@@ -55,104 +56,126 @@ def compare(
     >>> hec.compare([result], installed=result).verdict
     'same'
     """
-    named = list(zip(names or map("result {}".format, count(1)), results, strict=False))
-    if len(dict(named)) < len(results):
-        raise InputError(f"expected {len(results)} different names, found {len(dict(named))}")
+    if not names:
+        names = [f"result {number}" for number in range(1, len(results) + 1)]
+    by_name = dict(zip(names, results, strict=False))
+    if len(by_name) < len(results):
+        raise InputError(f"expected {len(results)} different names, found {len(by_name)}")
     require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
-    couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(named, 2)]
+    couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(by_name.items(), 2)]
     if installed is not None:
-        couples = [(("installed", installed), each) for each in named]
+        couples = [(("installed", installed), named) for named in by_name.items()]
     if not couples:
         raise InputError("expected two results or more, or one and what is installed")
     differences = tuple(_difference(*couple) for couple in couples)
-    verdict = Change.of_all([Change(each.verdict) for each in differences]).value
-    apart = tuple(each.second for each in differences if each.verdict == Change.MOVED)
-    others = "another" if installed is None else "what is installed"
-    sentence = f"{verdict}: none of {len(results)} differs from {others}"
-    sentence = f"moved: {listing(apart)} of {len(results)}" if apart else sentence
+    verdict = Change.of_all([Change(difference.verdict) for difference in differences]).value
+    moved_names = tuple(
+        difference.second for difference in differences if difference.verdict == Change.MOVED
+    )
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
-    elif apart and installed is None:
-        apart, sentence = _who_moved([*dict(named)], results, differences)
-    return Comparison(sentence=sentence, verdict=verdict, moved=apart, differences=differences)
+    elif moved_names and installed is None:
+        moved_names, sentence = _who_moved([*by_name], results, differences)
+    elif moved_names:
+        sentence = f"moved: {listing(moved_names)} of {len(results)}"
+    else:
+        others = "another" if installed is None else "what is installed"
+        sentence = f"{verdict}: none of {len(results)} differs from {others}"
+    return Comparison(
+        sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
+    )
 
 
 def _who_moved(
     names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
-    """The results without which the others agree, if there are such, and a sentence."""
-    # That two differ is known: less evidence is enough to say which.
-    found = agreement_of_results(results, level=0.05)
-    if found.kind in ("one off", "moved"):
-        return tuple(names[index] for index in found.apart), f"moved: {found.sentence(names)}"
-    apart = [each for each in differences if each.verdict == Change.MOVED]
-    pairs = listing([f"{each.first} and {each.second}" for each in apart])
-    return (), f"moved: {pairs} differ; they do not show which of them has moved"
+    """Return the results without which the others agree, if there are such, and a sentence."""
+    # Two results differ for sure: weaker evidence is enough to name one of them.
+    agreement = agreement_of_results(results, level=0.05)
+    if agreement.kind in ("one off", "moved"):
+        apart = tuple(names[index] for index in agreement.apart)
+        return apart, f"moved: {agreement.sentence(names)}"
+    couples = [
+        f"{difference.first} and {difference.second}"
+        for difference in differences
+        if difference.verdict == Change.MOVED
+    ]
+    return (), f"moved: {listing(couples)} differ; they do not show which of them has moved"
 
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
-    """The result with its comparison with what is installed."""
+    """Return a result with its comparison with the installed extrinsic."""
     origin = "a result" if isinstance(installed, Calibration) else installed.origin
     values = by_axis(xyz_rpy(installed.T_parent_child))
-    found = compare([result], installed, ["result"])
-    return replace(result, comparison=replace(found, installed=origin, values=values))
+    comparison = compare([result], installed, ["result"])
+    return replace(result, comparison=replace(comparison, installed=origin, values=values))
 
 
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
-    first_name, one = first
-    second_name, two = second
-    covariance, scatter, allowance = _spread(one) + _spread(two)
-    if not (_is_found(one) and _is_found(two)):
-        # What is the same in all recordings is in one of both only: the larger of both, by axis.
+    """Test the difference of two named extrinsics by axis."""
+    first_name, before = first
+    second_name, after = second
+    covariance, scatter, allowance = _spread(before) + _spread(after)
+    if not (_is_from_motion(before) and _is_from_motion(after)):
+        # Only one of both has the errors that all recordings share: the larger of scatter and
+        # allowance holds, by axis.
         scatter = allowance + np.diag(np.maximum(np.diag(scatter - allowance), 0.0))
-    values = deviation(two.T_parent_child, one.T_parent_child)
-    limits = SEEN_TARGETS * np.array([target_of(axis, two) for axis in AXES])
-    found = moved(values, covariance + scatter, limits)
+    values = deviation(after.T_parent_child, before.T_parent_child)
+    limits = SEEN_TARGETS * np.array([target_of(axis, after) for axis in AXES])
+    difference = moved(values, covariance + scatter, limits)
     return Difference(
         first=first_name,
         second=second_name,
-        verdict=found.verdict.value,
-        sentence=found.sentence,
-        axes=found.axes,
+        verdict=difference.verdict.value,
+        sentence=difference.sentence,
+        axes=difference.axes,
     )
 
 
-def _is_found(given: Calibration | Extrinsic) -> bool:
-    """Whether it was found from motion, with the same sensors."""
-    return isinstance(given, Calibration) or given.is_calibration
+def _is_from_motion(extrinsic: Calibration | Extrinsic) -> bool:
+    """Whether an extrinsic was estimated from motion, with the same sensors."""
+    return isinstance(extrinsic, Calibration) or extrinsic.is_calibration
 
 
-def _spread(given: Calibration | Extrinsic) -> FloatArray:
-    """Covariance (6, 6) along and about the parent's axes, how recordings of its rig scatter, and
-    its allowance, stacked.
+def _spread(extrinsic: Calibration | Extrinsic) -> FloatArray:
+    """Covariances (3, 6, 6) of an extrinsic along and about the parent's axes.
+
+    They are the measured covariance, the scatter between recordings of the rig, and the allowance.
     """
-    rotation = given.T_parent_child[:3, :3]
+    rotation = extrinsic.T_parent_child[:3, :3]
     covariance = np.diag(UNKNOWN**2)
     allowance = np.zeros((6, 6))
-    measured = given.covariance_measured if isinstance(given, Calibration) else given.covariance
+    if isinstance(extrinsic, Calibration):
+        measured = extrinsic.covariance_measured
+        allowance = turned(rotation, extrinsic.covariance_allowance)
+    else:
+        measured = extrinsic.covariance
     if np.isfinite(measured).all():
         covariance = turned(rotation, measured)
-    if isinstance(given, Calibration):
-        hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in given.observability]
-        covariance = covariance + np.diag(np.where(hidden, UNKNOWN**2, 0.0))
-        allowance = turned(rotation, given.covariance_allowance)
-    scatter = scatter_of_recordings(covariance) if _is_found(given) else np.zeros((6, 6))
+    if isinstance(extrinsic, Calibration):
+        is_hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in extrinsic.observability]
+        covariance = covariance + np.diag(np.where(is_hidden, UNKNOWN**2, 0.0))
+    scatter = np.zeros((6, 6))
+    if _is_from_motion(extrinsic):
+        scatter = scatter_of_recordings(covariance)
     return np.array([covariance, scatter, allowance])
 
 
 def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) -> Agreement:
-    """How the results of several recordings of one rig, in the order of time, belong together; the
-    level is that of :func:`agreement_of`.
+    """Compare the results of several recordings of one rig, in the order of time.
+
+    ``level`` is that of :func:`~hand_eye_calib.core.assessment.agreement.agreement_of`.
     """
-    Ts = np.array([each.T_parent_child for each in results])
-    covariances = turned(Ts[:, :3, :3], np.array([each.covariance_measured for each in results]))
-    usual = [np.diag(scatter_of_recordings(each)) for each in covariances]
-    return agreement_of(Ts, covariances, np.sqrt(np.median(usual, axis=0)), level)
+    Ts = np.array([result.T_parent_child for result in results])
+    measured = np.array([result.covariance_measured for result in results])
+    covariances = turned(Ts[:, :3, :3], measured)
+    variances = [np.diag(scatter_of_recordings(covariance)) for covariance in covariances]
+    return agreement_of(Ts, covariances, np.sqrt(np.median(variances, axis=0)), level)
 
 
 def require_same_frames(results: Iterable[Calibration]) -> None:
     """Raise InputError unless all results are of one pair of frames."""
-    frames = {f"{each.child_frame} in {each.parent_frame}" for each in results}
+    frames = {f"{result.child_frame} in {result.parent_frame}" for result in results}
     if len(frames) > 1:
         raise InputError(
             f"expected results of one pair of frames; found {' and '.join(sorted(frames))}"
@@ -160,5 +183,5 @@ def require_same_frames(results: Iterable[Calibration]) -> None:
 
 
 def by_axis(values: FloatArray) -> dict[str, float]:
-    """Return values (6,) by the names of their axes."""
+    """Return values (6,) by the name of their axis."""
     return dict(zip(AXES, values.tolist(), strict=True))
