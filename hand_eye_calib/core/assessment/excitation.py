@@ -1,6 +1,4 @@
-"""How the parent sensor has moved, and in words what it does not show: hints for a person who is
-still recording.
-"""
+"""Motion of the parent sensor so far, and hints on the motion that is missing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,33 +14,34 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 
-# Most poses that are looked at, evenly over the session: enough to see curves, and few enough to
-# cost a few milliseconds.
+# Largest number of poses, evenly over the session: enough for curves, and some milliseconds.
 _MAX_POSES = 500
 
-# The rotation about an axis is this quantile of all motions: one outlier is not a rotation.
+# Quantile of all motions that is the rotation about an axis: one outlier is not a rotation.
 _QUANTILE = 0.95
 
 # Smallest rotation (rad) that reveals anything of a lever arm.
 MIN_ROTATION = float(np.radians(5.0))
 
-# A sensor moves if it does so faster than this over a second (m/s, rad/s).
-_MOVES = 0.05, float(np.radians(1.0))
+# Speed over a second (m/s) above which a sensor moves.
+_MOVES_M_S = 0.05
+# Angular rate over a second (rad/s) above which a sensor moves.
+_MOVES_RAD_S = float(np.radians(1.0))
 _STEP_NS = 1_000_000_000
 
-# Wheels and tracks move a sensor along one axis of its own: at least this share of its squared
-# directions; it is x from this cosine on. Directions of the shorter steps, below this share of the
-# median, are noise. (Road vehicles: 0.95 to 1; handheld devices, drones and robot arms: 0.4 to
-# 0.85.)
+# Least share of the squared directions along one axis of the sensor if wheels or tracks move it;
+# also the least cosine to x of a motion along x. Measured: road vehicles 0.95 to 1; handheld
+# devices, drones and robot arms 0.4 to 0.85.
 _ALONG_ONE_AXIS = 0.9
+# Directions of steps below this share of the median are noise.
 _LONG_STEP = 0.3
-# What turns a vehicle about its x, y and z.
+# Manoeuvres that turn a vehicle about its x, y and z.
 _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """How the parent sensor has moved, in its own axes.
+    """Motion of the parent sensor, in its own axes.
 
     Attributes
     ----------
@@ -52,16 +51,17 @@ class Excitation:
         Rotation about x, y and z, rad: the 95th percentile over the session, of the time span with
         the most rotation.
     lever_arms : (3, 3) array
-        How far the rotations move lever arms, over the time span with the most of it: their
-        :func:`~hand_eye_calib.core.assessment.covariance.lever_arm_products`.
+        :func:`~hand_eye_calib.core.assessment.covariance.lever_arm_products` of the rotations over
+        the time span with the largest displacement of lever arms.
     distance : float
         Length of the path, m.
     motion_s : float
-        Seconds during which the sensor moved; a robot that stands still shows nothing.
+        Seconds during which the sensor moved. A robot at rest reveals nothing.
     drives : bool
-        The sensor moves as on a vehicle, along one axis of its own; also if it has not moved yet.
+        Whether the sensor moves along one axis of its own, as on a vehicle; also if it has not
+        moved yet.
     forward : (3,) array
-        Unit vector of the direction that it moves along most; 0 if it has not moved.
+        Unit vector of the main direction of motion; 0 if the sensor has not moved.
     """
 
     n_poses: int
@@ -74,19 +74,20 @@ class Excitation:
 
     @property
     def has_vehicle_axes(self) -> bool:
-        """Whether x is along the motion and z is what it turns about, as REP 103 has it."""
+        """Whether the sensor moves along x and turns about z, as in REP 103."""
         turns_about_z = self.rotation[2] >= max(self.rotation.max(), MIN_ROTATION)
-        return bool(self.drives and turns_about_z and abs(self.forward[0]) > _ALONG_ONE_AXIS)
+        moves_along_x = abs(self.forward[0]) > _ALONG_ONE_AXIS
+        return bool(self.drives and turns_about_z and moves_along_x)
 
     def hidden_axes(self) -> tuple[str, ...]:
-        """Axes x, y, z along which the motion cannot show the translation, whatever the noise."""
+        """Return the axes x, y, z along which the motion hides the translation, without noise."""
         if self.rotation.max() < MIN_ROTATION:
             return TRANSLATIONS
         return hidden_axes(self.lever_arms)
 
 
 def excitation(pose_pairs: PosePairs) -> Excitation:
-    """The Excitation in synchronised poses."""
+    """Return the motion of the parent sensor in synchronised poses."""
     n_poses = len(pose_pairs)
     rotation = np.zeros(3)
     lever_arms = np.zeros((3, 3))
@@ -99,53 +100,60 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
         rotations = np.swapaxes(poses[:-lag, :3, :3], 1, 2) @ poses[lag:, :3, :3]
         angles = np.abs(se3.rotation_log(rotations))
         rotation = np.maximum(rotation, [quantile(angle, _QUANTILE) for angle in angles.T])
-        at_lag = lever_arm_products(rotations - np.eye(3))
-        if np.trace(at_lag) > np.trace(lever_arms):
-            lever_arms = at_lag
+        products = lever_arm_products(rotations - np.eye(3))
+        if np.trace(products) > np.trace(lever_arms):
+            lever_arms = products
         lag *= 2
-    distance = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
-    found = [_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
-    share, forward = max(found, key=lambda each: each[0])
-    motion_s = seconds_of_motion(pose_pairs)
-    drives = share >= _ALONG_ONE_AXIS
-    return Excitation(n_poses, rotation, lever_arms, distance, motion_s, drives, forward)
+    directions = [_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
+    share, forward = max(directions, key=lambda direction: direction[0])
+    return Excitation(
+        n_poses=n_poses,
+        rotation=rotation,
+        lever_arms=lever_arms,
+        distance=float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()),
+        motion_s=seconds_of_motion(pose_pairs),
+        drives=share >= _ALONG_ONE_AXIS,
+        forward=forward,
+    )
 
 
 def _main_direction(poses: FloatArray, lag: int) -> tuple[float, FloatArray]:
-    """The axis of their own that poses (N, 4, 4) move along, and its share of all motion."""
+    """Share of the main direction in all motion of poses (N, 4, 4), and its axis in the sensor."""
     steps = poses[lag:, :3, 3] - poses[:-lag, :3, 3]
     lengths = np.linalg.norm(steps, axis=1)
-    long = (lengths > _LONG_STEP * median(lengths)) & (lengths > 0)
-    if not long.any():
+    is_long = (lengths > _LONG_STEP * median(lengths)) & (lengths > 0)
+    if not is_long.any():
         return 1.0, np.zeros(3)
-    own = np.einsum("nji,nj->ni", poses[:-lag, :3, :3], steps)[long] / lengths[long, None]
-    shares, axes = np.linalg.eigh(own.T @ own / len(own))
+    in_sensor = np.einsum("nji,nj->ni", poses[:-lag, :3, :3], steps)
+    directions = in_sensor[is_long] / lengths[is_long, None]
+    shares, axes = np.linalg.eigh(directions.T @ directions / len(directions))
     return float(shares[-1]), axes[:, -1]
 
 
 def seconds_of_motion(pose_pairs: PosePairs) -> float:
-    """Seconds during which the parent sensor moved, by poses that are a second apart or more."""
+    """Return the seconds during which the parent sensor moved, by poses a second apart."""
     stamps_ns = pose_pairs.stamps_ns
     rows = np.unique((stamps_ns - stamps_ns[0]) // _STEP_NS, return_index=True)[1]
     if len(rows) < 2:
         return 0.0
-    seconds = np.diff(stamps_ns[rows]) * 1e-9
+    durations_s = np.diff(stamps_ns[rows]) * 1e-9
     poses = pose_pairs.Ts_pw_p[rows]
-    speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / seconds
+    speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / durations_s
     rotations = np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
-    moves = (speeds > _MOVES[0]) | (se3.rotation_angle(rotations) / seconds > _MOVES[1])
-    return float(seconds[moves].sum())
+    rates = se3.rotation_angle(rotations) / durations_s
+    is_moving = (speeds > _MOVES_M_S) | (rates > _MOVES_RAD_S)
+    return float(durations_s[is_moving].sum())
 
 
 def what_is_missing(seen: Excitation, calibration: Calibration | None = None) -> str:
-    """What cannot be determined from the motion so far, and the motion that would show it.
+    """Describe what the motion so far does not determine, and the motion that would.
 
     Parameters
     ----------
     seen : Excitation
-        Of the parent sensor; x, y, z are its axes.
+        Motion of the parent sensor; x, y, z are its axes.
     calibration : Calibration, optional
-        The result from those poses. If there is one, its verdicts decide.
+        The result from the same poses. Its verdicts decide if given.
 
     Returns
     -------
@@ -153,22 +161,22 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
         Empty if nothing is missing.
     """
     axes = [*seen.hidden_axes()]
-    what = "cannot be determined from"
+    problem = "cannot be determined from"
     if calibration:
         axes = calibration.hidden
         if not axes:
-            known = calibration.observability
-            what = "still uncertain after"
-            axes = [dof.name for dof in known if dof.verdict is DofVerdict.WEAK]
+            verdicts = calibration.observability
+            problem = "still uncertain after"
+            axes = [dof.name for dof in verdicts if dof.verdict is DofVerdict.WEAK]
     if not axes:
         return ""
-    return f"{axes_in_words(axes)} {what} the motion so far: {helpful_motion(axes, seen)}"
+    return f"{axes_in_words(axes)} {problem} the motion so far: {helpful_motion(axes, seen)}"
 
 
 def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
-    """The motion that would show most about these axes, in words.
+    """Describe the motion that reveals most about these axes.
 
-    A rotation about one axis shows offsets and angles across it, never those along it.
+    A rotation about one axis reveals offsets and angles across this axis, never along it.
 
     Parameters
     ----------
@@ -180,23 +188,28 @@ def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
     return listing([*dict.fromkeys(_motion_for(axis, seen) for axis in axes)])
 
 
-def _motion_for(axis: str, seen: Excitation) -> str:
+def _motion_for(name: str, seen: Excitation) -> str:
+    """Describe the motion that reveals most about one axis."""
     rotation = seen.rotation
     if rotation.max() < MIN_ROTATION:
-        return (
-            "move in curves, to both sides" if seen.drives else "rotate the sensors, about all axes"
-        )
+        if seen.drives:
+            return "move in curves, to both sides"
+        return "rotate the sensors, about all axes"
     main = int(np.argmax(rotation))
-    along = (TRANSLATIONS if axis in TRANSLATIONS else ROTATIONS).index(axis)
-    is_planar = int((rotation < MIN_ROTATION).sum()) == 2 and (seen.drives or along == main)
-    if not is_planar:
-        least = min((each for each in range(3) if each != along), key=lambda each: rotation[each])
-        like = f" ({_MANOEUVRES[least]})" * seen.has_vehicle_axes
-        return f"rotations about {'xyz'[least]} help most{like}"
-    if along != main:
+    is_rotation = name in ROTATIONS
+    axis = (ROTATIONS if is_rotation else TRANSLATIONS).index(name)
+    across = [other for other in range(3) if other != axis]
+    turns_about_one_axis = int((rotation < MIN_ROTATION).sum()) == 2
+    if not turns_about_one_axis or not (seen.drives or axis == main):
+        least = min(across, key=lambda other: rotation[other])
+        hint = f"rotations about {'xyz'[least]} help most"
+        return f"{hint} ({_MANOEUVRES[least]})" if seen.has_vehicle_axes else hint
+    if axis != main:
         return "tighter curves to both sides help most"
-    if axis in ROTATIONS:
+    if is_rotation:
         return "move farther, straight on and in curves"
-    others = " and ".join(name for index, name in enumerate("xyz") if index != main)
-    tilt = "over a ramp or a kerb" if seen.drives else f"about {others}"
+    if seen.drives:
+        tilt = "over a ramp or a kerb"
+    else:
+        tilt = "about " + " and ".join("xyz"[other] for other in across)
     return f"tilt the sensors {tilt}, or measure it by hand"

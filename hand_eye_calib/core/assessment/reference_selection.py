@@ -1,4 +1,4 @@
-"""``reference: auto``: the reference whose answer is nearest to the adaptive estimator's."""
+"""Option ``reference: auto``: the reference with the answer nearest to the adaptive estimator's."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,24 @@ from hand_eye_calib.core.solvers.registry import Method
 
 _CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
-# Fewest poses from which the noise can be estimated; fewest pairs that say something.
+# Fewest poses for an estimate of the noise.
 MIN_POSES = 13
+# Fewest motion pairs of a candidate.
 _MIN_PAIRS = 6
 
 
 @dataclass(frozen=True)
 class ReferenceChoice:
-    """A reference; by candidate, the distance of its answer from the adaptive estimator's, in
-    standard deviations of that; and the adaptive estimator's.
+    """A reference and the candidates it was chosen from.
+
+    Attributes
+    ----------
+    reference : str
+    distances : dict of str to float
+        Candidate to the distance of its answer from that of the adaptive estimator, in standard
+        deviations of the latter.
+    model : AdaptiveSolution
+        The answer of the adaptive estimator.
     """
 
     reference: str
@@ -29,25 +38,31 @@ class ReferenceChoice:
     model: AdaptiveSolution
 
     def reason(self) -> str:
-        """The reason in one sentence."""
-        nearest, farthest = (choose(self.distances.values()) for choose in (min, max))
+        """Return the reason for the choice in one sentence."""
+        distances = self.distances.values()
         return (
             f"{self.reference} of {', '.join(self.distances)}: its estimate is nearest to the "
-            f"adaptive estimator's, {nearest:.1f} standard deviations off; the farthest is "
-            f"{farthest:.1f} off"
+            f"adaptive estimator's, {min(distances):.1f} standard deviations off; the farthest is "
+            f"{max(distances):.1f} off"
         )
 
 
 def select_reference(
     pose_pairs: PosePairs, method: Method, solution: AdaptiveSolution | None = None
 ) -> ReferenceChoice:
-    """Choose the reference for a method; ``solution`` is the adaptive estimator's for these poses,
-    if it is known.
+    """Choose the reference for a method.
 
-    The residual cannot tell which reference is best (Välimäki et al. 2023, section 4.2). The
-    adaptive estimator can: its error is smaller and, as that of the best linear estimator,
-    uncorrelated with the distance of other answers from it. So the answer nearest to it is
-    probably the best one.
+    The residual does not indicate the best reference (Välimäki et al. 2023, section 4.2). The
+    adaptive estimator does: its error is smaller and, as the error of the best linear estimator,
+    uncorrelated with the distance of other answers from its own. So the nearest answer is probably
+    the best one.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    method : Method
+    solution : AdaptiveSolution, optional
+        Solution of the adaptive estimator for these poses; computed if left out.
 
     Raises
     ------
@@ -62,11 +77,12 @@ def select_reference(
     poses = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     solution = solution or estimator.solve(pose_pairs.stamps_ns, *poses, quick=True)
     information = np.linalg.pinv(solution.cov_parent_child_in_child, hermitian=True)
-    to_answer = se3.inverse(solution.T_parent_child)
-    distances = {}
+    back = se3.inverse(solution.T_parent_child)
+    distances: dict[str, float] = {}
     for reference in _CANDIDATES:
         pairs = motion_pairs(*poses, reference)
         if len(pairs) >= _MIN_PAIRS:
-            error = se3.log(to_answer @ method.solve(pairs).T_parent_child)
-            distances[reference] = max(float(error @ information @ error), 0.0) ** 0.5
-    return ReferenceChoice(min(distances, key=distances.__getitem__), distances, solution)
+            deviation = se3.log(back @ method.solve(pairs).T_parent_child)
+            distances[reference] = max(float(deviation @ information @ deviation), 0.0) ** 0.5
+    nearest = min(distances, key=distances.__getitem__)
+    return ReferenceChoice(nearest, distances, solution)
