@@ -12,8 +12,9 @@ from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.stops.calibrate import calibrate_stops
 
-KINDS = ("poses", "positions", "rotations", "rates")
+KINDS = ("poses", "positions", "rotations", "rates", "stops")
 
 # A value of each option that is not the default and that matters for the streams below.
 VALUES = {
@@ -61,6 +62,10 @@ REFUSED = {
     | _OF_WHOLE_POSES,
     "rotations": {"scale", "parent_scale"} | _OF_WHOLE_POSES,
     "rates": {"scale", "parent_scale", "child_invert", "child_quaternion"} | _OF_WHOLE_POSES,
+    "stops": {"threshold", "min_inlier_fraction", "max_pairs", "max_gap", "time_offset"}
+    | {"keyframe.min_translation", "keyframe.min_rotation", "keyframe.min_interval"}
+    | {"parent_kind", "child_kind"}
+    | _OF_WHOLE_POSES,
 }
 
 # What a stream measures already changes nothing.
@@ -92,9 +97,19 @@ def streams(kind):
 
 
 @cache
+def stops():
+    """Poses of both sensors at 40 stops."""
+    poses = wandering_poses(240)[::6]
+    return disturbed(poses, 4, 0.002, 0.001), disturbed(child_of(poses), 1, 0.002, 0.001)
+
+
+@cache
 def document(kind, **options):
     try:
-        result = whole_snapshot(*streams(kind), options).estimate()
+        if kind == "stops":
+            result = calibrate_stops(*stops(), CalibratorConfig.from_options(options))
+        else:
+            result = whole_snapshot(*streams(kind), options).estimate()
     except NotEnoughDataError as error:
         return str(error)
     return str(result.to_dict())

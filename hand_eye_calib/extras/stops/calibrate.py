@@ -30,7 +30,7 @@ _OBEYED = {"min_pairs", "parent_frame", "child_frame", "scale", "parent_scale"}
 _OBEYED |= {
     f"{stream}_{name}"
     for stream in ("parent", "child")
-    for name in ("invert", "quaternion", "measures", "kind")
+    for name in ("invert", "quaternion", "measures")
 }
 _OBEYED_GROUPS = ("prior_", "target_")
 
