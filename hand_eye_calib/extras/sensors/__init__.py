@@ -1,4 +1,4 @@
-"""Lidar scans, images of a target and files of other programs as poses."""
+"""Read lidar scans, images of a target and files of other programs as poses."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Images of a target in a bag: the poses of the camera that took them."""
+"""Read the poses of a camera from a bag with its images of a target."""
 
 from pathlib import PurePosixPath
 
@@ -20,7 +20,9 @@ from hand_eye_calib.formats.bags.sources import Reading
 
 
 def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReading":
-    """Reading of images of a target, with the intrinsics of a file or of the camera_info beside.
+    """Return the reader of images of a target.
+
+    The intrinsics come from a file, or from the camera_info topic beside the images.
 
     Parameters
     ----------
@@ -43,8 +45,8 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
         raise InputError(f"{topic} is of type {type_}, which has no images of a target")
     if file:
         return ImageReading(stream, topic, target, read_camera(file))
-    beside = (str(folder / "camera_info") for folder in PurePosixPath(topic).parents)
-    info = next((each for each in beside if each in bag.topics), "")
+    candidates = [str(folder / "camera_info") for folder in PurePosixPath(topic).parents]
+    info = next((name for name in candidates if name in bag.topics), "")
     run = next(bag.runs([info]), None)
     if run is None:
         raise InputError(
@@ -56,7 +58,7 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
 
 
 class ImageReading(Reading):
-    """Images of a target: the poses of the camera in the frame of the target."""
+    """Read images of a target as poses of the camera in the frame of the target."""
 
     def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
         super().__init__(stream, topic)
@@ -67,16 +69,16 @@ class ImageReading(Reading):
 
     def take(self, run: messages.Run) -> None:
         for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
-            with located(self.topics[0]):
-                is_seen = self._finder.look(grey_of(message))
-            if is_seen:
+            with located(self.name):
+                is_usable = self._finder.look(grey_of(message))
+            if is_usable:
                 self._stamps_ns.append(messages.ns_of(message.header.stamp) or 0)
                 self._bag_ns.append(bag_ns)
                 self._frame = printable(frame_name(message.header.frame_id))
 
     def table(self) -> PoseTable:
-        found = self._finder.found()
-        self.notes.append(f"{self.topics[0]}: {found}")
-        poses = se3.to_rows(se3.inverse(found.Ts_camera_target))
+        target_poses = self._finder.found()
+        self.notes.append(f"{self.name}: {target_poses}")
+        poses = se3.to_rows(se3.inverse(target_poses.Ts_camera_target))
         table = PoseTable.of(self._stamps_ns, poses, "target", self._frame)
         return self._stamped(table.recorded(self.stream, self._bag_ns))

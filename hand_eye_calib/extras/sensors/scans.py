@@ -1,19 +1,20 @@
-"""Odometry from the scans of a lidar (``sensor_msgs/PointCloud2``), by registration with
-small_gicp.
+"""Compute odometry from the scans of a lidar (``sensor_msgs/PointCloud2``) with small_gicp.
 
-Each scan is registered against a map of the scans before it, by their local planes (generalised
-ICP), whose voxels hold the mean plane of their points. Registration of points to points, as of
-KISS-ICP, drags along the rings of a lidar that has 16 of them: they look the same on flat ground
-whatever the pitch, and pitch and roll are not followed.
+Each scan is registered against a map of the previous scans by generalised ICP: points match local
+planes, and each voxel of the map holds the mean plane of its points. Matching points to points, as
+KISS-ICP does, drags along the rings of a lidar with 16 rings. On flat ground the rings look the
+same at any pitch, so pitch and roll would not be followed.
 
-A pose is that of the middle of its scan. A scan is registered roughly when it comes, as if the
-motion went on, and finely after the next one, when the motion during it is known from both sides:
-a constant motion doubles the errors. What each ring of the lidar measures too far is learned from
-the planes of the map: with 3 mm of that, walls seem to move as the lidar pitches, and the extrinsic
-is up to 2 cm off along the axis that turns least.
+A pose is that of the middle of its scan. Each new scan is registered roughly, as if the motion
+continued. It is registered finely after the next scan, when the motion during it is known from both
+sides. A constant motion would double the errors.
+
+The range error of each ring is learned from the planes of the map. With an error of 3 mm, walls
+seem to move as the lidar pitches, and the extrinsic is up to 2 cm off along the axis that turns
+least.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,51 +34,86 @@ from hand_eye_calib.formats.npz import read_arrays
 
 # numpy's name of each datatype of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-# Names that drivers give the time of a point.
-_TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
+# Names that drivers use for the time of a point.
+_TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
+
+
+class Step(NamedTuple):
+    """Sizes of a registration, in voxels of the fine map.
+
+    Attributes
+    ----------
+    map_voxel : float
+        Size of the voxels of the map.
+    scan_voxel : float
+        The scan is thinned to one point in each voxel of this size.
+    reach : float
+        Longest distance of matched points.
+    min_inlier_fraction : float
+        Registration fails if fewer points match.
+    """
+
+    map_voxel: float
+    scan_voxel: float
+    reach: float
+    min_inlier_fraction: float
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Numbers of the registration."""
+    """Constants of the registration."""
 
-    # No scan lasts longer (ns): tells the unit of the times of its points.
+    # Longest scan (ns). The unit of the times of points follows from this limit.
     longest_ns: float = 1e9
-    # Ranges that are used (m): the robot itself is nearer, and beyond a scan is too sparse.
+    # Ranges that are used (m). The robot itself is nearer; beyond, a scan is too sparse.
     ranges_m: tuple[float, float] = (1.0, 80.0)
-    # Points of a scan that are used, evenly drawn: more take longer and change nothing.
+    # Points of a scan that are used, evenly drawn. More take longer and change nothing.
     most_points: int = 7_000
-    # Size of a voxel as a share of the median range, within limits (m).
+    # Size of a voxel as a share of the median range.
     voxel_share: float = 0.03
+    # Limits of the size of a voxel (m).
     voxel_limits_m: tuple[float, float] = (0.1, 0.4)
-    # Of the rough and the fine registration: voxels of the map, voxels that a scan is thinned to,
-    # and over how much points are matched, all in voxels; share of matched points below which it
-    # counts as failed. The fine map has few voxels in the beginning.
-    steps: tuple[tuple[float, ...], ...] = ((3.0, 3.0, 6.0, 0.3), (1.0, 1.5, 2.0, 0.1))
-    # Points that a local plane is fitted to: fewer are of one ring, on a line.
+    # Points that a local plane is fitted to. Fewer points are of one ring, on a line.
     n_neighbours: int = 15
-    # Rings by elevation, in half degrees; scans from one look at them to the next, what a look
-    # counts at the next one, and the sum of squared cosines that says that a ring is right.
+    # Rings by elevation, in half degrees.
     n_rings: int = 361
-    look_every: int = 10
+    # Scans between two estimates of the range errors of rings.
+    learn_every: int = 10
+    # Weight of an estimate at the next estimate.
     kept_share: float = 0.95
-    right: float = 100.0
-    # Of a plane: variance across over that along, and distance of its points (m).
+    # Prior that a ring has no range error, as a sum of squared cosines.
+    prior_weight: float = 100.0
+    # A voxel is a plane if its variance across is this share of its variance along.
     flat: float = 0.01
+    # Longest distance of a point from its plane (m).
     near_m: float = 0.1
     # Time (s) in which points of a scan have the same correction for motion.
     part_s: float = 0.002
 
 
 TUNING = Tuning()
+_ROUGH = Step(map_voxel=3.0, scan_voxel=3.0, reach=6.0, min_inlier_fraction=0.3)
+# The fine map has few voxels in the beginning, so few points match.
+_FINE = Step(map_voxel=1.0, scan_voxel=1.5, reach=2.0, min_inlier_fraction=0.1)
 
-_KEPT = ("poses", "stamps_ns", "bag_ns", "frame", "n_failed", "too_far_m")
+# Arrays of a stored result.
+_STORED = ("poses", "stamps_ns", "bag_ns", "frame", "n_failed", "too_far_m")
 
 
 class Scan(NamedTuple):
-    """Points (N, 3) of one turn of a lidar, m, in its own frame; their rings (N,), which are their
-    elevations in half degrees from straight down; their times (N,), s since the middle of the scan;
-    and its stamp.
+    """One turn of a lidar.
+
+    Attributes
+    ----------
+    points : (N, 3) array
+        In the frame of the lidar, m.
+    rings : (N,) int array
+        Elevations in half degrees from straight down.
+    times_s : (N,) array
+        Since the middle of the scan.
+    stamp_ns : int
+        Of the middle of the scan.
+    frame : str
     """
 
     points: FloatArray
@@ -88,73 +124,98 @@ class Scan(NamedTuple):
 
 
 def scan_of(message: Any) -> Scan:
-    """Points and times of a PointCloud2 message; an InputError if it has no x, y and z, or is
-    damaged. Without times of its points, a scan counts as taken at once.
+    """Return the points of a PointCloud2 message in the used ranges.
+
+    All points count as measured at once if the message has no times of points.
+
+    Raises
+    ------
+    InputError
+        If the message has no x, y and z, or is damaged.
     """
-    names = [field.name for field in message.fields]
-    if not {*"xyz"} <= {*names}:
-        raise InputError(f"points have no x, y, z, but {', '.join(names)}")
-    order = "<>"[message.is_bigendian]
-    size = message.point_step
-    n = message.height * message.width
-    try:
-        kinds = [order + _DATATYPES[field.datatype] for field in message.fields]
-        places = [field.offset for field in message.fields]
-        form = np.dtype({"names": names, "formats": kinds, "offsets": places, "itemsize": size})
-        rows = np.asarray(message.data, dtype=np.uint8)[: n * size].view(form)
-    except (ValueError, IndexError, TypeError) as error:
-        raise InputError(f"a scan of points is damaged ({error}); record it again") from error
+    rows = _rows_of(message)
     points = np.stack([rows[axis] for axis in "xyz"], axis=-1)
     ranges = np.linalg.norm(points.astype(float), axis=1)
-    used = np.flatnonzero((ranges > TUNING.ranges_m[0]) & (ranges < TUNING.ranges_m[1]))
+    nearest_m, farthest_m = TUNING.ranges_m
+    used = np.flatnonzero((ranges > nearest_m) & (ranges < farthest_m))
     if len(used) > TUNING.most_points:
         used = used[np.linspace(0, len(used) - 1, TUNING.most_points).astype(int)]
-    of_time = next((rows[name] for name in _TIMES if name in names), np.zeros(len(rows)))
     points = points[used].astype(float)
-    times = of_time[used].astype(float)
     rings = np.round(np.degrees(2 * np.arccos(-points[:, 2] / ranges[used]))).astype(int)
-    first, last = (times.min(), times.max()) if len(times) else (0.0, 0.0)
-    fitting = (ns for ns in STAMP_UNITS.values() if 0 < (last - first) * ns <= TUNING.longest_ns)
+    times = np.zeros(len(used))
+    time_field = next((name for name in _TIME_FIELDS if name in rows.dtype.names), "")
+    if time_field:
+        times = rows[time_field][used].astype(float)
+    first = times.min() if len(times) else 0.0
+    last = times.max() if len(times) else 0.0
+    fitting = [ns for ns in STAMP_UNITS.values() if 0 < (last - first) * ns <= TUNING.longest_ns]
     unit_ns = max(fitting, default=0)
     middle = (first + last) / 2
-    # Times may be relative to the stamp of the header, or absolute.
-    middle_ns = round(float(middle) * unit_ns)
-    header_ns = ns_of(message.header.stamp) or 0
-    stamp_ns = middle_ns + header_ns * (middle_ns <= TUNING.longest_ns)
+    stamp_ns = round(float(middle) * unit_ns)
+    if stamp_ns <= TUNING.longest_ns:  # the times are relative to the header
+        stamp_ns += ns_of(message.header.stamp) or 0
     times_s = (times - middle) * unit_ns * 1e-9
     frame = printable(frame_name(message.header.frame_id))
     return Scan(points, rings, times_s, stamp_ns, frame)
 
 
+def _rows_of(message: Any) -> Any:
+    """Return the points of a PointCloud2 message as a structured array (N,)."""
+    names = [field.name for field in message.fields]
+    if not {*"xyz"} <= {*names}:
+        raise InputError(f"points have no x, y, z, but {', '.join(names)}")
+    size = message.point_step
+    n_bytes = message.height * message.width * size
+    byte_order = ">" if message.is_bigendian else "<"
+    try:
+        formats = [byte_order + _DATATYPES[field.datatype] for field in message.fields]
+        offsets = [field.offset for field in message.fields]
+        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+        return np.asarray(message.data, dtype=np.uint8)[:n_bytes].view(dtype)
+    except (ValueError, IndexError, TypeError) as error:
+        raise InputError(f"a scan of points is damaged ({error}); record it again") from error
+
+
 class ScanReading(Reading):
-    """The points of a lidar, as odometry: its scans are registered one after the other. What is
-    found is kept beside the bag, and read again for files of the same sizes and times: poses (N, 7)
-    in the frame of the first scan, each of the middle of its scan, stamps and bag times (N,), the
-    lidar's frame, how many scans could not be registered, and what rings measure too far (m).
+    """Compute odometry from the points of a lidar: each scan is registered after the previous one.
+
+    The result is stored beside the bag, and read again for files of the same sizes and times. It
+    has ``poses`` (N, 7) of the middles of scans in the frame of the first scan, ``stamps_ns`` and
+    ``bag_ns`` (N,), the lidar's ``frame``, the number of scans without registration, ``n_failed``,
+    and the range error of each ring, ``too_far_m``.
+
+    Raises
+    ------
+    MissingDependencyError
+        If small_gicp is not installed, and no result is stored.
     """
 
     def __init__(self, stream: str, topic: str, bag: Path, files: Sequence[Path]) -> None:
         super().__init__(stream, topic)
-        self._state = np.array([[each.stat().st_size, each.stat().st_mtime_ns] for each in files])
-        self._place = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
-        self._kept: list[Any] = []
-        # The errors are of many kinds: it is not there, cut off, or of an older version.
+        self._state = np.array([[file.stat().st_size, file.stat().st_mtime_ns] for file in files])
+        self._path = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
+        self._stored: Mapping[str, Any] = {}
+        # The errors are of many kinds: the file is absent, cut off, or of an older version.
         with suppress(Exception):
-            kept = read_arrays(self._place)
-            if np.array_equal(kept["bag_files"], self._state):
-                self._kept = [kept[name] for name in _KEPT]
+            stored = read_arrays(self._path)
+            if np.array_equal(stored["bag_files"], self._state):
+                self._stored = {name: stored[name] for name in _STORED}
                 self.topics = ()
                 return
         self._gicp = required("small_gicp", "odometry from the points of a lidar", "lidar")
+        # Size of a voxel of the fine map.
         self._voxel_m = 0.0
-        self._has_failed = [False]
-        self._maps: list[Any] = []
-        # Of all scans, and the newest three of them.
+        self._rough_map: Any = None
+        self._fine_map: Any = None
+        # Of all scans.
         self._poses = [np.eye(4)]
+        self._has_failed = [False]
         self._stamps_ns = list[int]()
         self._bag_ns = list[int]()
+        # The newest three scans.
         self._scans = list[Scan]()
-        # What rings measure too far (m), and of what it is the ratio.
+        # Range error of each ring (m), the ratio of two sums over planes: cosine times distance,
+        # and squared cosine.
         self._too_far_m = np.zeros(TUNING.n_rings)
         self._sums = np.zeros((2, TUNING.n_rings))
 
@@ -166,29 +227,42 @@ class ScanReading(Reading):
                 self._add(scan)
 
     def table(self) -> PoseTable:
-        if not self._kept:
-            n_failed = sum(self._has_failed)
-            if 2 * n_failed >= len(self._bag_ns):
-                raise InputError(
-                    f"{self.topics[0]}: of {len(self._bag_ns)} scans with points, {n_failed} "
-                    "could not be registered; use the odometry of a lidar SLAM"
-                )
-            self._register(-1, 1)
-            found = se3.to_rows(np.array(self._poses)), self._stamps_ns, self._bag_ns
-            self._kept = [*found, self._scans[-1].frame, n_failed, self._too_far_m]
-            with suppress(OSError):  # the folder may be read-only
-                kept = dict(zip(_KEPT, self._kept, strict=True))
-                np.savez(self._place, bag_files=self._state, **kept)
-        poses, stamps_ns, bag_ns, frame, n_failed, _ = self._kept
-        lost = f", {n_failed} of which could not be registered" if n_failed else ""
-        self.notes.append(f"odometry from {len(poses)} scans{lost}; it is kept in {self._place}")
-        return PoseTable.of(stamps_ns, poses, "scans", str(frame)).recorded(self.stream, bag_ns)
+        if not self._stored:
+            self._finish()
+        stored = self._stored
+        text = f"odometry from {len(stored['poses'])} scans"
+        if stored["n_failed"]:
+            text += f", {stored['n_failed']} of which could not be registered"
+        self.notes.append(f"{text}; it is kept in {self._path}")
+        frame = str(stored["frame"])
+        table = PoseTable.of(stored["stamps_ns"], stored["poses"], "scans", frame)
+        return table.recorded(self.stream, stored["bag_ns"])
+
+    def _finish(self) -> None:
+        """Register the last scan finely, and store the result."""
+        n_failed = sum(self._has_failed)
+        if 2 * n_failed >= len(self._bag_ns):
+            raise InputError(
+                f"{self.name}: of {len(self._bag_ns)} scans with points, {n_failed} could not be "
+                "registered; use the odometry of a lidar SLAM"
+            )
+        self._register_finely(-1)
+        self._stored = {
+            "poses": se3.to_rows(np.array(self._poses)),
+            "stamps_ns": self._stamps_ns,
+            "bag_ns": self._bag_ns,
+            "frame": self._scans[-1].frame,
+            "n_failed": n_failed,
+            "too_far_m": self._too_far_m,
+        }
+        with suppress(OSError):  # the folder may be read-only
+            np.savez(self._path, bag_files=self._state, **self._stored)
 
     def _add(self, scan: Scan) -> None:
-        """Register the next scan."""
+        """Register the next scan roughly, and the scan before it finely."""
         ranges = np.linalg.norm(scan.points, axis=1)
-        right = 1.0 - self._too_far_m[scan.rings] / ranges
-        self._scans = [*self._scans[-2:], scan._replace(points=scan.points * right[:, None])]
+        factors = 1.0 - self._too_far_m[scan.rings] / ranges
+        self._scans = [*self._scans[-2:], scan._replace(points=scan.points * factors[:, None])]
         self._stamps_ns.append(scan.stamp_ns)
         count = len(self._stamps_ns)
         if count == 1:
@@ -198,79 +272,101 @@ class ScanReading(Reading):
             last = self._poses[-1]
             self._poses.append(last @ se3.inverse(self._poses[-2:][0]) @ last)
             self._has_failed.append(True)
-            self._register(-1, 0)
+            self._register_roughly()
         if count <= 3:  # the first scan needs the motion during it
-            self._start()
+            self._start_maps()
         if count >= 3:
-            self._register(-2, 1)
+            self._register_finely(-2)
 
-    def _start(self) -> None:
+    def _start_maps(self) -> None:
         """Begin the maps with the first scan."""
-        points = self._thinned(self._still(-len(self._scans)), 1)
-        self._maps = [self._gicp.GaussianVoxelMap(x[0] * self._voxel_m) for x in TUNING.steps]
-        for each in self._maps:
-            each.insert(points)
+        points = self._thinned(self._still(-len(self._scans)), _FINE)
+        self._rough_map = self._gicp.GaussianVoxelMap(_ROUGH.map_voxel * self._voxel_m)
+        self._fine_map = self._gicp.GaussianVoxelMap(_FINE.map_voxel * self._voxel_m)
+        self._rough_map.insert(points)
+        self._fine_map.insert(points)
 
-    def _register(self, index: int, step: int) -> None:
-        """Find the pose of the scan at this index from the end: roughly, or finely as a part of the
-        maps.
-        """
+    def _register_roughly(self) -> None:
+        """Estimate the pose of the newest scan; the pose before it if that fails."""
+        points = self._thinned(self._still(-1), _ROUGH)
+        if not self._align(-1, points, self._rough_map, _ROUGH):
+            # The predicted pose would lead on and away from the map.
+            self._poses[-1] = self._poses[-2]
+
+    def _register_finely(self, index: int) -> None:
+        """Estimate the pose of the scan at this index from the end, and add it to the maps."""
         still = self._still(index)
-        _, _, matched, least = TUNING.steps[step]
-        points = self._thinned(still, step)
-        found = self._gicp.align(
-            *(self._maps[step], points, self._poses[index]),
-            max_correspondence_distance=matched * self._voxel_m,
+        points = self._thinned(still, _FINE)
+        self._align(index, points, self._fine_map, _FINE)
+        if self._has_failed[index]:
+            return
+        if len(self._poses) % TUNING.learn_every == 0:
+            self._learn_range_errors(self._scans[index], still, self._poses[index])
+        self._rough_map.insert(points, self._poses[index])
+        self._fine_map.insert(points, self._poses[index])
+
+    def _align(self, index: int, points: Any, voxel_map: Any, step: Step) -> bool:
+        """Register points; replace the pose at the index and return True unless too few match."""
+        result = self._gicp.align(
+            voxel_map,
+            points,
+            self._poses[index],
+            max_correspondence_distance=step.reach * self._voxel_m,
             max_iterations=30,
         )
-        if found.num_inliers >= least * points.size():
-            pose = np.array(found.T_target_source)
-            # Rounding must not grow from scan to scan.
-            pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
-            self._poses[index] = pose
-            self._has_failed[index] = False
-        elif not step:
-            self._poses[index] = self._poses[index - 1]  # rather than on and away from the map
-        if step and not self._has_failed[index]:
-            if len(self._poses) % TUNING.look_every == 0:
-                self._look_at_rings(self._scans[index], still, self._poses[index])
-            for each in self._maps:
-                each.insert(points, self._poses[index])
+        if result.num_inliers < step.min_inlier_fraction * points.size():
+            return False
+        pose = np.array(result.T_target_source)
+        # Rounding must not grow from scan to scan.
+        pose[:3, :3] = se3.nearest_rotation(pose[None, :3, :3])[0]
+        self._poses[index] = pose
+        self._has_failed[index] = False
+        return True
 
     def _still(self, index: int) -> FloatArray:
-        """Points (N, 3) of a scan as if all were taken in its middle, in the motion through its
-        pose and those beside it.
+        """Return the points (N, 3) of a scan as if all were measured in its middle.
+
+        A polynomial through the poses of the newest scans is the motion during the scan.
         """
         scan = self._scans[index]
-        near = slice(-len(self._scans), None)
-        since_s = (np.array(self._stamps_ns[near]) - scan.stamp_ns) * 1e-9
-        motions = se3.log(se3.inverse(self._poses[index]) @ np.array(self._poses[near]))
+        newest = slice(-len(self._scans), None)
+        since_s = (np.array(self._stamps_ns[newest]) - scan.stamp_ns) * 1e-9
+        motions = se3.log(se3.inverse(self._poses[index]) @ np.array(self._poses[newest]))
         polynomial = np.linalg.lstsq(np.vander(since_s), motions, rcond=None)[0]
-        parts_s, part = np.unique(np.round(scan.times_s / TUNING.part_s), return_inverse=True)
-        Ts = se3.exp(np.vander(parts_s * TUNING.part_s, len(since_s)) @ polynomial)[part]
+        part_numbers = np.round(scan.times_s / TUNING.part_s)
+        parts, part_of_point = np.unique(part_numbers, return_inverse=True)
+        powers = np.vander(parts * TUNING.part_s, len(since_s))
+        Ts = se3.exp(powers @ polynomial)[part_of_point]
         return np.asarray(np.einsum("nij,nj->ni", Ts[:, :3, :3], scan.points) + Ts[:, :3, 3])
 
-    def _thinned(self, points: FloatArray, step: int) -> Any:
-        """One of the points (N, 3) in each voxel, with the planes about them."""
-        thinned = self._gicp.voxelgrid_sampling(points, TUNING.steps[step][1] * self._voxel_m)
+    def _thinned(self, points: FloatArray, step: Step) -> Any:
+        """Return one of the points (N, 3) in each voxel, with their local planes."""
+        thinned = self._gicp.voxelgrid_sampling(points, step.scan_voxel * self._voxel_m)
         self._gicp.estimate_covariances(thinned, num_neighbors=TUNING.n_neighbours)
         return thinned
 
-    def _look_at_rings(self, scan: Scan, still: FloatArray, pose: FloatArray) -> None:
-        """Learn what rings measure too far, from their points beside planes of the map."""
-        means = np.array(self._maps[1].voxel_points())[:, :3]
-        covs = np.reshape(self._maps[1].voxel_covs(), (-1, 4, 4))[:, :3, :3]
-        placed = still @ pose[:3, :3].T + pose[:3, 3]
+    def _learn_range_errors(self, scan: Scan, still: FloatArray, pose: FloatArray) -> None:
+        """Estimate the range errors of rings from points near planes of the fine map.
+
+        A range that is too long by e moves the point by e times the cosine between ray and normal
+        away from its plane; e is the least-squares estimate with a prior of 0.
+        """
+        means = np.array(self._fine_map.voxel_points())[:, :3]
+        covariances = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))[:, :3, :3]
+        points = still @ pose[:3, :3].T + pose[:3, 3]
         rays = scan.points @ pose[:3, :3].T
-        nearest = self._gicp.KdTree(means).batch_nearest_neighbor_search(placed)[0]
-        planes, of_point = np.unique(nearest, return_inverse=True)
-        variances, axes = np.linalg.eigh(covs[planes])
+        nearest = self._gicp.KdTree(means).batch_nearest_neighbor_search(points)[0]
+        voxels, voxel_of_point = np.unique(nearest, return_inverse=True)
+        variances, axes = np.linalg.eigh(covariances[voxels])
         is_flat = variances[:, 0] < TUNING.flat * variances[:, 1]
-        normals = axes[of_point, :, 0]
-        offsets = np.einsum("ni,ni->n", normals, placed - means[planes[of_point]])
+        normals = axes[voxel_of_point, :, 0]
+        from_planes = points - means[voxels[voxel_of_point]]
+        distances = np.einsum("ni,ni->n", normals, from_planes)
         cosines = np.einsum("ni,ni->n", normals, rays) / np.linalg.norm(rays, axis=1)
-        cosines *= is_flat[of_point] & (np.abs(offsets) < TUNING.near_m)
-        offsets += cosines * self._too_far_m[scan.rings]
-        counted = (np.bincount(scan.rings, cosines * x, TUNING.n_rings) for x in (offsets, cosines))
-        self._sums = TUNING.kept_share * self._sums + np.array([*counted])
-        self._too_far_m = self._sums[0] / (self._sums[1] + TUNING.right)
+        cosines *= is_flat[voxel_of_point] & (np.abs(distances) < TUNING.near_m)
+        # The points were corrected by the previous estimate.
+        distances += cosines * self._too_far_m[scan.rings]
+        products = np.bincount(scan.rings, cosines * distances, TUNING.n_rings)
+        squares = np.bincount(scan.rings, cosines * cosines, TUNING.n_rings)
+        self._sums = TUNING.kept_share * self._sums + np.array([products, squares])
+        self._too_far_m = self._sums[0] / (self._sums[1] + TUNING.prior_weight)

@@ -1,11 +1,12 @@
-"""Poses of a camera from images of a target: a ChArUco board, or an AprilGrid as of Kalibr."""
+"""Estimate poses of a camera from images of a ChArUco board, or of an AprilGrid of Kalibr."""
 
 import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -23,20 +24,29 @@ from hand_eye_calib.formats.files import read_bytes
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
-# Largest image that is decoded: twice that of the largest camera sensors in industry, 65 million.
+# Most pixels of an image that is decoded. The largest industrial sensors have 65 million.
 _MOST_PIXELS = 130_000_000
-# How OpenCV turns images of ROS into grey ones; its names of Bayer patterns begin with another row.
+# OpenCV's conversion from each encoding of ROS to grey. OpenCV names a Bayer pattern by its second
+# row, ROS by its first.
 _TO_GREY = {
-    **dict.fromkeys(("mono8", "8UC1"), ""),
-    **dict.fromkeys(("bgr8", "8UC3"), "BGR2GRAY"),
-    **{"rgb8": "RGB2GRAY", "bgra8": "BGRA2GRAY", "rgba8": "RGBA2GRAY"},
-    **{"bayer_rggb8": "BayerBG2GRAY", "bayer_bggr8": "BayerRG2GRAY"},
-    **{"bayer_gbrg8": "BayerGR2GRAY", "bayer_grbg8": "BayerGB2GRAY"},
-    **{"yuv422": "YUV2GRAY_UYVY", "yuv422_yuy2": "YUV2GRAY_YUY2"},
+    "mono8": "",
+    "8UC1": "",
+    "bgr8": "BGR2GRAY",
+    "8UC3": "BGR2GRAY",
+    "rgb8": "RGB2GRAY",
+    "bgra8": "BGRA2GRAY",
+    "rgba8": "RGBA2GRAY",
+    "bayer_rggb8": "BayerBG2GRAY",
+    "bayer_bggr8": "BayerRG2GRAY",
+    "bayer_gbrg8": "BayerGR2GRAY",
+    "bayer_grbg8": "BayerGB2GRAY",
+    "yuv422": "YUV2GRAY_UYVY",
+    "yuv422_yuy2": "YUV2GRAY_YUY2",
 }
 
-# An image needs so many corners of the target, and may miss them by so much (pixels, rms).
+# An image with fewer corners of the target is skipped.
 _FEWEST_CORNERS = 8
+# An image with larger residuals (rms, pixels) is skipped.
 _LARGEST_RMS_PX = 5.0
 
 _EXPECTED_TARGET = (
@@ -47,16 +57,33 @@ _EXPECTED_CAMERA = (
     "the intrinsics of a camera: camera_info of ROS, camchain of Kalibr, or camera_matrix and "
     "distortion_coefficients of OpenCV"
 )
-# Whether a model of distortion is that of a fisheye.
-_IS_FISHEYE = dict.fromkeys(("", "none", "plumb_bob", "radtan", "rational_polynomial"), False)
-_IS_FISHEYE |= {"equidistant": True, "fisheye": True}
+# Models of distortion, and whether they are those of a fisheye.
+_IS_FISHEYE = {
+    "": False,
+    "none": False,
+    "plumb_bob": False,
+    "radtan": False,
+    "rational_polynomial": False,
+    "equidistant": True,
+    "fisheye": True,
+}
 
 
 @dataclass(frozen=True)
 class Target:
-    """A flat target of kind "charuco" or "aprilgrid": its columns and rows of squares or tags; the
-    sides (m) of a square and its marker, or of a tag and the gap between two; and OpenCV's name of
-    the markers without ``DICT_``.
+    """A flat target.
+
+    Attributes
+    ----------
+    kind : {"charuco", "aprilgrid"}
+    columns, rows : int
+        Numbers of squares or tags.
+    size : float
+        Side of a square or tag, m.
+    marker : float
+        Side of the marker in a square, or gap between two tags, m.
+    dictionary : str
+        OpenCV's name of the markers without ``DICT_``.
     """
 
     kind: str
@@ -68,25 +95,44 @@ class Target:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``charuco:5x7:0.04:0.03:4X4_50`` or ``aprilgrid:6x6:0.088:0.0264``; a ConfigError
-        if it is no target.
+        """Read ``charuco:5x7:0.04:0.03:4X4_50`` or ``aprilgrid:6x6:0.088:0.0264``.
+
+        Raises
+        ------
+        ConfigError
+            If the text is no target.
         """
         kind, *parts = text.split(":")
-        names = {"charuco": (*parts[3:], "4X4_50"), "aprilgrid": ("APRILTAG_36h11", *parts[3:])}
         try:
             columns, rows = map(int, parts[0].split("x"))
             size, marker = map(float, parts[1:3])
-            is_right = min(columns, rows) > 1 and marker > 0 and 0 < size < 100 and len(parts) <= 4
-            if is_right and (kind == "aprilgrid" or marker < size):
-                return cls(kind, columns, rows, size, marker, names[kind][0])
-        except (IndexError, KeyError, ValueError):
-            pass
-        raise ConfigError(f"expected a target: {_EXPECTED_TARGET}; got {text!r}")
+        except (IndexError, ValueError):
+            raise _no_target(text) from None
+        is_possible = min(columns, rows) > 1 and marker > 0 and 0 < size < 100
+        if kind == "aprilgrid" and is_possible and len(parts) <= 4:
+            return cls(kind, columns, rows, size, marker, "APRILTAG_36h11")
+        if kind == "charuco" and is_possible and len(parts) <= 4 and marker < size:
+            dictionary = parts[3] if len(parts) > 3 else "4X4_50"
+            return cls(kind, columns, rows, size, marker, dictionary)
+        raise _no_target(text)
+
+
+def _no_target(text: str) -> ConfigError:
+    return ConfigError(f"expected a target: {_EXPECTED_TARGET}; got {text!r}")
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics: matrix (3, 3) in pixels, and distortion by OpenCV's models, or of a fisheye."""
+    """Intrinsics of a camera.
+
+    Attributes
+    ----------
+    matrix : (3, 3) array
+        Pixels.
+    distortion : (n,) array
+        Coefficients of OpenCV's models.
+    is_fisheye : bool
+    """
 
     matrix: FloatArray
     distortion: FloatArray
@@ -94,8 +140,12 @@ class Camera:
 
     @classmethod
     def of(cls, where: object, matrix: Any, distortion: Any, model: str = "") -> Self:
-        """From 9 numbers, coefficients and the name of their model; an InputError if they are not
-        those of a camera.
+        """Make a camera from 9 numbers, coefficients and the name of their model.
+
+        Raises
+        ------
+        InputError
+            If they are not those of a camera; ``where`` names their place.
         """
         try:
             numbers = np.array(matrix, dtype=float).reshape(3, 3)
@@ -103,12 +153,12 @@ class Camera:
                 raise ValueError("no focal length")
             return cls(numbers, np.array(distortion, dtype=float).ravel(), _IS_FISHEYE[model])
         except (KeyError, TypeError, ValueError):
-            expected = f"{_EXPECTED_CAMERA}; models are {', '.join(filter(None, _IS_FISHEYE))}"
-            raise InputError(f"{where}: expected {expected}") from None
+            models = ", ".join(model for model in _IS_FISHEYE if model)
+            raise InputError(f"{where}: expected {_EXPECTED_CAMERA}; models are {models}") from None
 
 
 def read_camera(path: str | Path) -> Camera:
-    """Read intrinsics from YAML of ROS, Kalibr or OpenCV; an InputError if there are none."""
+    """Read intrinsics from YAML of ROS, Kalibr or OpenCV; raise InputError if there are none."""
     document: Any = read_yaml(path, _EXPECTED_CAMERA)
     try:
         document = document.get("cam0", document)
@@ -117,31 +167,37 @@ def read_camera(path: str | Path) -> Camera:
             matrix = [fu, 0, pu, 0, fv, pv, 0, 0, 1]
             distortion = document["distortion_coeffs"]
         else:
-            matrix, distortion = (
-                value["data"] if isinstance(value, Mapping) else value
-                for value in (document["camera_matrix"], document["distortion_coefficients"])
-            )
+            matrix = _entries(document["camera_matrix"])
+            distortion = _entries(document["distortion_coefficients"])
     except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(f"{path}: expected {_EXPECTED_CAMERA}") from None
     return Camera.of(path, matrix, distortion, document.get("distortion_model", ""))
 
 
+def _entries(matrix: Any) -> Any:
+    """Return the numbers of a matrix in YAML, which ROS and OpenCV write as a mapping."""
+    return matrix["data"] if isinstance(matrix, Mapping) else matrix
+
+
 def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
-    """Intrinsics of a CameraInfo message of ROS; of rectified images the projection counts."""
-    k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
+    """Return the intrinsics of a CameraInfo message; of its projection for rectified images."""
+    is_ros1 = hasattr(info, "K")
     if is_rectified:
-        return Camera.of(where, np.reshape(p, (3, 4))[:, :3], [])
-    return Camera.of(where, k, d, info.distortion_model)
+        projection = np.reshape(info.P if is_ros1 else info.p, (3, 4))
+        return Camera.of(where, projection[:, :3], [])
+    if is_ros1:
+        return Camera.of(where, info.K, info.D, info.distortion_model)
+    return Camera.of(where, info.k, info.d, info.distortion_model)
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the images of a folder in the order of their names, numbers by their value."""
+    """Return the image files of a folder by name; numbers in names sort by value."""
     images = [path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES]
     return sorted(images, key=lambda path: _by_number(path.name))
 
 
 def _by_number(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts names with numbers by the value of these."""
+    """Return a key that sorts names by the values of their numbers."""
     parts = re.split("([0-9]+)", name)
     return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts]
 
@@ -152,13 +208,13 @@ def read_image(path: Path) -> Any:
     Raises
     ------
     InputError
-        If it is no regular file, no image, or one of too many pixels.
+        If it is no regular file, no image, or has too many pixels.
     """
     return image_in(read_bytes(path), path)
 
 
 def image_in(data: Any, where: object) -> Any:
-    """Return the image in the bytes of an image file, in grey; ``where`` is for messages."""
+    """Decode an image file in grey; ``where`` names the file in errors."""
     cv2 = _opencv()
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -170,27 +226,44 @@ def image_in(data: Any, where: object) -> Any:
 
 
 def grey_of(message: Any) -> Any:
-    """The image of a sensor_msgs/Image or CompressedImage in grey; an InputError if it has none."""
+    """Return the image of a sensor_msgs/Image or CompressedImage in grey.
+
+    Raises
+    ------
+    InputError
+        If the image cannot be decoded.
+    """
     data = np.asarray(message.data, dtype=np.uint8)
     if not hasattr(message, "encoding"):
         return image_in(data, "a compressed image")
-    if message.encoding not in _TO_GREY:
-        known = ", ".join(_TO_GREY)
-        raise InputError(f"images are encoded as {message.encoding[:40]!r}; expected {known}")
+    conversion = _TO_GREY.get(message.encoding)
+    if conversion is None:
+        expected = ", ".join(_TO_GREY)
+        raise InputError(f"images are encoded as {message.encoding[:40]!r}; expected {expected}")
     n_channels = message.step // message.width
-    conversion = _TO_GREY[message.encoding]
     rows = data.reshape(message.height, message.step)[:, : message.width * n_channels]
     image = rows.reshape(message.height, message.width, n_channels)
     if not conversion:
         return image[:, :, 0]
-    return _opencv().cvtColor(image, getattr(_opencv(), f"COLOR_{conversion}"))
+    cv2 = _opencv()
+    return cv2.cvtColor(image, getattr(cv2, f"COLOR_{conversion}"))
 
 
 @dataclass(frozen=True)
 class TargetPoses:
-    """Poses (N, 4, 4) of the target in the camera, of the images in which it is seen; the indices
-    (N,) of these, by how many pixels (rms) their corners are missed, and standard deviations
-    (m, rad) of the poses if the corners err by as much; and the number of all images.
+    """Poses of a target in N of all images.
+
+    Attributes
+    ----------
+    Ts_camera_target : (N, 4, 4) array
+    images : list of int
+        Indices of the N images.
+    rms_px : (N,) array
+        Residuals of the corners (rms, pixels).
+    sigmas : (N, 2) array
+        Standard deviations (m, rad) of each pose if the corners err by these residuals.
+    n_images : int
+        Number of all images.
     """
 
     Ts_camera_target: FloatArray
@@ -208,101 +281,124 @@ class TargetPoses:
         )
 
 
+class _Pose(NamedTuple):
+    """Pose of the target, residual of its corners (rms, pixels), standard deviations (m, rad)."""
+
+    T_camera_target: FloatArray
+    rms_px: float
+    sigmas: FloatArray
+
+
 class TargetFinder:
-    """Finds a target in grey images of a camera, and its poses from its corners; a ConfigError for
-    markers that OpenCV does not have.
+    """Detect a target in grey images of a camera, and estimate its poses from its corners.
+
+    Raises
+    ------
+    ConfigError
+        If OpenCV does not have the markers.
     """
 
     def __init__(self, target: Target, camera: Camera) -> None:
         self._cv2 = _opencv()
         self._target = target
         self._camera = camera
-        aruco = self._cv2.aruco
         self._n_images = 0
-        self._found: list[tuple[FloatArray, int, float, FloatArray]] = []
+        # By the number of the image.
+        self._poses: dict[int, _Pose] = {}
+        aruco = self._cv2.aruco
         markers = getattr(aruco, f"DICT_{target.dictionary}", None)
         if markers is None:
             raise ConfigError(
                 f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
             )
         dictionary = aruco.getPredefinedDictionary(markers)
-        size = (target.columns, target.rows)
-        # The corners (k, 3) of each number that is detected.
+        # The corners (k, 3), m, of each number that is detected: k is 1 of a square, 4 of a tag.
         if target.kind == "charuco":
+            size = (target.columns, target.rows)
             board = aruco.CharucoBoard(size, target.size, target.marker, dictionary)
             self._detect = aruco.CharucoDetector(board).detectBoard
             self._corners = np.asarray(board.getChessboardCorners(), dtype=float)[:, None]
-            return
-        parameters = aruco.DetectorParameters()
-        parameters.markerBorderBits = 2  # Kalibr's tags have a border of two bits
-        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        self._detect = aruco.ArucoDetector(dictionary, parameters).detectMarkers
-        # From the lower left tag on, rows upward. OpenCV has the tags of this family upside down:
-        # their corners come from the lower right one on, clockwise.
-        square = target.size * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
-        y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
-        places = (target.size + target.marker) * np.stack([x, y, 0 * x], axis=-1)
-        self._corners = places[:, None] + square
+        else:
+            parameters = aruco.DetectorParameters()
+            parameters.markerBorderBits = 2  # Kalibr's tags have a border of two bits
+            parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+            self._detect = aruco.ArucoDetector(dictionary, parameters).detectMarkers
+            self._corners = _aprilgrid_corners(target)
 
     def look(self, image: Any) -> bool:
-        """Whether the next image shows the target, well enough."""
+        """Take the next image; return whether it shows the target well enough."""
         number = self._n_images
-        self._n_images = self._n_images + 1
-        pixels, ids, *_ = self._detect(image)
-        known = np.ravel([] if ids is None else ids).astype(int)
-        is_known = known < len(self._corners)
-        corners = self._corners[known[is_known]].reshape(-1, 3)
+        self._n_images += 1
+        pixels, detected, *_ = self._detect(image)
+        ids = np.ravel([] if detected is None else detected).astype(int)
+        is_on_target = ids < len(self._corners)
+        corners = self._corners[ids[is_on_target]].reshape(-1, 3)
         if len(corners) < _FEWEST_CORNERS:
             return False
-        pixels = np.asarray(pixels, dtype=float).reshape(len(known), -1, 2)[is_known]
-        T_camera_target, rms_px, sigmas = self._pose(corners, pixels.reshape(-1, 1, 2))
-        if rms_px <= _LARGEST_RMS_PX:
-            self._found.append((T_camera_target, number, rms_px, sigmas))
-        return rms_px <= _LARGEST_RMS_PX
+        pixels = np.asarray(pixels, dtype=float).reshape(len(ids), -1, 2)[is_on_target]
+        pose = self._pose(corners, pixels.reshape(-1, 1, 2))
+        is_good = pose.rms_px <= _LARGEST_RMS_PX
+        if is_good:
+            self._poses[number] = pose
+        return is_good
 
     def found(self) -> TargetPoses:
-        """All poses; an InputError if no image shows the target."""
-        if not self._found:
+        """Return all poses; raise InputError if no image shows the target."""
+        if not self._poses:
             target = self._target
             raise InputError(
                 f"none of {self._n_images} images shows at least {_FEWEST_CORNERS} corners of the "
                 f"target {target.kind} {target.columns}x{target.rows} of {target.dictionary}"
             )
-        poses, numbers, rms, sigmas = zip(*self._found, strict=True)
-        columns = np.stack(poses), list(numbers), np.array(rms), np.array(sigmas)
-        return TargetPoses(*columns, self._n_images)
+        Ts, rms_px, sigmas = map(np.array, zip(*self._poses.values(), strict=True))
+        return TargetPoses(Ts, [*self._poses], rms_px, sigmas, self._n_images)
 
-    def _pose(
-        self, corners: FloatArray, pixels: FloatArray
-    ) -> tuple[FloatArray, float, FloatArray]:
-        """Pose of the target in the camera, the rms error of its corners in pixels, and standard
-        deviations. Of the two poses that a flat target nearly fits, the better one.
+    def _pose(self, corners: FloatArray, pixels: FloatArray) -> _Pose:
+        """Estimate the pose of the target from its corners (n, 3) at pixels (n, 1, 2).
+
+        Two poses nearly fit a flat target. The one with the smaller residual is returned.
         """
         cv2 = self._cv2
         camera = self._camera
         undistort = cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
         rays = undistort(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
-        ideal = (np.eye(3), None)
         focal = camera.matrix[[0, 1], [0, 1]]
-        _, turns, shifts, _ = cv2.solvePnPGeneric(corners, rays, *ideal, flags=cv2.SOLVEPNP_IPPE)
-        found = []
-        for start in zip(turns, shifts, strict=True):
-            turn, shift = cv2.solvePnPRefineLM(corners, rays, *ideal, *start)
-            seen, jacobian = cv2.projectPoints(corners, turn, shift, *ideal)
-            off = (seen.reshape(-1, 2) - rays) * focal
-            rms_px = float(np.sqrt((off**2).sum(axis=1).mean()))
-            found.append((rms_px, turn, shift, jacobian[:, :6]))
-        rms_px, turn, shift, jacobian = min(found, key=lambda each: each[0])
-        of_pixels = jacobian * np.tile(focal, len(corners))[:, None]
-        # Two coordinates of a corner share its error; first come rotations, then translations.
-        variances = rms_px**2 / 2 * np.diag(np.linalg.pinv(of_pixels.T @ of_pixels))
-        sigmas = np.sqrt(variances.reshape(2, 3).mean(axis=1))[::-1]
-        T = se3.from_rotation_translation(cv2.Rodrigues(turn)[0], shift.ravel())
-        return T, rms_px, sigmas
+        # Rays are pixels of a camera without distortion, with this matrix.
+        ideal = (np.eye(3), None)
+        _, rotations, translations, _ = cv2.solvePnPGeneric(
+            corners, rays, *ideal, flags=cv2.SOLVEPNP_IPPE
+        )
+        candidates = []
+        for start in zip(rotations, translations, strict=True):
+            vector, shift = cv2.solvePnPRefineLM(corners, rays, *ideal, *start)
+            projected, derivatives = cv2.projectPoints(corners, vector, shift, *ideal)
+            residuals = (projected.reshape(-1, 2) - rays) * focal
+            rms_px = float(np.sqrt((residuals**2).sum(axis=1).mean()))
+            candidates.append((rms_px, vector, shift, derivatives[:, :6]))
+        rms_px, vector, shift, derivatives = min(candidates, key=itemgetter(0))
+        T = se3.from_rotation_translation(cv2.Rodrigues(vector)[0], shift.ravel())
+        jacobian = derivatives * np.tile(focal, len(corners))[:, None]
+        # The two coordinates of a corner share its variance.
+        variances = rms_px**2 / 2 * np.diag(np.linalg.pinv(jacobian.T @ jacobian))
+        # OpenCV's parameters are rotations, then translations.
+        turn_rad, shift_m = np.sqrt(variances.reshape(2, 3).mean(axis=1))
+        return _Pose(T, rms_px, np.array([shift_m, turn_rad]))
+
+
+def _aprilgrid_corners(target: Target) -> FloatArray:
+    """Return the corners (tags, 4, 3) of an AprilGrid in OpenCV's order, m.
+
+    The tags begin at the lower left, row by row upward. OpenCV has the tags of this family upside
+    down: their corners begin at the lower right, clockwise.
+    """
+    square = target.size * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
+    y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    places = (target.size + target.marker) * np.stack([x, y, 0 * x], axis=-1)
+    return np.asarray(places[:, None] + square)
 
 
 def _opencv() -> Any:
-    # A file of 1 MB may unpack to more memory than there is. OpenCV reads this when it is imported.
+    # A file of 1 MB may unpack to more than the memory. OpenCV reads this limit at its import.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MOST_PIXELS))
     cv2 = required("cv2", "finding a target in images", "camera")
     if not hasattr(cv2.aruco, "CharucoDetector"):
