@@ -27,9 +27,12 @@ from hand_eye_calib.online.live.solving import NO_MOTION, Answer, Failure, Job, 
 from hand_eye_calib.online.live.state import (
     ANSWER_WITHIN_S,
     Broadcast,
+    BroadcastState,
+    Condition,
     ExtrinsicState,
     InputState,
     Level,
+    Outcome,
     ProgressState,
     ResultState,
     Standing,
@@ -94,7 +97,7 @@ class SolveCycle:
         self._rest_until_s = 0.0
         # Callbacks that wait for a solve, with the time of the request (steady time, s).
         self._asked: dict[OnSolved, float] = {}
-        # Callbacks that the job under way answers.
+        # Callbacks that the current job answers.
         self._in_flight: tuple[OnSolved, ...] = ()
         self._process = SolvingProcess(wake)
         self.restart()
@@ -102,7 +105,7 @@ class SolveCycle:
     def restart(self) -> None:
         """Begin a new session without a result."""
         self.result: Calibration | None = None
-        # Copy of the calibrator that gave the result, and options that its checks set.
+        # Copy of the calibrator that was solved for the result, and options that checks had set.
         self._solved: tuple[Calibrator, Options] | None = None
         self._solved_at_s = 0.0
         # Motion of the session so far.
@@ -114,10 +117,11 @@ class SolveCycle:
         # Sentences of the reasons that were logged as warnings, by their rules.
         self._warned: dict[str, str] = {}
         # Options that checks of this session set, and the warnings about them.
-        self._certain: Options = {}
+        self._check_options: Options = {}
         self._option_warnings: tuple[str, ...] = ()
-        # Whether poses came in since the last check, and when the next is due (steady time, s).
+        # Whether there are poses that no check has used.
         self._is_unchecked = False
+        # Earliest time of the next check (steady time, s).
         self._check_due_s = 0.0
         self.checks.restart()
         self.goal.restart()
@@ -128,17 +132,16 @@ class SolveCycle:
         If only targets have changed, the result stays and gets a new verdict at once, because the
         robot may be parked by now.
         """
-        self._certain = {}
+        self._check_options = {}
         self._option_warnings = ()
         self._is_unchecked = True
         self._check_due_s = 0.0
         self.checks.follow(config)
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
-        has_only_targets = replace(before, **targets) == config and before.given.difference(
-            _TARGETS
-        ) == config.given.difference(_TARGETS)
-        if result is None or not has_only_targets:
+        has_same_values = replace(before, **targets) == config
+        has_same_names = before.given.difference(_TARGETS) == config.given.difference(_TARGETS)
+        if result is None or not (has_same_values and has_same_names):
             self.goal.follow(config.targets)
             return
         targets["target_axes"] = parse_targets("target.axes", config.target_axes)
@@ -187,11 +190,11 @@ class SolveCycle:
         return replace(self.result, warnings=(*self.result.warnings, self.problem))
 
     def snapshot(self) -> Snapshot | None:
-        """Return the poses and options that gave the result; None without a result."""
+        """Return the poses and options of the result; None without a result."""
         if self._solved is None:
             return None
-        calibrator, certain = self._solved
-        return with_options(calibrator.snapshot(), certain)
+        calibrator, options = self._solved
+        return with_options(calibrator.snapshot(), options)
 
     # ------------------------------------------------------------------ solving
 
@@ -203,16 +206,16 @@ class SolveCycle:
 
     def answer_overdue(self) -> None:
         """Answer callers that have waited too long; the solve continues. To be called often."""
-        long_ago_s = time.monotonic() - ANSWER_WITHIN_S
-        for on_solved, since_s in list(self._asked.items()):
-            if since_s >= long_ago_s:
+        now_s = time.monotonic()
+        for on_solved, asked_s in list(self._asked.items()):
+            if asked_s >= now_s - ANSWER_WITHIN_S:
                 continue
             del self._asked[on_solved]
             text = f"still solving after {ANSWER_WITHIN_S:g} s (do others use the processor?)"
             on_solved(False, f"{text}: the result will be in the log and on the topics")
 
     def start_if_due(self) -> None:
-        """Start a solve or a check if there are new poses and the pause after the last is over."""
+        """Start a solve or a check if there are new poses, and the last solve is long enough ago."""
         now_s = time.monotonic()
         must_check = self._is_unchecked and now_s >= self._check_due_s
         has_work = self._session.has_new_poses or must_check
@@ -250,22 +253,22 @@ class SolveCycle:
             self._is_unchecked = False
             self._check_due_s = now_s + _CHECK_PERIOD_S
         self._submitted = self._session.copy_to_solve()
-        self._process.submit(Job(self._session.number, self._submitted, check, self._certain))
+        self._process.submit(Job(self._session.number, self._submitted, check, self._check_options))
 
     # ------------------------------------------------------------------ answers
 
-    def conclude(self, answer: Answer) -> tuple[bool, str]:
+    def conclude(self, answer: Answer) -> Outcome:
         """Process an answer; return whether it is good, and a line of text about it."""
         if answer.session != self._session.number:
             return False, "the session was reset during the solve: its result is dropped"
-        # Pause as long as the solve took, so that half of the processor time stays free.
+        # Pause for the duration of the solve, so that half of the processor time stays free.
         self._rest_until_s = time.monotonic() + answer.seconds
         # Keep the largest rotation so far: the measured rotation can decrease with more poses.
         rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
         self._motion = replace(answer.motion, rotation=rotation)
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
-            self._certain = {**self._certain, **answer.options}
+            self._check_options = {**self._check_options, **answer.options}
             self._option_warnings = answer.messages
         if answer.check is not None:
             self.checks.take(answer.check)
@@ -300,13 +303,13 @@ class SolveCycle:
         if self._failing_since_s is None:
             self._failing_since_s = time.monotonic()
 
-    def _refute(self, newest: Calibration) -> tuple[bool, str]:
+    def _refute(self, newest: Calibration) -> Outcome:
         """Replace the result by a calibration whose prior the motion contradicts.
 
         The earlier result is neither published nor saved any more.
         """
         self.goal.add(newest, self._motion, self.checks.faults())
-        self._solved = self._submitted, self._certain
+        self._solved = self._submitted, self._check_options
         self._set_result(newest)
         return False, self._describe(newest)
 
@@ -316,18 +319,18 @@ class SolveCycle:
         self._solved_at_s = time.monotonic()
         self._failing_since_s = None
 
-    def _take(self, newest: Calibration) -> tuple[bool, str]:
+    def _take(self, newest: Calibration) -> Outcome:
         """Make a usable calibration the session's result, unless the goal keeps a better result."""
         was_done = self.goal.progress.done
         progress = self.goal.add(newest, self._motion, self.checks.faults())
         result = self.goal.best or newest
         if result is newest:
-            self._solved = self._submitted, self._certain
+            self._solved = self._submitted, self._check_options
         else:
-            kept = f"kept is the result of {result.n_poses} poses, as the newest is worse"
-            kept = f"{kept}: {describe(newest)}"
-            self._log.info(kept, ONCE_S, key="kept")
-            result = replace(result, warnings=(*result.warnings, kept))
+            reason = f"kept is the result of {result.n_poses} poses, as the newest is worse"
+            warning = f"{reason}: {describe(newest)}"
+            self._log.info(warning, ONCE_S, key="kept")
+            result = replace(result, warnings=(*result.warnings, warning))
             result = _with_newest_halves(result, newest)
         result = self._with_findings(result)
         self._set_result(result)
@@ -387,9 +390,7 @@ class SolveCycle:
 
     # -------------------------------------------------------------------- state
 
-    def extrinsic_state(
-        self, accepts_poses: bool, tf_static: tuple[Broadcast, str]
-    ) -> ExtrinsicState:
+    def extrinsic_state(self, accepts_poses: bool, tf_static: BroadcastState) -> ExtrinsicState:
         """Return the diagnostics of the result.
 
         Parameters
@@ -421,9 +422,7 @@ class SolveCycle:
             result=result,
         )
 
-    def _condition(
-        self, accepts_poses: bool, tf_static: tuple[Broadcast, str]
-    ) -> tuple[Level, str]:
+    def _condition(self, accepts_poses: bool, tf_static: BroadcastState) -> Condition:
         """Return level and text of the gravest condition that applies."""
         result = self.result
         failure = self._failure
@@ -451,7 +450,7 @@ class SolveCycle:
         return "; ".join(texts) or "no result yet"
 
     def progress_state(
-        self, why_not_compared: str, pause: tuple[Level, str] = (Level.OK, "")
+        self, why_not_compared: str, pause: Condition = (Level.OK, "")
     ) -> ProgressState:
         """Return the diagnostics of the progress towards the targets.
 
@@ -470,18 +469,17 @@ class SolveCycle:
         is_well = self.standing is Standing.CURRENT and not needs_change
         level = Level.OK if is_well else Level.WARN
         pause_level, why_paused = pause
-        is_paused = bool(why_paused) and not progress.done
-        if is_paused:
+        if progress.done:
+            why_paused = ""
+        if why_paused:
             level = max(level, pause_level)
         text = progress.sentence
-        if self.problem and not progress.is_faulty:
-            text = self.problem
-        elif is_paused and not progress.is_faulty:
-            text = why_paused
+        if not progress.is_faulty:
+            text = self.problem or why_paused or text
         return ProgressState(
             level=level,
             text=text,
-            is_paused=is_paused,
+            is_paused=bool(why_paused),
             progress=progress,
             comparison=self._comparison(why_not_compared),
         )
@@ -493,7 +491,7 @@ class SolveCycle:
         return Comparison(sentence=f"not compared yet: {why_not}") if why_not else None
 
 
-def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> tuple[Level, str]:
+def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
     """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
     if not accepts_poses:
         return Level.WARN, "Paused: not accepting poses; call ~/set_enabled to go on."

@@ -215,7 +215,9 @@ class Goal:
         # Motion improves neither an axis with a prior nor one out of reach of the streams.
         exempt = np.isin(AXES, newest.out_of_reach)
         exempt |= [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
-        return np.asarray(np.where(exempt, 0.0, calibration.sigmas_measured**2 / room))
+        ratios: FloatArray = calibration.sigmas_measured**2 / room
+        ratios[exempt] = 0.0
+        return ratios
 
     def _in_steps(self, left_s: FloatArray) -> FloatArray:
         """Round times left (6,) to steps that decrease one by one, because estimates jump."""
@@ -226,7 +228,7 @@ class Goal:
         # To and from infinity and zero, a time may jump.
         is_new = (before == far) | (before == 0) | (steps == far) | (steps == 0)
         self._steps = np.where(is_new, steps, np.clip(steps, before - 1, before))
-        return np.asarray(_STEPS_S[self._steps])
+        return _STEPS_S[self._steps]
 
     def _nothing_yet(self, sentence: str) -> Progress:
         """Progress without a result."""

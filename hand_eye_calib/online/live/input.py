@@ -21,7 +21,7 @@ from hand_eye_calib.core.geometry.frames import check_not_null
 from hand_eye_calib.formats.transforms import PoseFields
 from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.live.state import REPORT_PERIOD_S, InputState, Level
+from hand_eye_calib.online.live.state import REPORT_PERIOD_S, Condition, InputState, Level
 
 # Share of lost messages from which on a person should act.
 _MUCH_LOST = 0.01
@@ -444,7 +444,7 @@ class PoseInput:
 
     def _condition(
         self, steady_s: float, rate_hz: float, lost_share: float, may_rest: bool
-    ) -> tuple[Level, str]:
+    ) -> Condition:
         """Return level and text of the gravest condition of the input."""
         if self._arrived_s is None:
             text = f"no message on {self.topic} yet"

@@ -14,7 +14,7 @@ from hand_eye_calib.online.live.cycle import SolveCycle
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.session import LiveSession, output_path
 from hand_eye_calib.online.live.solving import start
-from hand_eye_calib.online.live.state import SavedState, Standing
+from hand_eye_calib.online.live.state import Outcome, SavedState, Standing
 
 _PAGES = "from hand_eye_calib.online.live.pages import write_session; write_session()"
 
@@ -40,7 +40,7 @@ class Saver:
         self._earlier_kept_in = ""
         self._process: subprocess.Popen[bytes] | None = None
 
-    def save(self, options: NodeConfig) -> tuple[bool, str]:
+    def save(self, options: NodeConfig) -> Outcome:
         """Write the result files; return whether that worked, and a line of text, also logged."""
         try:
             text = self._save(options)

@@ -52,6 +52,16 @@ class Broadcast(Enum):
     REFUSED = "refused"
 
 
+# Level of a condition and its text.
+Condition: TypeAlias = tuple[Level, str]
+
+# Whether the result is broadcast, and the reason if it is not.
+BroadcastState: TypeAlias = tuple[Broadcast, str]
+
+# Success of a request and a line of text about it.
+Outcome: TypeAlias = tuple[bool, str]
+
+
 class Standing(Enum):
     """Validity of the session's result.
 

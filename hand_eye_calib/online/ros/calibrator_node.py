@@ -20,7 +20,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from hand_eye_calib.core.base.config import NodeConfig, other_names
+from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig, other_names
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import MOUNT_MONITORS
 from hand_eye_calib.core.base.text import listing
@@ -31,7 +31,7 @@ from hand_eye_calib.online.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.online.live.saving import Saver
 from hand_eye_calib.online.live.session import LiveSession, output_path
-from hand_eye_calib.online.live.state import REPORT_PERIOD_S, NodeState
+from hand_eye_calib.online.live.state import REPORT_PERIOD_S, NodeState, Outcome
 from hand_eye_calib.online.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC, ResultTopics, StateTopics
 from hand_eye_calib.online.ros.parameters import Parameters
@@ -72,7 +72,6 @@ class CalibratorNode(Node):
             self._log.warning(line)
         options = self._options.node
         config = self._options.calibrator
-        self._config = config
         # From now on, participants may only choose a directory below this directory.
         self._output_base = output_path(options.output_directory or ".").resolve()
         if options.monitor:
@@ -310,16 +309,16 @@ class CalibratorNode(Node):
         response.success, response.message = await solved
         return response
 
-    def _answer(self, act: Callable[[Any], tuple[bool, str]], request: Any, response: Any) -> Any:
+    def _answer(self, act: Callable[[Any], Outcome], request: Any, response: Any) -> Any:
         """Act on a request, and answer it with success and a line of text."""
         response.success, response.message = act(request)
         self._publish()
         return response
 
-    def _save(self, request: Trigger.Request) -> tuple[bool, str]:
+    def _save(self, request: Trigger.Request) -> Outcome:
         return self._saver.save(self._options.node)
 
-    def _reset(self, request: Trigger.Request) -> tuple[bool, str]:
+    def _reset(self, request: Trigger.Request) -> Outcome:
         self._begin_session()
         text = "all poses forgotten, new session"
         priors = priors_of(self._options.calibrator)
@@ -329,7 +328,7 @@ class CalibratorNode(Node):
         self._log.info(text)
         return True, text
 
-    def _set_enabled(self, request: SetBool.Request) -> tuple[bool, str]:
+    def _set_enabled(self, request: SetBool.Request) -> Outcome:
         for source in self._inputs:
             source.is_enabled = request.data
         text = "accepting poses" if request.data else "not accepting poses"
@@ -349,13 +348,11 @@ class CalibratorNode(Node):
         if self._output_base is not None and options.output_directory:
             output_path(options.output_directory, self._output_base)
 
-    def _follow_parameters(self) -> None:
-        """Apply changed parameters."""
+    def _follow_parameters(self, before: CalibratorConfig) -> None:
+        """Apply changed parameters; ``before`` has the options of the engine before the change."""
         options = self._options.node
         config = self._options.calibrator
-        before = self._config
         if (config, config.given) != (before, before.given):
-            self._config = config
             self._session.reconfigure(config)
             self._cycle.follow(config, before)
         for source in self._inputs:

@@ -28,8 +28,8 @@ class Parameters:
     ----------
     node : rclpy.node.Node
     on_change : callable
-        Called without arguments after parameters have changed; ``calibrator`` and ``node`` are the
-        new options by then.
+        Called with the CalibratorConfig of before after parameters have changed; ``calibrator`` and
+        ``node`` are the new options by then.
     check : callable
         ``check(NodeConfig)`` raises ConfigError for options that cannot be applied.
 
@@ -51,7 +51,7 @@ class Parameters:
     def __init__(
         self,
         node: Node,
-        on_change: Callable[[], None],
+        on_change: Callable[[CalibratorConfig], None],
         check: Callable[[NodeConfig], None],
     ) -> None:
         declared: dict[str, Any] = node.get_parameters_by_prefix("")
@@ -97,9 +97,10 @@ class Parameters:
 
     def _apply(self, parameters: list[Parameter]) -> None:
         if any(parameter.name in FIELDS for parameter in parameters):
+            before = self.calibrator
             self.given = self._proposed(parameters)
             self.calibrator, self.node = _configs(self.given)
-            self._on_change()
+            self._on_change(before)
 
 
 def _checked(values: Options) -> Options:

@@ -26,7 +26,7 @@ from hand_eye_calib.core.results.records import AXES, ROTATIONS
 from hand_eye_calib.formats.bags.messages import transform_of
 from hand_eye_calib.formats.installed import open_installed, stated
 from hand_eye_calib.online.live.log import NodeLog
-from hand_eye_calib.online.live.state import Broadcast
+from hand_eye_calib.online.live.state import Broadcast, BroadcastState
 from hand_eye_calib.online.ros.conversions import LATCHED, LISTENING, quick, to_transform
 
 # Value of the option ``installed`` for the transform on /tf_static.
@@ -188,9 +188,11 @@ class Robot:
 def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
     """Return a result with the installed value on its only unobservable axis of translation."""
     hidden = calibration.unobservable()
-    if len(hidden) != 1 or hidden[0] in (*ROTATIONS, *calibration.out_of_reach):
+    if len(hidden) != 1:
         return calibration
-    (axis,) = hidden
+    axis = hidden[0]
+    if axis in ROTATIONS or axis in calibration.out_of_reach:
+        return calibration
     index = AXES.index(axis)
     T = calibration.T_parent_child.copy()
     covariance = turned(T[:3, :3], calibration.covariance_measured)
@@ -211,7 +213,7 @@ class TfBroadcaster:
     """
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
-        self.state: tuple[Broadcast, str] = Broadcast.OFF, ""
+        self.state: BroadcastState = Broadcast.OFF, ""
         self._node = node
         self._log = log
         self._tree = tree
@@ -256,7 +258,7 @@ class TfBroadcaster:
                 "they are restarted"
             )
 
-    def _decide(self, result: Calibration | None, why_not: str) -> tuple[Broadcast, str]:
+    def _decide(self, result: Calibration | None, why_not: str) -> BroadcastState:
         if not self._is_on:
             return Broadcast.OFF, ""
         if result is None or why_not:

@@ -519,9 +519,8 @@ def state_of(text: str) -> NodeState | None:
     """
     try:
         state = from_plain(NodeState, _printable(json.loads(text)))
-        trial = Board()
-        trial.take(state, 0.0)
-        trial.view(0.0)
+        # A trial that raises an error for values that cannot be displayed.
+        _view(state, 0.0)
     except (TypeError, ValueError, KeyError, RecursionError, OverflowError, OSError):
         return None
     return state
