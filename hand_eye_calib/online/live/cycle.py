@@ -215,7 +215,7 @@ class SolveCycle:
             on_solved(False, f"{text}: the result will be in the log and on the topics")
 
     def start_if_due(self) -> None:
-        """Start a solve or a check if there are new poses, and the last solve is long enough ago."""
+        """Start a solve or a check if there are new poses and the pause after a solve is over."""
         now_s = time.monotonic()
         must_check = self._is_unchecked and now_s >= self._check_due_s
         has_work = self._session.has_new_poses or must_check
