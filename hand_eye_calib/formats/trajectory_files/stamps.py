@@ -52,7 +52,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
             f"{table.path}: the poses have no stamps; name their column t, give `times`, or pair "
             "poses by row with `pair_by`"
         )
-    unit = stamp_unit or table.units["t"]
+    unit = stamp_unit or table.stamp_unit
     stamps = table.stamps
     if not unit and min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:
         stamps = _unpacked(stamps)

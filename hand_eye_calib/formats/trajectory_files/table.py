@@ -1,11 +1,13 @@
-"""The numbers of a trajectory, row by row, before they become poses: what the columns are by their
-names, and what stands in them; and rows as they are written.
+"""Table of the numbers of a trajectory, before they become poses.
+
+A table has the quantities of its columns, by their names, and their values row by row. It is filled
+from the lines of a file or from numbers in memory. Rows of the format tum are also written here.
 """
 
 import math
 import re
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -35,29 +37,65 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import seconds, stamp_of
 
-# Quantities that are all 0 where there is no orientation, as of tracking that was lost.
+# Quantities that are all 0 where there is no orientation, such as while tracking is lost.
 _TURNS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 
-# More names than this in a column are those of something else, such as images.
+# Most sensors that a column names. A column with more names is about something else, such as
+# images.
 _MOST_SENSORS = 20
 
 
 @dataclass
 class Table:
-    """The rows of a file: their line numbers, stamps (none without a column of them), and values,
-    one row after the other; the names of their images, if there is a column of them. Rows without
-    a pose, with values that are absent or not finite, are left out: ``rows`` are the numbers of
-    the others, from 0, ``n_rows`` counts all, ``first_left_out`` is the line of the first.
+    """Rows of a trajectory's numbers. Rows without a pose are skipped.
 
-    ``path`` is what messages call it, ``names`` are those of all columns. ``measures`` says what
-    to read, one of registry.MEASURES, "twists" for velocities, or "auto", which becomes what the
-    columns are; ``expected`` is what a row should be, for messages. Found are the column of each
-    quantity (``at``), such as "x" or "qw", those of the stamp (``stamp_at``) by what they are
-    (``stamp_names``), and the ``units`` of quantities and of "t" in the names.
-    ``guesses`` are what a person should know of how the file was read, ``conventions`` those of
-    its angles that the motion does not contradict, the usual first; ``is_transposable`` if rows
-    and columns of its rotations could be exchanged. An InputError if a column is missing, or
-    several have the same meaning.
+    A row has no pose if a value is missing or not finite, or if its orientation is all 0.
+
+    Attributes
+    ----------
+    path : object
+        Name of the table in messages.
+    names : sequence of str
+        Names of all columns.
+    measures : str
+        Kind of data to read: one of config.MEASURES, "twists" for velocities, or "auto", which
+        becomes the kind that the columns have.
+    expected : str
+        Description of a row for messages.
+    format : str
+    is_transposable : bool
+        Whether rows and columns of the rotations could be exchanged.
+    line_numbers, rows : array
+        Line number of each row with a pose, and its number among all rows, from 0.
+    n_rows : int
+        Number of all rows.
+    first_left_out : int or None
+        Line of the first row that was skipped.
+    stamps : list of Decimal
+        Empty without a column of stamps.
+    numbers : array of float
+        Values of the quantities, row after row.
+    images : list of str
+        Names of images, if there is a column of them.
+    guesses : list of str
+        Notes for the user on what the file does not state.
+    conventions : list of str
+        Conventions of angles that the motion does not contradict, the usual one first.
+    at : dict of str to int
+        Column of each quantity, such as "x" or "qw".
+    units : dict of str to str
+        Units of quantities in the columns' names.
+    stamp_names, stamp_at : sequence
+        Quantities that make the stamp, and their columns.
+    stamp_unit : str
+        Unit of the stamps; empty if it is to be recognised from their size.
+    second_unit : str
+        Unit of the second of a week of GPS; empty if no name states it.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, or several columns are the same quantity.
     """
 
     path: object
@@ -78,11 +116,27 @@ class Table:
 
     def __post_init__(self) -> None:
         columns, units = named_columns(self.names)
-        self.expected = self.expected or f"{len(self.names)} columns: {self._listed()}"
+        self.expected = self.expected or f"{len(self.names)} columns: {self._listed(self.names)}"
         self.measures, quantities = measured(columns, self.names, self.measures)
         self.stamp_names = stamp_columns(columns)
+        self._refuse_unclear_columns(columns, quantities)
+        self.at = {name: columns[name][0] for name in quantities}
+        self.units = {name: units[column] for name, column in self.at.items() if units[column]}
+        self.stamp_at = [columns[name][0] for name in self.stamp_names]
+        self._set_stamp_units(units)
+        self._value_at = [*self.at.values()]
+        self._image_at = columns.get("image", [])[:1]
+        self._sensor_at = columns.get("sensor", [])[:1]
+        self._sensors: set[str] = set()
+        turn = next((group for group in _TURNS if {*group} <= {*quantities}), ())
+        self._turn_at = [quantities.index(name) for name in turn]
+
+    def _refuse_unclear_columns(
+        self, columns: Mapping[str, list[int]], quantities: Sequence[str]
+    ) -> None:
+        """Raise an InputError if a quantity has no column or several."""
         if missing := [name for name in quantities if name not in columns]:
-            listed = self._listed()
+            listed = self._listed(self.names)
             has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
             no_pose = " (accelerations show no pose)" if has_accelerations else ""
             raise InputError(
@@ -93,79 +147,100 @@ class Table:
             )
         for name in (*self.stamp_names, *quantities):
             if len(columns[name]) > 1:
+                listed = self._listed([self.names[column] for column in columns[name]])
                 raise InputError(
-                    f"{self.path}: columns {self._listed(columns[name])} could all be {name}; name "
-                    "them with `columns`"
+                    f"{self.path}: columns {listed} could all be {name}; name them with `columns`"
                 )
-        self.at = {name: columns[name][0] for name in quantities}
-        self.stamp_at = [columns[name][0] for name in self.stamp_names]
-        self._value_at = [*self.at.values()]
-        self._image_at = columns.get("image", ())
-        self.units = {name: units[at] for name, at in self.at.items() if units[at]}
-        self.units["t"] = ""
-        if self.stamp_names == ("secs", "nsecs"):
-            self.units["t"] = "ns"
-        elif len(self.stamp_at) == 1:
-            self.units["t"] = units[self.stamp_at[0]]
-        elif self.stamp_at:
-            self.units["t"] = "s"
+
+    def _set_stamp_units(self, units: Sequence[str]) -> None:
+        """Set the unit of the stamps and of the second of a week, from the units of all columns."""
         unit = units[self.stamp_at[-1]] if self.stamp_at else ""
         self.second_unit = unit if unit in STAMP_UNITS else ""
         if "mow" in self.stamp_names:
             self.second_unit = self.second_unit or "ms"
-        if self.stamp_names == ("mow",):
-            self.units["t"] = self.second_unit
-        self._sensor_at = columns.get("sensor", [])[:1]
-        self._sensors: set[str] = set()
-        turn = next((group for group in _TURNS if {*group} <= {*quantities}), ())
-        self._turn_at = [list(quantities).index(name) for name in turn]
+        if len(self.stamp_names) < 2:
+            self.stamp_unit = self.second_unit
+        elif self.stamp_names == ("secs", "nsecs"):
+            self.stamp_unit = "ns"
+        else:
+            self.stamp_unit = "s"
 
     @property
     def n_left_out(self) -> int:
-        """How many rows have no pose."""
+        """Number of rows without a pose."""
         return self.n_rows - len(self.rows)
 
-    def _listed(self, places: Iterable[int] | None = None) -> str:
-        """The names of some columns, or of all, for a message."""
-        names = self.names if places is None else [self.names[k] for k in places]
+    def _listed(self, names: Iterable[str]) -> str:
+        """Return names of columns for a message."""
         return shortened(", ".join(names), LONGEST_NAME)
 
     def values(self, names: Iterable[str] = ()) -> FloatArray:
-        """(N, k) array: the values of some quantities, or of all."""
-        places = [*self.at]
-        all_values = np.asarray(self.numbers).reshape(-1, len(self.at))
-        return all_values[:, [places.index(name) for name in names]] if names else all_values
+        """Return an array (N, k) of the values of k quantities, or of all quantities."""
+        quantities = [*self.at]
+        all_values = np.asarray(self.numbers).reshape(-1, len(quantities))
+        return all_values[:, [quantities.index(name) for name in names]] if names else all_values
 
     def fill(
         self, lines: Iterable[tuple[int, Any]], cells_of: Callable[[Any], Sequence[str]]
     ) -> Self:
-        """Add rows from their line numbers and texts; an InputError at the first line with another
-        number of cells, or with something that is no number.
+        """Add rows, and return the table.
+
+        Parameters
+        ----------
+        lines : iterable of (int, object)
+            Line number and content of each row.
+        cells_of : callable
+            Splits the content of a row into cells.
+
+        Raises
+        ------
+        InputError
+            At the first line with another number of cells or with text in place of a number, and
+            if the poses are of several sensors.
         """
         n_columns = len(self.names)
-        for line_number, text in lines:
-            cells = cells_of(text)
+        for line_number, content in lines:
+            cells = cells_of(content)
             if len(cells) != n_columns:
-                cells = self._as_many_as_columns(cells, line_number, text)
+                cells = self._as_many_as_columns(cells, line_number, content)
             try:
                 self._add(cells, line_number)
             except ValueError as error:
                 reason = f"expected {self.expected}; {shortened(str(error))}"
                 raise InputError(f"{self.path}, line {line_number}: {reason}") from None
-        self._refuse_several_sensors()
-        return self
-
-    def _refuse_several_sensors(self) -> None:
-        """Raise an InputError if a column names few sensors, but more than one."""
         if 1 < len(self._sensors) <= _MOST_SENSORS:
             column = self.names[self._sensor_at[0]]
-            listed = shortened(", ".join(sorted(self._sensors)), LONGEST_NAME)
             raise InputError(
-                f"{self.path}: poses of several sensors, {column} {listed}; write a file for each"
+                f"{self.path}: poses of several sensors, {column} "
+                f"{self._listed(sorted(self._sensors))}; write a file for each"
             )
+        return self
+
+    def fill_from_arrays(self, values: FloatArray, stamps: Sequence[Decimal | None] | None) -> None:
+        """Add the rows of values (N, k) that have a pose, and a stamp if there are stamps."""
+        is_pose = np.isfinite(values).all(axis=1)
+        if self._turn_at:
+            is_pose &= values[:, self._turn_at].any(axis=1)
+        if stamps is not None:
+            is_pose &= [stamp is not None for stamp in stamps]
+            both = zip(stamps, is_pose, strict=True)
+            self.stamps = [stamp for stamp, is_used in both if stamp is not None and is_used]
+        rows = np.flatnonzero(is_pose).tolist()
+        self.numbers.frombytes(np.ascontiguousarray(values[is_pose]).tobytes())
+        self.line_numbers.extend(row + 1 for row in rows)
+        self.rows.extend(rows)
+        self.n_rows = len(values)
+        if self.n_left_out:
+            self.first_left_out = int(np.argmin(is_pose)) + 1
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
-        """Add a row, or count it if it has no pose; a ValueError for what is no number."""
+        """Add a row, or count it if it has no pose.
+
+        Raises
+        ------
+        ValueError
+            If a cell has text in place of a number.
+        """
         row = self.n_rows
         self.n_rows += 1
         values = self._numbers_in(cells)
@@ -174,67 +249,73 @@ class Table:
                 self.first_left_out = line_number
             return
         self.numbers.extend(values)
-        if self._image_at:
-            self.images.append(cells[self._image_at[0]])
-        if self._sensor_at and len(self._sensors) <= _MOST_SENSORS:
-            self._sensors.add(cells[self._sensor_at[0]])
+        self.images += [cells[column] for column in self._image_at]
+        if len(self._sensors) <= _MOST_SENSORS:
+            self._sensors.update(cells[column] for column in self._sensor_at)
         self.line_numbers.append(line_number)
         self.rows.append(row)
 
     def _add_stamp(self, cells: Sequence[str]) -> bool:
-        """Add the stamp of a row, and return whether it has one if it needs one."""
-        if self.stamp_at:
-            texts = [cells[place] for place in self.stamp_at]
-            try:
-                self.stamps.append(stamp_of(self.stamp_names, texts, self.second_unit))
-            except ValueError:
-                if any(map(is_null, texts)):
-                    return False
-                raise
+        """Add the stamp of a row. Return False if the row needs a stamp and has none."""
+        if not self.stamp_at:
+            return True
+        texts = [cells[column] for column in self.stamp_at]
+        try:
+            self.stamps.append(stamp_of(self.stamp_names, texts, self.second_unit))
+        except ValueError:
+            if any(map(is_null, texts)):
+                return False
+            raise
         return True
 
     def _numbers_in(self, cells: Sequence[str]) -> list[float]:
         try:
-            return [float(cells[place]) for place in self._value_at]
+            return [float(cells[column]) for column in self._value_at]
         except ValueError:
             return [
-                (angle if name in ("lat", "lon") else number)(cells[place])
-                for name, place in self.at.items()
+                angle(cells[column]) if name in ("lat", "lon") else number(cells[column])
+                for name, column in self.at.items()
             ]
 
     def _is_pose(self, values: Sequence[float]) -> bool:
-        """Whether the values of a row are finite, and some of its orientation is not 0."""
-        # The sum is quick; that of large numbers may not be finite.
+        """Whether the values of a row are finite, and its orientation is not all 0."""
+        # The sum is quick, but the sum of large numbers may not be finite.
         if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
             return False
         return not self._turn_at or any(values[place] for place in self._turn_at)
 
     def _as_many_as_columns(
-        self, cells: Sequence[str], line_number: int, text: object
+        self, cells: Sequence[str], line_number: int, content: object
     ) -> Sequence[str]:
-        """The cells of a row without an empty one at its end, or those of a row that has a stamp
-        alone; an InputError for any other number of cells.
+        """Return as many cells as columns, of a row with another number of cells.
+
+        An empty cell at the end is dropped. Empty cells are added to a row that has only a stamp.
+
+        Raises
+        ------
+        InputError
+            For any other row.
         """
         n_columns = len(self.names)
         if len(cells) == n_columns + 1 and not cells[-1]:
             return cells[:-1]
-        others = (cell for place, cell in enumerate(cells) if place not in self.stamp_at)
         has_stamp = self.stamp_at and max(self.stamp_at) < len(cells) < n_columns
+        others = (cell for column, cell in enumerate(cells) if column not in self.stamp_at)
         if has_stamp and all(map(is_null, others)):
             return [*cells, *[""] * (n_columns - len(cells))]
         raise InputError(
             f"{self.path}, line {line_number}: expected {self.expected}; found {len(cells)}: "
-            f"{shown_value(text)}"
+            f"{shown_value(content)}"
         )
 
     def guess(self, text: str) -> None:
-        """Note how something was read that the file does not say."""
+        """Add a note for the user on what the file does not state."""
         self.guesses.append(f"{self.path}: {text}")
 
-    def refuse(self, wrong: BoolArray, message: Callable[[int], str]) -> None:
-        """Raise an error at the first wrong row (N,), if there is one."""
-        index = int(np.argmax(wrong))
-        if wrong[index]:
+    def refuse(self, is_wrong: BoolArray, message: Callable[[int], str]) -> None:
+        """Raise an InputError at the first wrong row of (N,), if there is one."""
+        index = int(np.argmax(is_wrong))
+        if is_wrong[index]:
             raise InputError(f"{self.path}, line {self.line_numbers[index]}: {message(index)}")
 
 
@@ -247,8 +328,25 @@ _KINDS = (
 
 
 def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]:
-    """Names and values of the columns of an array of poses, and notes on how it was read; an
-    InputError if it is none.
+    """Return the columns of an array of poses.
+
+    Parameters
+    ----------
+    source : array_like
+        (N, 8) of t, x, y, z, qx, qy, qz, qw; (N, 7) without t; (N, 4) of t, x, y, z; or matrices
+        (N, 4, 4) or (N, 3, 4).
+
+    Returns
+    -------
+    names : sequence of str
+    values : (N, k) array
+    notes : list of str
+        Notes for the user on how the array was read.
+
+    Raises
+    ------
+    InputError
+        For anything else.
     """
     try:
         values = np.asarray(source, dtype=float)
@@ -263,33 +361,34 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
     if values.shape[1:] in ((3, 4), (4, 4)):
         return MATRIX, values.reshape(len(values), -1)[:, : len(MATRIX)], notes
     names = ("t", *POSITION, *QUATERNION)
-    known = {8: names, 7: names[1:], 4: names[:4]}
-    if values.ndim != 2 or values.shape[1] not in known:
+    names_of_width = {8: names, 7: names[1:], 4: names[:4]}
+    if values.ndim != 2 or values.shape[1] not in names_of_width:
         raise InputError(f"expected {_KINDS}; found an array {values.shape}")
-    return known[values.shape[1]], values, notes
+    return names_of_width[values.shape[1]], values, notes
 
 
 def _has_last_row(matrices: FloatArray) -> bool:
     """Whether the last row of all finite matrices (N, 4, 4) is 0 0 0 1."""
-    finite = matrices[np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))]
-    return bool(np.allclose(finite[:, 3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE))
+    is_finite = np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))
+    last_rows = matrices[is_finite, 3]
+    return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE))
 
 
 def table_of_object(source: Any, times: Any = None) -> Table:
-    """The numbers of an array or of a table; see :func:`hand_eye_calib.read_trajectory`. An
-    InputError if it is neither, or the stamps are no numbers or datetimes, one for each pose.
+    """Return the table of an array or of a DataFrame; see :func:`hand_eye_calib.read_trajectory`.
+
+    Raises
+    ------
+    InputError
+        If the source is neither, or the stamps are not numbers or datetimes, one for each pose.
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]
         table = Table("the table", [*map(str, keys)], expected=_KINDS)
-        columns = [np.asarray(source[keys[at]], dtype=float) for at in table.at.values()]
+        columns = [np.asarray(source[keys[place]], dtype=float) for place in table.at.values()]
         values = np.column_stack(columns)
-        if times is None and len(table.stamp_at) == 1:
-            times = source[keys[table.stamp_at[0]]]
-        elif times is None and table.stamp_at:
-            texts = zip(*(map(str, source[keys[at]]) for at in table.stamp_at), strict=True)
-            unit = table.second_unit
-            times = [stamp_of(table.stamp_names, cells, unit) for cells in texts]
+        if times is None:
+            times = _times_of_columns([source[keys[place]] for place in table.stamp_at], table)
     else:
         names, values, notes = columns_of_array(source)
         if names[0] == "t":
@@ -300,12 +399,20 @@ def table_of_object(source: Any, times: Any = None) -> Table:
         for note in notes:
             table.guess(note)
     stamps = None if times is None else _stamps_of_objects(times, table, len(values))
-    _fill_from_array(table, values, stamps)
+    table.fill_from_arrays(values, stamps)
     return table
 
 
+def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
+    """Return the stamps in columns of a DataFrame; None without a column."""
+    if len(columns) < 2:
+        return columns[0] if columns else None
+    rows = zip(*(map(str, column) for column in columns), strict=True)
+    return [stamp_of(table.stamp_names, cells, table.second_unit) for cells in rows]
+
+
 def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal | None]:
-    """One stamp per pose, none where it is not a time."""
+    """Return one stamp for each pose, None for a missing time."""
     if isinstance(times, list) and times and isinstance(times[0], Decimal):
         return [*times]
     if getattr(getattr(times, "dtype", None), "tz", None) is not None:
@@ -313,7 +420,7 @@ def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal |
     stamps = np.asarray(times)
     is_time = np.ones(stamps.shape, dtype=bool)
     if stamps.dtype.kind == "M":
-        table.units["t"] = "ns"
+        table.stamp_unit = "ns"
         is_time = ~np.isnat(stamps)
         stamps = stamps.astype("datetime64[ns]").astype(np.int64)
     elif stamps.dtype.kind == "f":
@@ -328,36 +435,16 @@ def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal |
             f"there must be one stamp per pose; found {stamps.size} stamps and {n_poses} poses"
         )
     both = zip(stamps.tolist(), is_time.tolist(), strict=True)
-    return [Decimal(stamp) if is_one else None for stamp, is_one in both]
-
-
-def _fill_from_array(
-    table: Table, values: FloatArray, stamps: Sequence[Decimal | None] | None
-) -> None:
-    """Add the rows (N, k) that have a pose and a stamp."""
-    is_pose = np.isfinite(values).all(axis=1)
-    if table._turn_at:
-        is_pose &= values[:, table._turn_at].any(axis=1)
-    if stamps is not None:
-        is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
-        table.stamps = [
-            stamp for stamp, keep in zip(stamps, is_pose, strict=True) if stamp is not None and keep
-        ]
-    rows = np.flatnonzero(is_pose).tolist()
-    table.numbers.frombytes(np.ascontiguousarray(values[is_pose]).tobytes())
-    table.line_numbers.extend(row + 1 for row in rows)
-    table.rows.extend(rows)
-    table.n_rows = len(values)
-    if table.n_left_out:
-        table.first_left_out = int(np.argmin(is_pose)) + 1
+    return [Decimal(stamp) if is_valid else None for stamp, is_valid in both]
 
 
 # ---- rows that are written
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a trajectory to a text file in the format tum, which evo reads, too, replacing it if it
-    exists. Reading it back gives the same stamps and poses.
+    """Write a trajectory to a text file in the format tum, which evo also reads.
+
+    A file that exists is replaced. Reading the file back returns the same stamps and poses.
 
     Parameters
     ----------
@@ -379,5 +466,5 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
-    """The line of a pose x y z qx qy qz qw, which keeps every digit."""
+    """Return the line of a pose x y z qx qy qz qw, with all digits."""
     return f"{seconds(stamp_ns)} {' '.join(map(repr, pose))}"
