@@ -447,7 +447,7 @@ def _fitting(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ..
     None if the numbers fit nothing, or no row is complete.
     """
     places = [place for place, cell in enumerate(row) if is_value(cell)]
-    values = _complete(rows, places, len(row))
+    values = _complete(rows, places, len(row)) if places else np.empty((0, 0))
     columns = _columns_of(values) if len(values) else None
     if columns is None:
         return None
