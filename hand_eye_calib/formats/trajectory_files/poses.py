@@ -1,9 +1,9 @@
-"""Stamps and poses from the numbers of a table, in whatever way it gives them.
+"""Poses from the numbers of a table.
 
-The order of quaternions and the convention of angles that a file does not name are judged by the
-motion: a vehicle moves in a steady direction of its own body, forward as a rule. With orientations
-of a wrong convention that direction wanders as the vehicle turns. Hand-held sensors and drones move
-in all directions; of them this says nothing.
+A file may not state the order of its quaternions or the convention of its angles. They are
+recognised by the motion: a vehicle moves in a steady direction of its own body, usually forward.
+With orientations of a wrong convention this direction wanders as the vehicle turns. Hand-held
+sensors and drones move in all directions, so that their motion does not distinguish conventions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,12 @@ from hand_eye_calib.core.geometry.trajectory import (
     far_position,
     scatter_of_direction,
 )
-from hand_eye_calib.formats.geodetic import are_earth_centred, axes_of_places
+from hand_eye_calib.formats.geodetic import (
+    LocalOrigin,
+    are_earth_centred,
+    axes_of_places,
+    rotations_to_first,
+)
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
     QUATERNION,
@@ -34,30 +39,50 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.table import Table
 
-# Units of lengths, angles and rates in m, rad and rad/s. Without a name it is the first, or the
-# second if a value is larger than the limit: a turn with room for rounding, and 2,000 deg/s, which
-# no gyroscope exceeds.
+# Largest angle (rad) of a column without a unit: one turn, with room for rounding.
+_LARGEST_ANGLE_RAD = 2 * np.pi + 0.01
+# Units of lengths, angles and rates in m, rad and rad/s. Without a name the unit is the first, or
+# the second if a value is larger than the limit. The limit of rates is 2,000 deg/s, which no
+# gyroscope exceeds.
 _KINDS = {
     "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}, np.inf),
-    "angle": ({"rad": 1.0, "deg": np.pi / 180}, 2 * np.pi + 0.01),
+    "angle": ({"rad": 1.0, "deg": np.pi / 180}, _LARGEST_ANGLE_RAD),
     "rate": ({"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0),
 }
 
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
-# The inverse rotation in roll, pitch and yaw, as pyboreas has it.
+# Inverse rotation in roll, pitch and yaw, as the library pyboreas has it.
 _INVERSE = "that of the world in the sensor's frame"
 _OTHER_ORDER = "counterclockwise from x, about axes that roll and pitch have turned"
-# A sensor that stays as level as this scatters no more than noise: 1 minus the cosine of 2.5 deg.
+# Scatter of the vertical in a level sensor that is only noise: 1 minus the cosine of 2.5 deg.
 _LEVEL = 1e-3
 
 # ---- poses and rates
 
 
 def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
-    """Positions (N, 3), m, and quaternions (N, 4), scalar last, of a table, or its angular rates
-    (N, 3), rad/s; what had to be guessed is added to its ``guesses``. A ``convention`` of its
-    angles goes before what the motion says. An InputError for values that cannot be, with the line.
+    """Return the poses of a table, or its angular rates.
+
+    Notes on what the file does not state are added to the table's ``guesses``.
+
+    Parameters
+    ----------
+    table : Table
+    convention : str, optional
+        Convention of the angles, instead of the one that fits the motion.
+
+    Returns
+    -------
+    positions : (N, 3) array
+        In m.
+    quats_xyzw : (N, 4) array
+        For rates there is one array instead, (N, 3) in rad/s.
+
+    Raises
+    ------
+    InputError
+        For values that cannot be, with their line.
     """
     table.refuse(
         np.asarray(~np.isfinite(table.values()).all(axis=1)),
@@ -71,16 +96,23 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
         positions, to_first = _positions(table)
         quats_xyzw = _orientations(table, positions, convention)
         if to_first is not None:
-            in_local = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
-            quats_xyzw = se3.to_quat_xyzw(to_first @ in_local)
+            rotations = _rotations_of(quats_xyzw)
+            quats_xyzw = se3.to_quat_xyzw(to_first @ rotations)
     if table.measures == "poses" and are_earth_centred(positions):
         quats_xyzw = _in_axes_of_earth(table, positions, quats_xyzw)
     return positions, quats_xyzw
 
 
+def _rotations_of(quats_xyzw: FloatArray) -> FloatArray:
+    """Return the rotations (N, 3, 3) of quaternions (N, 4)."""
+    return se3.from_quat_xyzw(np.zeros((len(quats_xyzw), 3)), quats_xyzw)[:, :3, :3]
+
+
 def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
-    """Positions (N, 3), m, and, of latitudes, the rotations (N, 3, 3) from the axes of each
-    position to those of the first.
+    """Return the positions (N, 3), m, of a table without matrices.
+
+    For latitudes, also return the rotations (N, 3, 3) from the axes east, north and up of each
+    position to those of the first position.
     """
     positions = np.zeros((len(table.line_numbers), 3))
     to_first = None
@@ -104,8 +136,9 @@ def _refuse_far(table: Table, positions: FloatArray) -> None:
 
 
 def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
-    """Positions (N, 3), m, and quaternions (N, 4), scalar last, of matrices: those of the nearest
-    rotations, as files have few digits.
+    """Return the positions (N, 3), m, and quaternions (N, 4), scalar last, of matrices.
+
+    The orientations are the nearest rotations, because the numbers of files have few digits.
     """
     matrices = table.values(MATRIX).reshape(-1, 3, 4)
     positions = matrices[:, :, 3]
@@ -118,10 +151,11 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
             "of the values"
         ),
     )
+    quats_xyzw = se3.to_quat_xyzw(nearest)
     if not table.is_transposable:
-        return positions, se3.to_quat_xyzw(nearest)
+        return positions, quats_xyzw
     ways = {
-        "row by row": se3.to_quat_xyzw(nearest),
+        "row by row": quats_xyzw,
         "column by column": se3.to_quat_xyzw(np.swapaxes(nearest, 1, 2)),
     }
     fitting = _fitting(positions, ways)
@@ -130,30 +164,30 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     return positions, ways[fitting[0]]
 
 
-_EARTH = "the axes of the earth, too"
-_EAST = "east, north and up of each place (ENU)"
-_NORTH = "north, east and down of each place (NED)"
-# Axes north, east and down in those east, north and up.
-_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Rotation from the axes north, east and down to the axes east, north and up.
+_R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArray) -> FloatArray:
-    """Quaternions (N, 4) in the axes of positions (N, 3) from the centre of the earth: those of the
-    file may be in the axes of each place. The motion tells, or else that a vehicle stays level.
+    """Return quaternions (N, 4) in the axes of the earth, of a file with positions (N, 3) in them.
+
+    The orientations of the file may be in the axes of the earth, or east, north and up, or north,
+    east and down of each position. The motion decides, or else the way in which a vehicle stays
+    level.
     """
     axes = axes_of_places(positions)
-    rotations = se3.from_quat_xyzw(positions, quats_xyzw)[:, :3, :3]
+    rotations = _rotations_of(quats_xyzw)
     ways = {
-        _EARTH: quats_xyzw,
-        _EAST: se3.to_quat_xyzw(axes @ rotations),
-        _NORTH: se3.to_quat_xyzw(axes @ _NED @ rotations),
+        "the axes of the earth, too": quats_xyzw,
+        "east, north and up of each place (ENU)": se3.to_quat_xyzw(axes @ rotations),
+        "north, east and down of each place (NED)": se3.to_quat_xyzw(axes @ _R_ENU_NED @ rotations),
     }
     fitting = _fitting(positions, ways)
     if len(fitting) > 1:
         up = axes[:, :, 2]
         tilts = {way: _tilt(ways[way], up) for way in fitting}
-        most = CLEARLY * min(tilts.values())
-        fitting = [way for way in fitting if tilts[way] <= max(most, _LEVEL)]
+        largest = max(CLEARLY * min(tilts.values()), _LEVEL)
+        fitting = [way for way in fitting if tilts[way] <= largest]
     reason = ", because the motion fits that" if len(fitting) < len(ways) else ""
     table.guess(
         "positions count from the centre of the earth (ECEF); orientations read as relative to "
@@ -163,71 +197,87 @@ def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArra
 
 
 def _tilt(quats_xyzw: FloatArray, up: FloatArray) -> float:
-    """How much directions (N, 3) scatter in the axes of a sensor: 0 if they are always the same."""
-    rotations = se3.from_quat_xyzw(np.zeros((len(up), 3)), quats_xyzw)[:, :3, :3]
-    in_sensor = np.einsum("nji,nj->ni", rotations, up)
+    """Return the scatter of directions (N, 3) in the axes of a sensor: 0 for a constant direction.
+
+    It is 1 minus the length of the mean direction.
+    """
+    in_sensor = np.einsum("nji,nj->ni", _rotations_of(quats_xyzw), up)
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
 def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Metres (N, 3) east, north and up of the first position, and the rotations (N, 3, 3) from the
-    axes of each position to those of the first.
-    """
-    from hand_eye_calib.formats.geodetic import LocalOrigin, rotations_to_first
+    """Return positions (N, 3), m, east, north and up of the first position.
 
-    lat, lon = _in_si(table, ("lat", "lon"), "angle").T
+    Also return the rotations (N, 3, 3) from these axes at each position to those at the first.
+    """
+    lat_rad, lon_rad = _in_si(table, ("lat", "lon"), "angle").T
     table.refuse(
-        (np.abs(lat) > np.pi / 2) | (np.abs(lon) > _KINDS["angle"][1]),
+        (np.abs(lat_rad) > np.pi / 2) | (np.abs(lon_rad) > _LARGEST_ANGLE_RAD),
         lambda row: (
-            f"found latitude {np.degrees(lat[row]):.7g} deg, longitude "
-            f"{np.degrees(lon[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps they "
-            "are swapped"
+            f"found latitude {np.degrees(lat_rad[row]):.7g} deg, longitude "
+            f"{np.degrees(lon_rad[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps "
+            "they are swapped"
         ),
     )
-    height = _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat))
+    height_m = _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat_rad))
     table.guess("latitude and longitude became metres east and north of the first position")
-    return LocalOrigin().local(lat, lon, height), rotations_to_first(lat, lon)
+    positions = LocalOrigin().local(lat_rad, lon_rad, height_m)
+    return positions, rotations_to_first(lat_rad, lon_rad)
 
 
 def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
-    """Columns (N, k) in m, rad or rad/s: in the unit that the header names, or by their size."""
-    known, largest_of_first = _KINDS[kind]
+    """Return columns (N, k) in m, rad or rad/s.
+
+    Their unit is the one in their names, or is recognised from the size of their values.
+    """
+    factors, largest_of_first = _KINDS[kind]
     values = table.values(names)
-    named = {unit for name in names if (unit := table.units.get(name))}
-    if len(named) > 1 or named - known.keys():
+    units = {table.units[name] for name in names if name in table.units}
+    if len(units) > 1 or units - factors.keys():
         raise InputError(
-            f"{table.path}: columns {', '.join(names)} in {', '.join(sorted(named))}; expected one "
-            f"of {', '.join(known)}"
+            f"{table.path}: columns {', '.join(names)} in {', '.join(sorted(units))}; expected one "
+            f"of {', '.join(factors)}"
         )
     sizes = np.abs(values).max(axis=1)
-    table.refuse(
-        (sizes > FARTHEST_M) & (kind != "length"),
-        lambda row: f"found {kind} {sizes[row]:.4g}; repair its source",
-    )
+    if kind != "length":
+        table.refuse(
+            sizes > FARTHEST_M, lambda row: f"found {kind} {sizes[row]:.4g}; repair its source"
+        )
+    if units:
+        return values * factors[units.pop()]
+    first, second, *_ = factors
     largest = float(sizes.max())
-    unit = min(named) if named else [*known][largest > largest_of_first]
-    if not named and kind != "length":
+    unit = second if largest > largest_of_first else first
+    if kind != "length":
         table.guess(
             f"{', '.join(names)} read in {unit}, the largest is {largest:.4g}; to change that, "
             f"name the unit in the header, such as {names[-1]}_{unit.replace('/', '_')}"
         )
-    return values * known[unit]
+    return values * factors[unit]
 
 
 # ---- orientations
 
 
 def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:
-    """Quaternions (N, 4), scalar last; level where there are none."""
-    kinds = (QUATERNION, SCALAR_FIRST, UNNAMED)
-    names = next((each for each in kinds if each[0] in table.at), ())
-    if not names:
-        if {"yaw", "heading"} & table.at.keys():
-            return _from_angles(table, positions, convention)
-        if ROTATION_VECTOR[0] in table.at:
-            _require_rotation_vectors(table)
-            return se3.to_quat_xyzw(se3.rotation_exp(_in_si(table, ROTATION_VECTOR, "angle")))
-        return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
+    """Return quaternions (N, 4), scalar last: the identity if the table has no orientations."""
+    for names in (QUATERNION, SCALAR_FIRST, UNNAMED):
+        if names[0] in table.at:
+            return _of_quaternions(table, names, positions)
+    if {"yaw", "heading"} & table.at.keys():
+        return _of_angles(table, positions, convention)
+    if ROTATION_VECTOR[0] in table.at:
+        _require_rotation_vectors(table)
+        return se3.to_quat_xyzw(se3.rotation_exp(_in_si(table, ROTATION_VECTOR, "angle")))
+    return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
+
+
+def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -> FloatArray:
+    """Return the quaternions (N, 4) of a table, with the scalar last.
+
+    The order of coefficients without clear names is the usual one, unless the motion or the first
+    orientation speaks for the other.
+    """
     quats = table.values(names)
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(quats, axis=1)
@@ -240,22 +290,25 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
     )
     if names == QUATERNION:
         return quats
-    # The order that motion and start speak for, or else the usual one.
     ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
-    usual, other = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
+    usual = "first" if names == SCALAR_FIRST else "last"
+    other = "last" if names == SCALAR_FIRST else "first"
     fitting = _fitting(positions, ways)
     # An odometry starts at the identity.
-    level = [way for way, (first, *_) in ways.items() if np.isclose(abs(first[3]), 1.0, rtol=0.0)]
+    is_identity = {
+        way: np.isclose(abs(quats_xyzw[0, 3]), 1.0, rtol=0.0) for way, quats_xyzw in ways.items()
+    }
     reason = ""
     if fitting == [other]:
         reason = "the motion keeps a steady direction that way"
-    elif other in level and other in fitting:
+    elif is_identity[other] and other in fitting:
         reason = "the first orientation is the identity that way"
     if reason:
-        order = {"first": "qw qx qy qz", "last": "qx qy qz qw"}[other]
+        order = "qw qx qy qz" if other == "first" else "qx qy qz qw"
         table.guess(f"quaternions read with the scalar {other}, t x y z {order}: {reason}")
         return ways[other]
-    if names == UNNAMED and table.format != "tum" and fitting != ["last"] and "last" not in level:
+    is_sure = fitting == [usual] or is_identity[usual]
+    if names == UNNAMED and table.format != "tum" and not is_sure:
         table.guess(
             "no columns are named, and nothing names the order of the quaternion; read with the "
             "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
@@ -264,13 +317,12 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
 
 
 def _require_rotation_vectors(table: Table) -> None:
-    """Refuse columns rx, ry, rz that are angles in degrees: nothing names their order."""
-    vectors = table.values(ROTATION_VECTOR)
+    """Raise an InputError if columns rx, ry, rz are angles in degrees, in an unknown order."""
     if not is_brief(table.names[table.at[ROTATION_VECTOR[0]]]):
         return
-    lengths = np.linalg.norm(vectors, axis=1)
+    lengths = np.linalg.norm(table.values(ROTATION_VECTOR), axis=1)
     table.refuse(
-        lengths > _KINDS["angle"][1],
+        lengths > _LARGEST_ANGLE_RAD,
         lambda row: (
             f"rx, ry, rz are {lengths[row]:.4g} long, more than a turn: angles in degrees? Name "
             "the columns roll_deg, pitch_deg, yaw_deg (about the fixed axes x, y, z), or "
@@ -280,52 +332,53 @@ def _require_rotation_vectors(table: Table) -> None:
     table.guess("rx, ry, rz read as a rotation vector, as Universal Robots have it")
 
 
-def _from_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
-    """Quaternions (N, 4) from roll, pitch and yaw (about the fixed axes x, y, z) or heading."""
-    names = [each for each in ("roll", "pitch", "yaw", "heading") if each in table.at]
+def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
+    """Return quaternions (N, 4) of roll, pitch and yaw (about the fixed axes x, y, z) or heading.
+
+    The axes of the body are x forward, y left and z up, in a frame with z up. With a heading a
+    positive pitch is nose up, as on aircraft and in INS. With a yaw the pitch is about y, as in
+    REP 103.
+    """
+    names = [name for name in ("roll", "pitch", "yaw", "heading") if name in table.at]
     *tilt, angle = _in_si(table, names, "angle").T
     if not tilt:
         table.guess("no columns of roll and pitch: taken as 0")
     roll, pitch = tilt or np.zeros((2, len(angle)))
-    # With a compass heading, a positive pitch is nose up, as on aircraft and in INS; with a yaw it
-    # is about y, as in REP 103. Axes of the body are x forward, y left and z up, in a frame with z
-    # up.
-    compass, usual = (
-        se3.rotation_from_rpy(np.stack(rpy, axis=1))
-        for rpy in ((roll, -pitch, np.pi / 2 - angle), (roll, pitch, angle))
-    )
-    inverse = np.swapaxes(usual, 1, 2)
-    other_order = se3.in_other_order(usual)
-    rotations = {
-        _COMPASS: compass,
-        _MATHEMATICAL: usual,
-        _INVERSE: inverse,
-        _OTHER_ORDER: other_order,
+    as_compass = np.stack([roll, -pitch, np.pi / 2 - angle], axis=1)
+    usual = se3.rotation_from_rpy(np.stack([roll, pitch, angle], axis=1))
+    ways = {
+        _COMPASS: se3.to_quat_xyzw(se3.rotation_from_rpy(as_compass)),
+        _MATHEMATICAL: se3.to_quat_xyzw(usual),
+        _INVERSE: se3.to_quat_xyzw(np.swapaxes(usual, 1, 2)),
+        _OTHER_ORDER: se3.to_quat_xyzw(se3.in_other_order(usual)),
     }
-    ways = {way: se3.to_quat_xyzw(each) for way, each in rotations.items()}
     expected = _COMPASS if names[-1] == "heading" else _MATHEMATICAL
     # In flat motion the order of angles does not matter.
     unlikely = {expected: 0, _OTHER_ORDER: 2}
     table.conventions = sorted(_fitting(positions, ways), key=lambda way: unlikely.get(way, 1))
     way = convention or table.conventions[0]
     if expected == _COMPASS or way != expected:
-        why = "" if way == expected else ", because the motion fits that and not the usual"
+        reason = ""
         if convention:
-            why = ", because that fits the other file with the same columns, too"
+            reason = ", because that fits the other file with the same columns, too"
+        elif way != expected:
+            reason = ", because the motion fits that and not the usual"
         axes = "x forward, y left, z up"
         if way == _INVERSE:
             axes = "x, y, z of the world where all angles are 0"
-        table.guess(f"{names[-1]} read as {way}{why}; axes of the sensor: {axes}")
+        table.guess(f"{names[-1]} read as {way}{reason}; axes of the sensor: {axes}")
     return ways[way]
 
 
 def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]:
-    """Select the ways to read orientations (N, 4) that the motion does not contradict: no other way
-    fits it clearly better. The positions (N, 3) are those of the sensor in its world.
+    """Return the ways to read orientations (N, 4) that the motion does not contradict.
+
+    The motion contradicts a way if another way fits it clearly better. The positions (N, 3) are
+    those of the sensor in its world.
     """
     scatters = {
-        way: scatter_of_direction(se3.from_quat_xyzw(positions, quats))
-        for way, quats in ways.items()
+        way: scatter_of_direction(se3.from_quat_xyzw(positions, quats_xyzw))
+        for way, quats_xyzw in ways.items()
     }
     largest = max(STEADY, CLEARLY * min(scatters.values()))
     return [way for way, scatter in scatters.items() if scatter <= largest]
