@@ -1,8 +1,8 @@
 """Extrinsics in the files of other programs, whose layouts are in ``layouts.yaml``.
 
-Which way round a transform goes is what people get wrong most often. So each file says by the names
-of the frames what its numbers map, and whether the calibration was inverted for it. Where the
-directions come from is in docs/exports.md.
+The direction of a transform is the most frequent mistake. Therefore each file names the frames
+between which its numbers map coordinates, and states whether the calibration was inverted. The
+sources of the directions are in docs/exports.md.
 """
 
 import json
@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -23,8 +23,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 
-# Beginnings of the words in a frame's name that say what the sensor is; nearest to the body first,
-# as the parent is taken for nearer than the child if the names say nothing.
+# Beginnings of words in a frame's name, by the kind of sensor. The kinds are in the order of their
+# distance from the body: if the names state nothing, the parent is nearer than the child.
 _ROLES = {
     "base": ("base", "ego", "vehicle", "chassis", "rig", "hand", "tool", "flange"),
     "imu": ("imu", "body", "gyro", "ins", "novatel", "xsens"),
@@ -33,31 +33,31 @@ _ROLES = {
     "gnss": ("gnss", "gps", "antenna", "rtk"),
 }
 _RANKS = {role: rank for rank, role in enumerate(_ROLES)}
-# Decimals of what is written: a thousandth of a micrometre.
+# Decimals of the numbers in a file: a thousandth of a micrometre.
 _DECIMALS = 12
-# What PX4 accepts for a delay (ms).
+# Longest delay (ms) that PX4 accepts (EKF2_EV_DELAY).
 _LONGEST_DELAY_MS = 300.0
 
 
 class Layout(NamedTuple):
-    """How a format writes one pair of sensors: the numbers are ``T_target_source``.
+    """Layout of one pair of sensors in a format: its numbers are ``T_target_source``.
 
     Attributes
     ----------
     target, source : str
-        What the sensors are; empty for any.
+        Kinds of the sensors; empty for any kind.
     is_inverted : bool or None
         Whether the target is the child; None if both are possible.
     keys : sequence of str
-        What a reader looks for: a pose, or translation and rotation.
+        Keys by which a reader finds a pose, or translation and rotation.
     text : str
-        The file, with ``%(name)s`` where numbers and names go.
+        Text of the file, with ``%(name)s`` in place of numbers and names.
     clock : int
-        ``t_target = t_source + clock * shift``; 0 if the file has no shift.
+        Sign of the shift in ``t_target = t_source + clock * shift``; 0 if the file has no shift.
     axes : sequence of str
-        Axes that must be known.
-    axes_said : str
-        What the file says of its axes.
+        Axes that the recording must determine.
+    axes_note : str
+        Note in the file on its axes.
     """
 
     target: str = ""
@@ -67,50 +67,84 @@ class Layout(NamedTuple):
     text: str = ""
     clock: int = 0
     axes: Sequence[str] = AXES
-    axes_said: str = ""
+    axes_note: str = ""
+
+
+class Arrangement(NamedTuple):
+    """Layout for two sensors, and its direction.
+
+    Attributes
+    ----------
+    layout : Layout
+    is_inverted : bool
+        Whether its numbers are ``T_child_parent``.
+    is_certain : bool
+        Whether the names of the frames state the kinds of the sensors.
+    """
+
+    layout: Layout
+    is_inverted: bool
+    is_certain: bool
 
 
 @cache
 def formats() -> dict[str, list[Layout]]:
-    """The layouts of each format."""
+    """Return the layouts of each format."""
     text = Path(__file__).with_name("layouts.yaml").read_text(encoding="utf-8")
-    rows = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    return {name: [Layout(**each) for each in found] for name, found in rows.items()}
+    document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return {name: [Layout(**fields) for fields in layouts] for name, layouts in document.items()}
 
 
 def role_of(frame: str) -> str:
-    """What a sensor is, by the name of its frame; empty if it does not say."""
+    """Return the kind of a sensor, from the name of its frame; empty if the name states none."""
     words = re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower())
-    found = [
-        role for role, starts in _ROLES.items() if any(word.startswith(starts) for word in words)
+    roles = [
+        role
+        for role, beginnings in _ROLES.items()
+        if any(word.startswith(beginnings) for word in words)
     ]
-    # camera_base_link is a camera's, imu_link of the base an IMU's.
-    return next((role for role in found if role != "base"), found[0] if found else "")
+    # camera_base_link belongs to a camera, imu_link of the base to an IMU.
+    if len(roles) > 1 and roles[0] == "base":
+        return roles[1]
+    return roles[0] if roles else ""
 
 
-def arranged(
-    layouts: Sequence[Layout], parent_frame: str, child_frame: str
-) -> tuple[Layout, bool, bool]:
-    """The layout that fits the sensors best, whether its numbers are ``T_child_parent``, and
-    whether the names of the frames say so.
+def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> Arrangement:
+    """Return the layout and the direction that fit the sensors best.
+
+    Most kinds of sensors must match, then fewest must differ. Then the first layout counts, and a
+    parent that is nearer to the body than the child.
     """
     roles = (role_of(parent_frame), role_of(child_frame))
-    found = []
+    best_score: tuple[Any, ...] = ()
     for order, layout in enumerate(layouts):
-        ways = (False, True) if layout.is_inverted is None else (layout.is_inverted,)
-        for is_inverted in ways:
-            wanted = (layout.source, layout.target) if is_inverted else layout[:2]
-            matches = sum(one == role != "" for one, role in zip(wanted, roles, strict=True))
-            misses = sum(one not in ("", role) for one, role in zip(wanted, roles, strict=True))
+        directions = (False, True) if layout.is_inverted is None else (layout.is_inverted,)
+        for is_inverted in directions:
+            wanted = (layout.target, layout.source)
+            if is_inverted:
+                wanted = (layout.source, layout.target)
+            pairs = list(zip(wanted, roles, strict=True))
+            n_matches = sum(kind == role != "" for kind, role in pairs)
+            n_misses = sum(kind not in ("", role) for kind, role in pairs)
             is_natural = _RANKS.get(wanted[0], 0) <= _RANKS.get(wanted[1], 0)
-            fit = layout, is_inverted, not misses
-            found.append((matches, -misses, -order, is_natural, fit))
-    return max(found, key=lambda each: each[:4])[4]
+            score = (n_matches, -n_misses, -order, is_natural)
+            if score > best_score:
+                best_score = score
+                best = Arrangement(layout, is_inverted, is_certain=n_misses == 0)
+    return best
 
 
 def export_text(result: Judged, name: str) -> str:
-    """A calibration in the format of another program, unless it is not usable. See
-    :meth:`~hand_eye_calib.core.results.calibration.Calibration.export`.
+    """Return a calibration in the format of another program.
+
+    See :meth:`~hand_eye_calib.core.results.calibration.Calibration.export`.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown format.
+    InputError
+        If the result is not usable, or an axis that the format needs is not determined.
     """
     if name not in formats():
         raise ConfigError(f"unknown format {name!r}; known are {', '.join(formats())}")
@@ -118,7 +152,8 @@ def export_text(result: Judged, name: str) -> str:
         raise InputError(f"nothing is written: {result.headline}")
     frames = (result.parent_frame, result.child_frame)
     T = result.T_parent_child
-    layout, is_inverted, is_certain = arranged(formats()[name], *frames)
+    arrangement = arranged(formats()[name], *frames)
+    layout = arrangement.layout
     if layout.is_inverted is False and not layout.target:  # the vehicle or robot, if it is known
         frames = (result.mounting[0], result.child_frame)
         T = result.mounting[1]
@@ -127,49 +162,79 @@ def export_text(result: Judged, name: str) -> str:
             f"nothing is written: this recording does not determine {axes_in_words(unknown)}; "
             "measure it by hand and calibrate again with --prior"
         )
-    target, source = frames[::-1] if is_inverted else frames
-    shift_s = layout.clock * (-1 if is_inverted else 1) * result.time_offset_s
-    texts = _numbers(se3.inverse(T) if is_inverted else T)
-    texts |= {"target": json.dumps(target), "source": json.dumps(source), "shift": _number(shift_s)}
-    is_fixed = "base" in target.lower()  # a camera beside the robot, not on its hand
-    texts |= {"eye": "eye_on_base" if is_fixed else "eye_in_hand", "robot": '"base"'}
-    texts |= {"effector": '"hand"', ("robot" if is_fixed else "effector"): texts["target"]}
-    delay_ms = -1e3 * result.time_offset_s
-    texts["ev_delay"] = f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
-    if not 0 <= delay_ms <= _LONGEST_DELAY_MS:
-        texts["ev_delay"] = f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
+    target, source = frames
+    offset_s = result.time_offset_s
+    if arrangement.is_inverted:
+        target, source = source, target
+        T = se3.inverse(T)
+        offset_s = -offset_s
+    texts = _numbers(T) | _robot_frames(target)
+    texts |= {
+        "target": json.dumps(target),
+        "source": json.dumps(source),
+        "shift": _number(layout.clock * offset_s),
+        "ev_delay": _delay_of_px4(-1e3 * result.time_offset_s),
+    }
+    lines = _remarks(result, name, arrangement, target, source)
+    lines = [printable(" ".join(line.split())) for line in lines]
+    if name == "kitti":  # a value, not a comment
+        texts["about"] = json.dumps(" ".join(lines))
+    elif layout.text.startswith(("{", "[")):  # JSON has no comments
+        texts["about"] = json.dumps(lines)
+    else:
+        texts["about"] = "\n".join(f"# {line}" for line in lines)
+    return layout.text % texts
+
+
+def _robot_frames(target: str) -> dict[str, str]:
+    """Return the texts of a robot's base and hand: the target is one of them."""
+    if "base" in target.lower():  # a camera beside the robot, not on its hand
+        return {"eye": "eye_on_base", "robot": json.dumps(target), "effector": '"hand"'}
+    return {"eye": "eye_in_hand", "robot": '"base"', "effector": json.dumps(target)}
+
+
+def _delay_of_px4(delay_ms: float) -> str:
+    """Return the line that sets a delay in PX4, or a comment if PX4 does not accept the delay."""
+    if 0 <= delay_ms <= _LONGEST_DELAY_MS:
+        return f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
+    return f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
+
+
+def _remarks(
+    result: Judged, name: str, arrangement: Arrangement, target: str, source: str
+) -> list[str]:
+    """Return remarks for the user in a file: direction, clocks, assumptions and axes."""
+    layout = arrangement.layout
+    sign = "-" if result.time_offset_s < 0 else "+"
+    origin = "estimated" if result.time_offset_sigma_s else "given, not estimated"
     lines = [
         f"{name}, by hand_eye_calib {version_of()}. {result.headline}.",
         f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
         f"Clocks: t({result.parent_frame}) = t({result.child_frame}) "
-        f"{'-' if result.time_offset_s < 0 else '+'} {_number(abs(result.time_offset_s))} s, "
-        + ("estimated." if result.time_offset_sigma_s else "given, not estimated."),
+        f"{sign} {_number(abs(result.time_offset_s))} s, {origin}.",
     ]
-    if is_inverted:
+    if arrangement.is_inverted:
         lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
-    if not is_certain:
-        roles = zip((target, source), layout[:2], strict=True)
-        said = ", ".join(f"{frame} is the {role}" for frame, role in roles if role)
-        lines.append(f"Assumed, because the names of the frames do not say it: {said}.")
-    if layout.axes_said:
-        lines.append(layout.axes_said % {"target": target, "source": source})
-    lines = [printable(" ".join(line.split())) for line in lines]
-    texts["about"] = "\n".join(f"# {line}" for line in lines)
-    if name == "kitti" or layout.text.startswith(("{", "[")):  # a value, not a comment
-        texts["about"] = json.dumps(" ".join(lines) if name == "kitti" else lines)
-    return layout.text % texts
+    if not arrangement.is_certain:
+        kinds = ((target, layout.target), (source, layout.source))
+        assumed = ", ".join(f"{frame} is the {kind}" for frame, kind in kinds if kind)
+        lines.append(f"Assumed, because the names of the frames do not say it: {assumed}.")
+    if layout.axes_note:
+        lines.append(layout.axes_note % {"target": target, "source": source})
+    return lines
 
 
 def _numbers(T: FloatArray) -> dict[str, str]:
-    """The texts of a pose (4, 4) that layouts need."""
+    """Return the texts of a pose (4, 4) for layouts."""
     t = T[:3, 3]
     R = T[:3, :3]
-    rpy = se3.rotation_to_rpy(T[:3, :3])
-    qx, qy, qz, qw = quat_xyzw = se3.to_quat_xyzw(T)
-    numbers = dict(zip(AXES, [*t, *rpy], strict=True)) | {"y_frd": -t[1], "z_frd": -t[2]}
-    numbers |= {"qx": qx, "qy": qy, "qz": qz, "qw": qw}
+    rpy_rad = se3.rotation_to_rpy(R)
+    quat_xyzw = se3.to_quat_xyzw(T)
+    numbers = dict(zip(AXES, [*t, *rpy_rad], strict=True))
+    numbers |= zip(("qx", "qy", "qz", "qw"), quat_xyzw, strict=True)
+    numbers |= {"y_frd": -t[1], "z_frd": -t[2]}
     rows = [_listed(row) for row in T]
-    return {axis: _number(value) for axis, value in numbers.items()} | {
+    return {name: _number(value) for name, value in numbers.items()} | {
         "t": _listed(t),
         "t_plain": _listed(t, " "),
         "R": _listed(R.ravel()),
@@ -179,7 +244,7 @@ def _numbers(T: FloatArray) -> dict[str, str]:
         "matrix": ",\n           ".join(rows),
         "xyzw": _listed(quat_xyzw),
         "wxyz": _listed(np.roll(quat_xyzw, 1)),
-        "rpy_deg": _listed(np.degrees(rpy)),
+        "rpy_deg": _listed(np.degrees(rpy_rad)),
     }
 
 
@@ -188,6 +253,6 @@ def _listed(values: FloatArray, separator: str = ", ") -> str:
 
 
 def _number(value: float) -> str:
-    """A number that every parser takes for one with a fraction, never in powers of ten."""
+    """Return a number with a decimal point and without a power of ten, for every parser."""
     text = f"{round(float(value), _DECIMALS) + 0.0:.{_DECIMALS}f}".rstrip("0")
     return f"{text}0" if text.endswith(".") else text

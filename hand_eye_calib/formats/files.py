@@ -1,8 +1,8 @@
-"""Files: the limits of what is read from them, and text that is written in one step.
+"""Files: limits of reading, and writing in one step.
 
-A file is never believed about its own size. Text and YAML are refused before memory is allocated
-for them. Bags are read by libraries: while they do so, a command gives the process no more memory
-than :data:`LARGEST`; the poses that are kept come on top.
+The size that a file states for itself is not trusted. Text and YAML that are too large are refused
+before memory is allocated. Libraries read bags: meanwhile a command limits the additional memory of
+the process to :data:`LARGEST`. The poses that are kept take memory of their own.
 """
 
 import os
@@ -17,50 +17,51 @@ from hand_eye_calib.core.base.errors import InputError, printable
 
 # ---- all files
 
-#: Bytes of a trajectory file, and of memory that reading a bag may take, in a command
+#: Bytes of the largest trajectory file, and of the memory to read a bag in a command.
 LARGEST = 512 << 20
 
 # ---- bags
 
-#: A compressed file may unpack to this many times its own size.
+#: Largest ratio of a file to its compressed size.
 LARGEST_RATIO = 256
-#: Bytes of the name of a topic, a type or a frame.
+#: Bytes of the longest name of a topic, a type or a frame.
 LONGEST_NAME = 1_024
-#: A block of messages is passed on when it has reached this many bytes.
+#: Bytes at which a block of messages is passed on.
 BLOCK_BYTES = 4 << 20
 
 # ---- YAML
 
-#: Bytes of a YAML file.
+#: Bytes of the largest YAML file.
 LARGEST_YAML = 1 << 20
-#: Whole numbers are smaller: they fit 64 bits, as in messages and files of other programs.
+#: Whole numbers are smaller than this: they have 64 bits, as in messages and other programs.
 LARGEST_INT = 1 << 63
-#: Levels of nesting.
+#: Largest number of levels of nesting.
 DEEPEST_YAML = 32
 
 # ---- .npz
 
-#: Bytes of all arrays of a file. The poses of 100,000 stops take 26 million.
+#: Largest size of all arrays of a file in bytes. The poses of 100,000 stops take 26 million.
 LARGEST_ARRAYS = 64 << 20
 
 # ---- trajectory files
 
-#: Characters of one line.
+#: Characters of the longest line.
 LONGEST_LINE = 65_536
 
 
 _STATM = Path("/proc/self/statm")
 _is_limited = False
 
-# Limits before each reading of those that go on, in several threads perhaps: the last to end puts
-# back those before the first.
+# Limits before the readings that are in progress, perhaps in several threads. The last reading
+# restores the limits before the first.
 _before: list[tuple[int, int]] = []
 _lock = threading.Lock()
 
 
 def limit_memory() -> None:
-    """Limit the memory of reading from now on, where the system can (Linux). That is for commands:
-    the limit is one of the whole process, which may have other threads.
+    """Limit the memory of all later readings, if the system can (Linux).
+
+    Only commands do so: the limit is for the whole process, which may have other threads.
     """
     global _is_limited
     _is_limited = _STATM.exists()
@@ -68,8 +69,9 @@ def limit_memory() -> None:
 
 @contextmanager
 def reading_memory() -> Iterator[None]:
-    """Lets the process grow by :data:`LARGEST` and no more, after :func:`limit_memory`; what asks
-    for more gets a MemoryError.
+    """Limit the growth of the process to :data:`LARGEST` while the block runs.
+
+    The limit is set only after :func:`limit_memory`. Beyond it a MemoryError is raised.
     """
     if not _is_limited:
         yield
@@ -79,10 +81,10 @@ def reading_memory() -> Iterator[None]:
     with _lock:
         limits = resource.getrlimit(resource.RLIMIT_AS)
         _before.append(limits)
-        # Virtual memory, which is what the limit counts.
-        most = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
+        # The limit is for virtual memory.
+        largest = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
         allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(resource.RLIMIT_AS, (min([most, *allowed]), limits[1]))
+        resource.setrlimit(resource.RLIMIT_AS, (min([largest, *allowed]), limits[1]))
     try:
         yield
     finally:
@@ -93,8 +95,12 @@ def reading_memory() -> Iterator[None]:
 
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """Open a file for reading; an InputError if that is not possible, or it is a pipe or a device,
-    for which reading may wait for ever.
+    """Open a file for reading.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened, or is a pipe or a device, which may block for ever.
     """
     try:
         file = open(  # noqa: SIM115
@@ -110,8 +116,12 @@ def open_regular(path: str | Path) -> BufferedReader:
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
-    """Read a whole file; an InputError if that is not possible, or it is larger than ``largest``
-    bytes.
+    """Read a whole file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or has more than ``largest`` bytes.
     """
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > largest:
@@ -125,8 +135,12 @@ def read_text(path: str | Path, expected: str, largest: int = LARGEST) -> str:
 
 
 def decoded(path: str | Path, data: bytes, expected: str) -> str:
-    """The text of a file in UTF-8, with or without a byte order mark; ``expected`` is what an error
-    says that it should be.
+    """Return the text of a file in UTF-8, with or without a byte order mark.
+
+    Raises
+    ------
+    InputError
+        If the data is no text. The message has ``expected``, the description of the file.
     """
     try:
         return data.decode("utf-8-sig")
@@ -136,7 +150,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
 
 @contextmanager
 def writing(path: str | Path) -> Iterator[None]:
-    """Turns what the system says of a file at or below a path into an InputError that names it."""
+    """Turn an OSError in the block into an InputError that names the file, or else the path."""
     try:
         yield
     except OSError as error:
@@ -145,12 +159,15 @@ def writing(path: str | Path) -> Iterator[None]:
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
-    """Write files, each in one step, once all of them are on the disk under other names. Text is
-    written in UTF-8.
+    """Write files in one step each, after all are on the disk under temporary names.
 
-    A reader sees the old file or the new one, never half of it. A symbolic link is replaced by the
-    file; what it led to stays as it is. If one cannot be written, what was there stays; the OSError
-    has its name.
+    A reader gets the old file or the new one, never a part. Text is written in UTF-8. A symbolic
+    link is replaced by the file; the target of the link stays as it is.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written; the error has its name. The old files stay.
     """
     temporaries = {
         path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}") for path in contents

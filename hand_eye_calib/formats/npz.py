@@ -1,4 +1,4 @@
-"""Arrays in ``.npz`` files, of a size that is looked at before memory is allocated."""
+"""Arrays in ``.npz`` files. Their size is checked before memory is allocated."""
 
 import math
 import zipfile
@@ -12,7 +12,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.formats.files import LARGEST_ARRAYS, open_regular
 
-# What damaged archives and arrays raise.
+# Errors of numpy and zipfile for damaged archives and arrays.
 _NO_ARRAYS = (
     OSError,
     ValueError,
@@ -28,13 +28,13 @@ _NO_ARRAYS = (
 
 
 def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` by their names.
+    """Return the arrays of an ``.npz`` file by their names.
 
     Raises
     ------
     InputError
-        If that is not possible, or the arrays take more than ``largest`` bytes, whatever the size
-        of the file: zeros compress to a thousandth.
+        If the file cannot be read, or the arrays take more than ``largest`` bytes. The size of the
+        file is no limit, because zeros compress to a thousandth.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -55,7 +55,7 @@ def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np
 
 
 def _check_array_size(member: IO[bytes], size: int) -> None:
-    """Raise a ValueError if an array claims more bytes than its file has."""
+    """Raise a ValueError if an array states more bytes than its file has."""
     version = np.lib.format.read_magic(member)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,

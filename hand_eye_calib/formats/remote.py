@@ -1,7 +1,7 @@
-"""Bags in object storage and on web servers: whatever fsspec reaches, such as
-``s3://bucket/run_1``, ``gs://...``, ``https://host/run_1.mcap``.
+"""Bags in object storage and on web servers.
 
-A bag is copied by fsspec to a temporary folder, read there, and the copy removed.
+The package fsspec reaches them, such as ``s3://bucket/run_1``, ``gs://...`` and
+``https://host/run_1.mcap``. It copies a bag to a temporary folder. The copy is read and removed.
 """
 
 import json
@@ -21,19 +21,19 @@ from hand_eye_calib.core.base.errors import (
 
 AsGiven = Callable[[Any], Any]
 
-# Files of a bag, as their names end.
+# Ends of the names of a bag's files.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
-# Files beside a .db3 that hold its newest messages if its recorder was killed.
-_BESIDE = (".db3-wal", ".db3-journal")
+# Ends of files with the newest messages of a .db3 whose recorder was killed.
+_JOURNALS = (".db3-wal", ".db3-journal")
 
 
 def is_url(path: object) -> bool:
-    """Whether a bag is named by a URL rather than a path."""
+    """Whether a bag's name is a URL rather than a path."""
     return "://" in str(path)
 
 
 def public(url: str) -> str:
-    """A URL without what gives access: user, password and query; a path stays as it is."""
+    """Return a URL without user, password and query, which are secret; a path stays as it is."""
     if not is_url(url):
         return url
     protocol, mark, rest = url.partition("?")[0].partition("://")
@@ -42,19 +42,30 @@ def public(url: str) -> str:
 
 
 def expanded(pattern: str) -> list[str]:
-    """URLs that a pattern with ``*`` stands for, sorted. Raises as :func:`local_copies`."""
+    """Return the URLs that match a pattern with ``*``, sorted. Raises as :func:`local_copies`."""
     with _reached(pattern) as (system, path):
-        return sorted(system.unstrip_protocol(found) for found in system.glob(path.rstrip("/")))
+        return sorted(system.unstrip_protocol(name) for name in system.glob(path.rstrip("/")))
 
 
 @contextmanager
 def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
-    """Copy remote bags to this machine for as long as the block lasts.
+    """Copy remote bags to this machine while the block runs.
 
-    Yields the paths on this machine, and a function that puts the URLs back into plain values that
-    name the copies; errors that are raised in the block name the URLs. An InputError if a store
-    cannot be reached, there is no bag, or it would fill more than half of the disk; a
-    MissingDependencyError if a package that the store needs is not installed.
+    Errors that are raised in the block name the URLs.
+
+    Yields
+    ------
+    paths : list of path-like
+        Paths on this machine.
+    as_given : callable
+        Replaces the paths of the copies in plain values by the URLs.
+
+    Raises
+    ------
+    InputError
+        If a store cannot be reached, has no bag, or the bag would fill more than half of the disk.
+    MissingDependencyError
+        If a package that the store needs is not installed.
     """
     if not any(map(is_url, paths)):
         yield [*paths], lambda value: value
@@ -80,46 +91,48 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
 
 
 def _copied(url: str, folder: Path) -> Path:
-    """Copy the files of a bag into a new folder; returns where it is."""
+    """Copy the files of a bag into a new folder, and return the path of the bag."""
     folder.mkdir()
     with _reached(url) as (system, path):
         is_file = _name(path).endswith(_SUFFIXES)
-        found = _file_and_beside(system, path) if is_file else system.ls(path, detail=True)
-        names = (*_SUFFIXES, *_BESIDE)
-        files = [about for about in found if _name(about["name"]).endswith(names)]
+        entries = _entries_of_file(system, path) if is_file else system.ls(path, detail=True)
+        suffixes = (*_SUFFIXES, *_JOURNALS)
+        files = [entry for entry in entries if _name(entry["name"]).endswith(suffixes)]
         if not files:
             raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
-        # Half of the free space is left to the copies of other processes.
+        # Other processes need the other half of the free space for their copies.
         largest = shutil.disk_usage(folder).free // 2
-        if sum(about.get("size") or 0 for about in files) > largest:
+        if sum(entry.get("size") or 0 for entry in files) > largest:
             raise InputError(
                 f"it is larger than {largest / 1e9:.3g} GB, half of the free space of "
                 f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
             )
-        for about in files:
-            # The name's last part only: a store does not choose where things go.
-            system.get_file(about["name"], str(folder / _name(about["name"])))
+        for entry in files:
+            # Only the last part of the name: a store must not choose the folder.
+            system.get_file(entry["name"], str(folder / _name(entry["name"])))
         return folder / _name(path) if is_file else folder
 
 
-def _file_and_beside(system: Any, path: str) -> list[dict[str, Any]]:
-    """Return what a store says of a file, and of those beside it that belong to it."""
+def _entries_of_file(system: Any, path: str) -> list[dict[str, Any]]:
+    """Return the entries of a file in a store, and of the journals that belong to it."""
     paths = [path]
     if path.endswith(".db3"):
-        beside = [path.removesuffix(".db3") + suffix for suffix in _BESIDE]
-        paths += [name for name in beside if system.exists(name)]
+        journals = [path.removesuffix(".db3") + suffix for suffix in _JOURNALS]
+        paths += [journal for journal in journals if system.exists(journal)]
     return [system.info(name) | {"name": name} for name in paths]
 
 
 def _name(path: str) -> str:
-    """Last part of a path, without the query of a URL."""
+    """Return the last part of a path, without the query of a URL."""
     return PurePosixPath(path.partition("?")[0]).name
 
 
 @contextmanager
 def _reached(url: str) -> Iterator[tuple[Any, str]]:
-    """The file system of a URL, and the path in it. Whatever a store answers becomes one line: each
-    kind has errors of its own, and only code of fsspec runs inside.
+    """Yield the file system of a URL, and the path in it.
+
+    Every error in the block becomes an InputError of one line: each kind of store has errors of its
+    own, and only code of fsspec runs in the block.
     """
     try:
         from fsspec.core import url_to_fs

@@ -1,8 +1,8 @@
 """YAML of unknown origin, read within limits.
 
 Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. Values are
-those of JSON: dates are read as text, other tags of YAML are refused, and so are keys that appear
-twice, aliases, and documents that are too large or too deep; all in one line.
+those of JSON: a date is read as text. Other tags of YAML, repeated keys, aliases, and documents
+that are too large or too deep are refused, with an error of one line.
 """
 
 import re
@@ -23,17 +23,17 @@ from hand_eye_calib.formats.files import (
     read_text,
 )
 
-# Characters of a whole number: 64 binary digits, with signs between them.
+# Characters of the longest whole number: 64 binary digits, with signs between them.
 _LONGEST_INT = 100
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
-# libyaml is several times as fast, and part of most builds.
+# The loader of libyaml is several times as fast, and is part of most builds.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
 
 
 class _Loader(_Base):
-    """YAML's safe loader for the values of JSON alone."""
+    """Safe loader of YAML, restricted to the values of JSON."""
 
     # Without dates, 2024-13-45 is a text like any other.
     yaml_implicit_resolvers: ClassVar = {
@@ -47,17 +47,20 @@ class _Loader(_Base):
     }
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
+        names = set()
         for key, _ in node.value:
-            if (name := str(key.value)) in seen:
+            if (name := str(key.value)) in names:
                 line = key.start_mark.line + 1
                 raise ValueError(f"the key {name[:40]!r} appears twice, line {line}")
-            seen.add(name)
+            names.add(name)
         return super().construct_mapping(node, deep)
 
 
 def _whole_number(loader: Any, node: Any) -> int:
-    """Return a whole number, of any base: ``0xff...`` of any length would be one, too."""
+    """Return a whole number in any base.
+
+    Its text is checked first: ``0xff...`` of any length would be a whole number, too.
+    """
     is_short = len(node.value) <= _LONGEST_INT
     number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
     if abs(number) >= LARGEST_INT:
@@ -69,28 +72,38 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 
 
 def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
-    """Read a YAML file; ``expected`` is what an error says that it should be. An InputError if it
-    cannot be read, is not YAML or exceeds a limit.
+    """Read a YAML file.
+
+    Parameters
+    ----------
+    path : str or path-like
+    expected : str
+        Description of the file for errors.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is not YAML or exceeds a limit.
     """
     text = read_text(path, expected, LARGEST_YAML)
-    # Comments of JSON, header and tag of OpenCV.
+    # Remove comments of JSON, and the header and tag of OpenCV.
     text = re.sub(r"^%YAML.*|^[ \t]*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
     try:
         _check_events(text)
         return yaml.load(text, Loader=_Loader)
-    # A loader raises nearly anything at values that are not what their tags say.
+    # A loader raises errors of many kinds for values that do not fit their tags.
     except Exception as error:
         reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
         raise InputError(f"{path} is not YAML that can be read: {reason}") from None
 
 
 def yaml_text(document: Any) -> str:
-    """Values of any kind as a YAML file for programs and people."""
+    """Return a document of any values as YAML for programs and people."""
     return str(_dump(plain(document), default_flow_style=None, width=120, allow_unicode=True))
 
 
 def _check_events(text: str) -> None:
-    """Refuse what is too deep, and aliases, before anything is built from it."""
+    """Raise a ValueError for aliases and deep nesting, before any value is made."""
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent)

@@ -3,6 +3,6 @@ programs (``foreign.py``).
 
 A file becomes a table of numbers, and the table becomes poses. Lengths are in metres if the header
 names no other unit. The units of stamps and of angles are recognised from their size. The order of
-a quaternion's coefficients is the format's or is named. Only with ``auto`` is it judged by the
-motion, and what was found is said.
+a quaternion's coefficients is that of the format or of the names. It is recognised by the motion
+only with the format ``auto``, and the user is notified.
 """

@@ -1,9 +1,11 @@
-"""Reading trajectories: TUM, KITTI, EuRoC, tables with named columns, files of other programs
-(``foreign.py``), bags, and numbers in memory.
+"""Reading of trajectories from files, bags and numbers in memory.
+
+Files are in the formats TUM, KITTI or EuRoC, tables with named columns, or files of other programs
+(``foreign.py``).
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -47,7 +49,7 @@ from hand_eye_calib.formats.trajectory_files.table import Table, table_of_object
 #: The format that the lines look like.
 AUTO = "auto"
 
-# Of the formats whose columns have an order: their names, and what a row is.
+# Columns of the formats whose columns have an order, and the description of a row.
 _FORMATS: dict[str, tuple[Sequence[str], str]] = {
     "tum": (TUM, f"8 numbers, {TUM_COLUMNS}"),
     "kitti": (MATRIX, "12 numbers, the first three rows of a pose"),
@@ -60,21 +62,32 @@ _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
+# Name of a file of stamps beside a file of poses.
 _TIMES = "times.txt"
-# Letters and signs of Latin-1 that headers have, and characters of ASCII.
+# Letters and signs of Latin-1 that headers have.
 _LATIN_1 = [bytes([code]) for code in (0xB0, 0xB2, 0xB5, *range(0xC0, 0x100))]
+# Characters of ASCII that texts have.
 _ASCII = bytes([*b"\t\n\r", *range(32, 127)])
-# A text has at most this share of them.
+# Largest share of Latin-1 letters in a text.
 _FEW_LETTERS = 0.05
-# Time between poses that are paired without stamps.
+# Time (ns) between poses that are paired without stamps.
 _STEP_NS = 100_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """How to read a text file; see :func:`hand_eye_calib.read_trajectory`. ``pair_by`` is of all
-    files that belong together: "time", or "row" or "name" (of images) in place of stamps. A
-    ConfigError for what is not known or does not go together.
+    """Options to read a text file; see :func:`hand_eye_calib.read_trajectory`.
+
+    Attributes
+    ----------
+    pair_by : str
+        "time", or "row" or "name" (of images) to pair poses without stamps. It is the same for all
+        files that belong together.
+
+    Raises
+    ------
+    ConfigError
+        For unknown values, and for options that cannot be combined.
     """
 
     format: str = "tum"
@@ -86,23 +99,34 @@ class FileOptions:
     pair_by: str = PAIR_BY[0]
 
     def __post_init__(self) -> None:
-        for what, given, known in (
-            ("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,)),
-            ("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO)),
-        ):
-            if given not in known:
-                raise ConfigError(f"unknown {what} {given!r}; known are {', '.join(known)}")
-        for value, of, what in (
-            (self.columns, "csv", "columns are named for"),
-            (self.times, "kitti", "a file of times belongs to"),
-        ):
-            if value is not None and self.format not in (of, AUTO):
-                raise ConfigError(f"{what} format {of} only; the format is {self.format}")
+        _refuse_unknown("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,))
+        _refuse_unknown("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO))
+        text = ""
+        if self.columns is not None and self.format not in ("csv", AUTO):
+            text = "columns are named for format csv only"
+        elif self.times is not None and self.format not in ("kitti", AUTO):
+            text = "a file of times belongs to format kitti only"
+        if text:
+            raise ConfigError(f"{text}; the format is {self.format}")
+
+
+def _refuse_unknown(setting: str, value: str, known: Sequence[str]) -> None:
+    if value not in known:
+        raise ConfigError(f"unknown {setting} {value!r}; known are {', '.join(known)}")
 
 
 class FileReading(NamedTuple):
-    """A trajectory; what was wrong with the file and was repaired; what the file does not say and
-    had to be found or assumed; and what a result has to be warned of.
+    """Trajectory of a file, with notes for the user.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+    repairs : list of str
+        Notes on faults of the file that were repaired.
+    guesses : list of str
+        Notes on what the file does not state and was recognised or assumed.
+    warnings : list of str
+        Warnings that belong to a result.
     """
 
     trajectory: Trajectory
@@ -122,50 +146,50 @@ def read_trajectory(
     repair: bool = False,
     measures: str = "auto",
 ) -> Trajectory:
-    """Read a trajectory from a text file, from a bag if ``topic`` is given, or from numbers in
-    memory.
+    """Read a trajectory from a text file, a bag or numbers in memory.
 
     Parameters
     ----------
     source : str, path-like or object
-        A file or a bag; or matrices (N, 4, 4) with ``times``, rows (N, 8) of t, x, y, z, qx, qy,
-        qz, qw or (N, 7) without t, or a pandas DataFrame with columns named as in csv files.
+        A file, or a bag if ``topic`` is given; or matrices (N, 4, 4) with ``times``, rows (N, 8)
+        of t, x, y, z, qx, qy, qz, qw or (N, 7) without t, or a pandas DataFrame with columns named
+        as in csv files.
     format : str
-        "tum", "kitti", "euroc", "csv", or "auto" for what the file looks like.
+        "tum", "kitti", "euroc", "csv", or "auto" for the format that the file looks like.
     topic : str, optional
-        Of a bag: the topic of the poses; or two frames, ``world:sensor``, whose transform is the
-        trajectory, from ``/tf`` and ``/tf_static``. Only ``measures`` can be combined with it.
+        Topic of the poses in a bag; or two frames, ``world:sensor``, whose transform in ``/tf``
+        and ``/tf_static`` is the trajectory. Only ``measures`` can be combined with a topic.
     columns : str, optional
-        For csv without a header: the columns' names, such as
-        ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Other
-        names are columns to skip.
+        Names of the columns of a csv file without a header, such as
+        ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Columns
+        with other names are skipped.
     times : str, path-like or (N,) array-like, optional
-        For kitti: the file of the stamps. For an object: the stamps, as seconds, whole numbers
-        or datetimes.
+        File of the stamps, for kitti. Stamps as seconds, whole numbers or datetimes, for an
+        object.
     stamp_unit : str, optional
-        "s", "ms", "us" or "ns"; if left out, recognised from the stamps' size or taken from the
-        header (``timestamp [ns]``).
+        "s", "ms", "us" or "ns". By default the unit is that of the header (``timestamp [ns]``), or
+        is recognised from the size of the stamps.
     measures : str
-        What to read: "poses", or only "positions", "rotations" or angular "rates"; "auto" for what
-        the columns are, and of a bag for what the messages are.
+        Kind of data to read: "poses", or only "positions", "rotations" or angular "rates"; "auto"
+        for the kind that the columns of a file or the messages of a bag have.
     repair : bool
-        Sort poses that are out of order and drop those with a stamp that is there already, with a
-        ``UserWarning`` that says how many; otherwise they are an error.
+        Sort poses that are out of order, and drop poses with a stamp that is there already. A
+        ``UserWarning`` has their number. Otherwise they are an error.
 
     Returns
     -------
     Trajectory
-        Stamps are exactly the decimal numbers of the file, in nanoseconds; frame names are empty,
-        from a bag those of the messages. Latitude and longitude become metres east and north of
-        the first position. What had to be guessed is a ``UserWarning``.
+        Stamps are exactly the decimal numbers of the file, in nanoseconds. Frame names are those of
+        the messages of a bag, and empty otherwise. Latitude and longitude become metres east and
+        north of the first position. A ``UserWarning`` reports a guess.
 
     Raises
     ------
     InputError
-        If the file cannot be read or a line cannot be used; the message names file, line and what
-        was found.
+        If the file or one of its lines cannot be read. The message has the file, the line and its
+        content.
     ConfigError
-        For a format or unit that is not known, and options that do not go together.
+        For an unknown format or unit, and for options that cannot be combined.
 
     Examples
     --------
@@ -175,17 +199,19 @@ def read_trajectory(
     >>> hec.read_trajectory(rows)
     Trajectory(2 poses over 0.100 s)
     """
-    path = Path(source) if isinstance(source, str | PathLike) else None
-    file_of_times = Path(times) if isinstance(times, str | PathLike) else None
-    is_named = format not in (FileOptions.format, AUTO)
-    has_options = is_named or columns is not None or file_of_times is not None
     if isinstance(source, Trajectory):
         return source
+    path = Path(source) if isinstance(source, str | PathLike) else None
+    file_of_times = Path(times) if isinstance(times, str | PathLike) else None
+    has_times_in_memory = times is not None and not file_of_times
+    is_format_named = format not in (FileOptions.format, AUTO)
+    has_file_options = is_format_named or columns is not None or file_of_times is not None
     if topic:
-        if has_options or times is not None or stamp_unit or repair or not path:
+        has_options = any([has_file_options, has_times_in_memory, stamp_unit, repair])
+        if has_options or not path:
             raise ConfigError("topic is for bags and cannot be combined with options of text files")
         return _of_bag(path, topic, measures)
-    if (has_options and not path) or (path and times is not None and not file_of_times):
+    if has_times_in_memory if path else has_file_options:
         raise ConfigError(
             "format, columns and a file of times are for text files, other times for objects"
         )
@@ -198,13 +224,19 @@ def read_trajectory(
         measures=measures,
     )
     table = read_table(path, options) if path else table_of_object(source, times)
-    trajectory, repairs, guesses, doubts = _read(table, options)
-    for text in [*guesses, *repairs, *doubts]:
-        warnings.warn(text, UserWarning, stacklevel=2)
-    return trajectory
+    reading = _read(table, options)
+    _warn_of(reading)
+    return reading.trajectory
+
+
+def _warn_of(reading: FileReading) -> None:
+    """Warn the user of the caller."""
+    for text in (*reading.guesses, *reading.repairs, *reading.warnings):
+        warnings.warn(text, UserWarning, stacklevel=3)
 
 
 def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
+    """Return the trajectory of a topic or of two frames, and warn the user of the caller."""
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
 
@@ -216,83 +248,128 @@ def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
 
 
 def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
-    """Read text files that belong together, with sensors named after the files: those with the same
-    columns, which come from one exporter, by one convention of their angles. An InputError if a
-    file cannot be read, or no convention fits the motion of all with the same columns.
+    """Read text files that belong together, with sensors named after the files.
+
+    Files with the same columns come from one program, and so their angles have one convention.
+
+    Parameters
+    ----------
+    files : sequence of (Path, FileOptions)
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, or no convention fits the motion of all files with the same
+        columns.
     """
-    tables = [read_table(*each) for each in files]
-    pairs: Sequence[IntArray | None] = [None] * len(files)
-    if files[0][1].pair_by != PAIR_BY[0]:
-        pairs = _pairs(tables, files[0][1].pair_by)
-    read = [
+    tables = [read_table(path, options) for path, options in files]
+    rows_of_tables: Sequence[IntArray | None] = [None] * len(files)
+    pair_by = files[0][1].pair_by
+    if pair_by != PAIR_BY[0]:
+        rows_of_tables = _rows_without_stamps(tables, pair_by)
+    readings = [
         _read(table, options, rows)
-        for (_, options), table, rows in zip(files, tables, pairs, strict=True)
+        for (_, options), table, rows in zip(files, tables, rows_of_tables, strict=True)
     ]
-    for header in {table.names for table in tables if table.conventions}:
-        of_one = [k for k, table in enumerate(tables) if table.names == header]
-        conventions = [tables[k].conventions for k in of_one]
-        common = [way for way in conventions[0] if all(way in each for each in conventions)]
+    for number, convention in _other_conventions(tables).items():
+        path, options = files[number]
+        # A new table, because the notes of the first one are about its own convention.
+        table = read_table(path, options)
+        readings[number] = _read(table, options, rows_of_tables[number], convention)
+    names = _sensor_names([path for path, _ in files])
+    return [
+        reading._replace(trajectory=replace(reading.trajectory, sensor_frame=name))
+        for reading, name in zip(readings, names, strict=True)
+    ]
+
+
+def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
+    """Return the common convention of angles for each table that was read with another one.
+
+    Raises
+    ------
+    InputError
+        If tables with the same columns have no common convention.
+    """
+    conventions = {}
+    for names in {table.names for table in tables if table.conventions}:
+        numbers = [number for number, table in enumerate(tables) if table.names == names]
+        common = tables[numbers[0]].conventions
+        for number in numbers:
+            common = [way for way in common if way in tables[number].conventions]
         if not common:
             raise InputError(
-                f"{' and '.join(str(files[k][0]) for k in of_one)} have the same columns, but no "
-                "convention of their angles fits the motion of all; write quaternions instead, or "
-                "name the column of one yaw (counterclockwise) and of the other heading (clockwise "
-                "from north) if that is what they are"
+                f"{' and '.join(str(tables[number].path) for number in numbers)} have the same "
+                "columns, but no convention of their angles fits the motion of all; write "
+                "quaternions instead, or name the column of one yaw (counterclockwise) and of the "
+                "other heading (clockwise from north) if that is what they are"
             )
-        for k in of_one:
-            if tables[k].conventions[0] != common[0]:
-                read[k] = _read(read_table(*files[k]), files[k][1], pairs[k], common[0])
-    names = [path.stem for path, _ in files]
+        for number in numbers:
+            if tables[number].conventions[0] != common[0]:
+                conventions[number] = common[0]
+    return conventions
+
+
+def _sensor_names(paths: Sequence[Path]) -> list[str]:
+    """Return different names of sensors, from the names of files; empty for equal files."""
+    names = [path.stem for path in paths]
     if len({*names}) < len(names):
-        names = told_apart([str(path.with_suffix("")) for path, _ in files])
-    names = names if len({*names}) == len(names) else [""] * len(names)
-    return [
-        each._replace(trajectory=replace(each.trajectory, sensor_frame=name))
-        for each, name in zip(read, names, strict=True)
-    ]
+        names = told_apart([str(path.with_suffix("")) for path in paths])
+    return names if len({*names}) == len(names) else [""] * len(names)
 
 
 def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
-    """Trajectories that belong together from whatever each is: files as they look like, with
-    warnings as of :func:`read_trajectory`.
+    """Read trajectories that belong together, with warnings as of :func:`read_trajectory`.
+
+    Files are read in the format that they look like.
     """
-    paths = [Path(each) for each in sources if isinstance(each, str | PathLike)]
+    paths = [Path(source) for source in sources if isinstance(source, str | PathLike)]
     if len(paths) < len(sources):
-        return [read_trajectory(each, AUTO) for each in sources]
+        return [read_trajectory(source, AUTO) for source in sources]
     readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])
     for reading in readings:
-        for text in [*reading.repairs, *reading.guesses, *reading.warnings]:
-            warnings.warn(text, UserWarning, stacklevel=3)
+        _warn_of(reading)
     return [reading.trajectory for reading in readings]
 
 
-def _pairs(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
-    """The rows of each table that belong to those of the others, without their stamps; a row
-    without a pose is left out of all.
+def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
+    """Return the rows of each table that belong together, paired by "row" or by "name" of image.
+
+    A row without a pose is skipped in all tables.
     """
-    counts = [table.n_rows for table in tables]
-    if pair_by == "row" and len({*counts}) > 1:
-        raise InputError(f"to be paired by row, files need as many poses each; found {counts}")
-    keys: list[list[Any]] = [
-        [*table.images] if pair_by == "name" else [*table.rows] for table in tables
+    n_rows = [table.n_rows for table in tables]
+    if pair_by == "row" and len({*n_rows}) > 1:
+        raise InputError(f"to be paired by row, files need as many poses each; found {n_rows}")
+    keys: list[Sequence[Any]] = [
+        table.images if pair_by == "name" else table.rows for table in tables
     ]
-    common = sorted(set.intersection(*map(set, keys)))
+    places = [{key: place for place, key in enumerate(keys_of)} for keys_of in keys]
+    common = sorted(set.intersection(*map(set, places)))
     if not common:
-        named = [len(each) for each in keys]
+        n_names = [len(keys_of) for keys_of in keys]
         raise InputError(
-            f"no image has a name that is in all files; found {named} names; pair by time or row"
+            f"no image has a name that is in all files; found {n_names} names; pair by time or row"
         )
-    places = [{key: row for row, key in enumerate(each)} for each in keys]
-    return [np.array([place[key] for key in common]) for place in places]
+    return [np.array([place_of[key] for key in common]) for place_of in places]
 
 
 def _read(
     table: Table, options: FileOptions, rows: IntArray | None = None, convention: str = ""
 ) -> FileReading:
-    """The trajectory of a table, or of some of its rows in place of its stamps."""
+    """Return the trajectory of a table.
+
+    Parameters
+    ----------
+    table : Table
+    options : FileOptions
+    rows : (N,) array of int, optional
+        Rows to use, at regular stamps of their own.
+    convention : str, optional
+        Convention of the table's angles; by default it is recognised by the motion.
+    """
     if not table.line_numbers:
-        raise InputError(f"{table.path}: no poses in it{_all_left_out(table)}")
-    repairs, doubts = _left_out(table)
+        raise InputError(f"{table.path}: no poses in it{_why_no_poses(table)}")
+    repairs, doubts = _notes_on_left_out(table)
     if rows is None:
         stamps_ns = stamps_in_ns(table, options.stamp_unit)
         refuse_coarse(table, stamps_ns, table.values())
@@ -302,20 +379,22 @@ def _read(
         stamps_ns[rows] = np.arange(len(rows)) * _STEP_NS
     values = poses_of(table, convention)
     if (np.diff(stamps_ns[rows]) <= 0).any():
-        rows, of_stamps = in_order(table, stamps_ns, options.repair)
-        repairs += of_stamps
-    builders: dict[str, Callable[..., Trajectory]] = {"rates": Trajectory.from_rates}
-    build = builders.get(table.measures, Trajectory.from_quat_xyzw)
-    trajectory = build(stamps_ns[rows], *(columns[rows] for columns in values))
+        rows, stamp_repairs = in_order(table, stamps_ns, options.repair)
+        repairs += stamp_repairs
+    if table.measures == "rates":
+        trajectory = Trajectory.from_rates(stamps_ns[rows], values[0][rows])
+    else:
+        positions, quats_xyzw = values
+        trajectory = Trajectory.from_quat_xyzw(stamps_ns[rows], positions[rows], quats_xyzw[rows])
     if table.measures not in ("poses", "rates"):
         table.guess(f"{table.measures} alone, as its columns have it")
-    kind = table.measures if options.measures == AUTO else options.measures
-    if kind != "poses":
-        trajectory = replace(trajectory, measures=kind)
+    measures = table.measures if options.measures == AUTO else options.measures
+    if measures != "poses":
+        trajectory = replace(trajectory, measures=measures)
     return FileReading(trajectory, repairs, table.guesses, doubts)
 
 
-def _all_left_out(table: Table) -> str:
+def _why_no_poses(table: Table) -> str:
     if not table.n_rows:
         return f"; expected lines of {table.expected}"
     return (
@@ -324,8 +403,8 @@ def _all_left_out(table: Table) -> str:
     )
 
 
-def _left_out(table: Table) -> tuple[list[str], list[str]]:
-    """What was repaired by leaving out rows without a pose, or a warning if they are many."""
+def _notes_on_left_out(table: Table) -> tuple[list[str], list[str]]:
+    """Return notes on the rows without a pose: as a repair if they are few, else as a warning."""
     if not table.n_left_out:
         return [], []
     counts = without_poses(table.n_left_out, table.n_rows)
@@ -339,8 +418,12 @@ def _left_out(table: Table) -> tuple[list[str], list[str]]:
 
 
 def read_table(path: str | Path, options: FileOptions) -> Table:
-    """The rows of a file in its format, or in the one that it looks like; an InputError if it
-    cannot be read, a line cannot be used, or columns have no names.
+    """Return the rows of a file, in the format of the options or the one that it looks like.
+
+    Raises
+    ------
+    InputError
+        If the file or one of its lines cannot be read, or its columns have no names.
     """
     data = read_bytes(path)
     for read in FILE_READERS.values():
@@ -350,14 +433,14 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
     needs_names = not options.columns and options.format in (AUTO, "csv")
     layout = layout_of(path, text, needs_names)
+    guesses = []
     if options.format != AUTO or options.columns or options.times:
-        layout = _as_given(layout, options)
-        guesses = []
+        layout = _with_options(layout, options)
     else:
-        guesses = [f"{path}{text}" for text in _guesses_of(layout)]
+        guesses = [f"{path}{guess}" for guess in _guesses_of(layout)]
     table = _empty_table(path, layout, options)
     table.guesses = guesses
-    if layout.row:  # a file without data is not gone through again
+    if layout.row:  # a file without rows needs no second pass
         table.fill(lines_of(path, text, layout.rows_after), layout.cells_of)
         stamp_cells = [layout.row[place] for place in table.stamp_at if place < len(layout.row)]
         for note in notes_on_stamps(table.stamp_names, stamp_cells):
@@ -367,22 +450,25 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
 
 
 def _in_utf8(data: bytes) -> bytes:
-    """A text as it is, or in UTF-8 if it is in UTF-16 or has some letters of Latin-1, such as °."""
+    """Return a text in UTF-8 if it is in UTF-16 or has some letters of Latin-1, such as °.
+
+    Other data is returned as it is.
+    """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         with suppress(UnicodeDecodeError):
             return data.decode("utf-16").encode()
     try:
         data.decode()
     except UnicodeDecodeError:
-        n_other = sum(data.count(letter) for letter in _LATIN_1)
-        n_odd = len(data.translate(None, _ASCII)) - n_other
-        if n_odd == 0 and n_other < _FEW_LETTERS * len(data):
+        n_latin = sum(data.count(letter) for letter in _LATIN_1)
+        n_other = len(data.translate(None, _ASCII)) - n_latin
+        if n_other == 0 and n_latin < _FEW_LETTERS * len(data):
             return data.decode("latin-1").encode()
     return data
 
 
-def _as_given(layout: Layout, options: FileOptions) -> Layout:
-    """The layout with the format and columns that options name."""
+def _with_options(layout: Layout, options: FileOptions) -> Layout:
+    """Return the layout with the format and columns of the options."""
     if options.columns:
         names = tuple(name.strip() for name in options.columns.split(","))
         return replace(layout, format="csv", columns=names, is_transposable=False)
@@ -391,13 +477,13 @@ def _as_given(layout: Layout, options: FileOptions) -> Layout:
     if options.format != AUTO:
         columns = tuple(_FORMATS[options.format][0])
         return replace(layout, format=options.format, columns=columns, is_transposable=False)
-    has_own_stamps = layout.columns is None or stamp_columns(named_columns(layout.columns)[0])
     # The file of times is for poses without stamps.
+    has_own_stamps = layout.columns is None or stamp_columns(named_columns(layout.columns)[0])
     return replace(layout, format="kitti", columns=MATRIX) if has_own_stamps else layout
 
 
 def _guesses_of(layout: Layout) -> list[str]:
-    """What a person should know of a layout that no option names."""
+    """Return notes for the user on a layout that no option names."""
     if layout.format == "tum":
         return []
     order = ", qw qx qy qz" if layout.format == "euroc" else ""
@@ -413,7 +499,7 @@ def _guesses_of(layout: Layout) -> list[str]:
 
 
 def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Table:
-    """The table that the rows of a layout go into."""
+    """Return the table for the rows of a layout."""
     n_columns = len(layout.row)
     columns = layout.columns
     if columns is None and n_columns:
@@ -431,23 +517,24 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
 
 
 def _add_times(table: Table, options: FileOptions) -> None:
-    """Add stamps from a file of their own to poses without any: that of an option, or times.txt in
-    the same folder.
+    """Add stamps to poses without stamps, from the file of an option or from times.txt.
+
+    The file times.txt is in the same folder as the poses.
     """
+    if table.stamp_at:
+        return
     times = options.times
+    path = Path(str(table.path)).with_name(_TIMES)
     is_auto = options.format == AUTO and not options.columns
-    beside = Path(str(table.path)).with_name(_TIMES)
-    if times is None and is_auto and not table.stamp_at and beside.is_file():
-        times = beside
-        table.guesses.append(
-            f"{table.path}: stamps read from {beside}; to change that, give `times`"
-        )
-    if times is not None and not table.stamp_at:
+    if times is None and is_auto and path.is_file():
+        times = path
+        table.guess(f"stamps read from {path}; to change that, give `times`")
+    if times is not None:
         table.stamps = _stamps_of(times, table)
 
 
 def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
-    """The stamps of poses from a file of their own."""
+    """Return the stamps of poses from a file of stamps."""
     lines = lines_of(times, read_text(times, "stamps"), after=0)
     table = Table(times, ["t"], "stamps", "a stamp")
     table.fill(lines, lambda text: text.split()[:1])

@@ -222,7 +222,7 @@ class Table:
         if self._turn_at:
             is_pose &= values[:, self._turn_at].any(axis=1)
         if stamps is not None:
-            is_pose &= [stamp is not None for stamp in stamps]
+            is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
             both = zip(stamps, is_pose, strict=True)
             self.stamps = [stamp for stamp, is_used in both if stamp is not None and is_used]
         rows = np.flatnonzero(is_pose).tolist()
