@@ -7,7 +7,9 @@ import pytest
 from motions import child_of, disturbed, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
+from hand_eye_calib.core.assessment.moved import most_likely
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.noise import estimator
 
 N_POSES = 40
 STAMPS_NS = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(N_POSES)
@@ -168,3 +170,32 @@ def test_equal_stamps(rows, kind):
 def test_stamps_in_reverse_order(kind):
     parent, child = both_poses("any")
     assert_clear_end(kind, STAMPS_NS[::-1].copy(), parent, child)
+
+
+@pytest.fixture
+def singular(monkeypatch):
+    """Let the search of the noise model end in a singular matrix."""
+
+    def fail(problem):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(estimator, "_solved", fail)
+
+
+def test_dnlo_stands_in_if_no_noise_model_fits(singular):
+    parent, child = both_poses("any", sigma=1e-3)
+    result = calibrated("poses", STAMPS_NS, parent, child, checks=False)
+    reason = "auto: dnlo on reference B3, because no noise model fits these poses"
+    assert result.method_reason == reason
+
+
+@pytest.mark.parametrize("options", [{"method": "adaptive"}, {"method": "dnlo"}])
+def test_a_method_that_needs_the_noise_model_says_that_none_fits(singular, options):
+    parent, child = both_poses("any", sigma=1e-3)
+    with pytest.raises(hec.HandEyeCalibError, match="no noise model fits"):
+        calibrated("poses", STAMPS_NS, parent, child, checks=False, **options)
+
+
+def test_a_shift_by_evidence_of_one_direction_is_finite():
+    tables = 1e30 * np.ones((1, 6, 7))
+    assert np.isfinite(most_likely(tables, 1e-3)).all()

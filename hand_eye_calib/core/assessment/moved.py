@@ -126,7 +126,12 @@ def _solve(H: FloatArray, S: FloatArray) -> FloatArray:
     """Return ``H^-1 S`` (..., n) of matrices (..., n, n) and vectors (..., n)."""
     # NumPy 1 takes the columns for vectors unless both arrays have as many dimensions.
     columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[..., None]
-    return np.asarray(np.linalg.solve(H, columns)[..., 0])
+    try:
+        solved = np.linalg.solve(H, columns)
+    except np.linalg.LinAlgError:
+        # Exact poses have so much evidence along some directions that the others are rounding.
+        solved = np.linalg.pinv(H) @ columns
+    return np.asarray(solved[..., 0])
 
 
 def most_likely(tables: FloatArray, ridge: float) -> FloatArray:

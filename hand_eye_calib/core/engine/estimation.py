@@ -22,8 +22,9 @@ from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.text import parse_targets
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise import estimator as adaptive_estimator
-from hand_eye_calib.core.noise.estimator import AdaptiveSolution
+from hand_eye_calib.core.noise.estimator import AdaptiveSolution, NoiseModelError
 from hand_eye_calib.core.noise.increments import SYSTEMATIC
+from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.core.results.records import Residuals
@@ -300,13 +301,21 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         "scale": config.is_known("scale"),
         "time": config.is_known("time_offset") and not is_clock_free,
     }
-    solution = adaptive_estimator.solve(
-        pose_pairs.stamps_ns,
-        pose_pairs.Ts_pw_p,
-        pose_pairs.Ts_cw_c,
-        [name for name in SYSTEMATIC if not known.get(name)],
-        is_clock_free=is_clock_free,
-    )
+    try:
+        solution = adaptive_estimator.solve(
+            pose_pairs.stamps_ns,
+            pose_pairs.Ts_pw_p,
+            pose_pairs.Ts_cw_c,
+            [name for name in SYSTEMATIC if not known.get(name)],
+            is_clock_free=is_clock_free,
+        )
+    except NoiseModelError:
+        if not is_auto:
+            raise
+        reference = TUNING.start_reference
+        dnlo = _solve_pairs(pose_pairs, replace(with_dnlo, reference=reference))
+        reason = f"auto: dnlo on reference {reference}, because no noise model fits these poses"
+        return replace(dnlo, method_reason=reason)
     if not is_auto:
         return _of_model(pose_pairs, config, solution, "")
     if solution.converged and not solution.is_noise_dominated:

@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.base.text import angle, counted, length
 from hand_eye_calib.core.geometry import se3
@@ -65,6 +66,10 @@ PLAIN_SIGMAS = 3.0
 _NOTABLE_JITTER_MS = 0.1
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
+
+
+class NoiseModelError(InputError):
+    """No noise model fits the poses: their matrices are singular to rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,7 +314,7 @@ def solve(
 
     Raises
     ------
-    numpy.linalg.LinAlgError
+    NoiseModelError
         If no noise model fits the poses to rounding.
     """
     problem = Problem(
@@ -319,7 +324,13 @@ def solve(
         without=frozenset(without) | (_SLOW_STAGES if quick else frozenset()),
         tuning=tuning,
     )
-    return _solved(problem)
+    try:
+        return _solved(problem)
+    except np.linalg.LinAlgError:
+        raise NoiseModelError(
+            "no noise model fits these poses: check units, jumps and stamps, or use method dnlo "
+            f"with reference {tuning.start_reference}"
+        ) from None
 
 
 def _solved(problem: Problem) -> AdaptiveSolution:
