@@ -1,4 +1,4 @@
-"""Simulated drives with known truth, and the demo."""
+"""Simulate drives with known truth, and run the demo."""
 
 from typing import Any
 

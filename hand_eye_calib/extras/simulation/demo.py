@@ -1,5 +1,6 @@
-"""``demo``: calibrate one simulated recording from its bag and with the live node, and compare with
-the truth.
+"""Command ``demo``: calibrate a simulated recording from its bag and with the live node.
+
+Both results are compared with the truth.
 """
 
 import argparse
@@ -29,9 +30,10 @@ if TYPE_CHECKING:
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
-# A minute of driving.
+# One minute.
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
 
+# Factor by which the playback is faster than the recording.
 PLAY_SPEED = 20.0
 
 
@@ -47,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo; returns the exit code."""
+    """Run the demo; return the exit code."""
     from hand_eye_calib.extras.simulation.drive import simulate_drive
     from hand_eye_calib.extras.simulation.player import play
     from hand_eye_calib.formats.bags.reader import PoseBag
@@ -61,15 +63,18 @@ def run(arguments: argparse.Namespace) -> int:
         bag_path = arguments.out / "demo_bag"
         if bag_path.is_dir():
             shutil.rmtree(bag_path)
-        streams = zip(TOPICS.values(), (drive.parent, drive.child), strict=True)
-        write_bag(bag_path, {topic: (each, "nav_msgs/msg/Odometry") for topic, each in streams})
+        streams = {
+            TOPICS["parent"]: (drive.parent, "nav_msgs/msg/Odometry"),
+            TOPICS["child"]: (drive.child, "nav_msgs/msg/Odometry"),
+        }
+        write_bag(bag_path, streams)
     note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
     recording = read_recording([bag_path], TOPICS, {})
     offline = recording.snapshot.estimate()
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
-    # Simulated odometry stays away from robots on the network.
+    # Robots on the network must not receive simulated odometry.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # From 102 on the ports overlap with those that Linux gives to clients.
+    # From domain 102 on, the ports overlap with those that Linux assigns to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     node = _node(arguments.out / "node.log")
     with waiting_for("playing"), PoseBag(bag_path) as bag, node as check:
@@ -84,13 +89,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _node(log_path: Path) -> Iterator[Callable[[], None]]:
-    """Run the node in a process of its own; yields a function that raises if it has ended."""
+    """Run the node in its own process; yield a function that raises an error if it has ended."""
     command = [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args"]
     command += ["-p", "solve_period:=1000.0"]  # the player asks for the solve of all poses
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
-        # At this speed best effort might lose messages, and the results of the same messages are
-        # compared.
+        # Best effort may lose messages at this speed, but both results must use the same messages.
         command += ["-p", f"qos_overrides.{topic}.subscription.reliability:=reliable"]
 
     def check() -> None:
@@ -109,13 +113,13 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
             yield check
             process.send_signal(signal.SIGINT)
             if process.wait(10.0) != 0:
-                check()  # says so
+                check()  # raises the error
         finally:
             process.kill()
 
 
 def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> Iterator[str]:
-    """The verdict, each result beside the truth, and how far it is off."""
+    """Yield the verdict, the truth, and both results with their errors."""
     from hand_eye_calib.core.geometry import se3
     from hand_eye_calib.core.geometry.se3 import absolute_errors
 
@@ -125,11 +129,13 @@ def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> 
     truth = drive.T_parent_child
     replayed = offline.T_parent_child
     for title, T in (("truth", truth), ("replay of the bag", replayed), ("live node", live)):
-        metres, radians = absolute_errors(T, truth)
         pose = se3.xyz_rpy(T).tolist()
         position = "".join(f"{value:10.4f}" for value in pose[:3])
         degrees = "".join(f"{math.degrees(value):10.3f}" for value in pose[3:])
-        off = f"off by {length(metres)} and {angle(radians)}" * (T is not truth)
-        yield f"  {title:<24}{position}{'':10}{degrees}  {off}".rstrip()
+        line = f"  {title:<24}{position}{'':10}{degrees}"
+        if T is not truth:
+            metres, radians = absolute_errors(T, truth)
+            line += f"  off by {length(metres)} and {angle(radians)}"
+        yield line
     metres, radians = absolute_errors(live, replayed)
     yield f"Offline and live differ by {metres:.1e} m and {math.degrees(radians):.1e} deg"

@@ -1,9 +1,8 @@
-"""A ground vehicle with two sensors drives over hills, and the errors of odometry and SLAM in their
-trajectories (Välimäki et al. 2023, section 4.1).
+"""Simulate a ground vehicle with two sensors on hills, and the errors of odometry and SLAM.
 
-If the article's text and its published trajectories differ, this follows the trajectories: the
-value called sigma^2 is a standard deviation, jumps last until the end, drift affects the child
-sensor only.
+Välimäki et al. 2023, section 4.1. Where the article's text and its published trajectories differ,
+the simulation follows the trajectories: the value called sigma^2 is a standard deviation, jumps
+last until the end, and only the child sensor drifts.
 """
 
 from collections.abc import Sequence
@@ -17,16 +16,15 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, WithArrays
 from hand_eye_calib.extras.simulation import options
 
-# Start of the published drives, heading along x; in units of the surface's arguments.
+# Start of the published drives, heading along x, in units of the surface's arguments.
 _START = np.array([0.0, 0.5])
-
-# Time from their start to the first pose (s), and time for which their first yaw rate is held.
+# Time from the start of the published drives to their first pose (s).
 _LEAD_S = 0.1
+# Duration of the first yaw rate of the published drives (s).
 _FIRST_HOLD_S = 0.4
-
-# Largest offset of the child sensor along each axis of the parent (m), and variance of a jump per
-# axis (m^2).
+# Largest offset of the child sensor along each axis of the parent (m).
 _LARGEST_OFFSET_M = 0.5
+# Variance of a jump along each axis (m^2).
 _JUMP_VARIANCE = 0.02
 
 _NO_NOISE = options.NoiseConfig()
@@ -34,14 +32,14 @@ _NO_NOISE = options.NoiseConfig()
 
 @dataclass(frozen=True, eq=False)
 class SimulatedDrive(WithArrays):
-    """Trajectories as both sensors report them, and the truth.
+    """Trajectories that both sensors report, and the truth.
 
     Attributes
     ----------
     parent, child : Trajectory
         With noise, each sensor in its own world.
     T_parent_child : (4, 4) array
-        The extrinsic.
+        The true extrinsic.
     T_pw_cw : (4, 4) array
         Pose of the child's world in the parent's world.
     """
@@ -101,73 +99,89 @@ def simulate_drive(
     config: options.DriveConfig = options.PUBLISHED_DRIVE,
     noise: options.NoiseConfig = _NO_NOISE,
 ) -> SimulatedDrive:
-    """Simulate one drive: of one seed the same, with any noise, and with the same noise."""
+    """Simulate one drive.
+
+    Parameters
+    ----------
+    seed : int or sequence of int
+        Equal seeds give the same drive with any noise, and the same random numbers of the noise.
+    config : DriveConfig
+    noise : NoiseConfig
+
+    Returns
+    -------
+    SimulatedDrive
+    """
     motion_rng, extrinsic_rng, noise_rng = np.random.default_rng(seed).spawn(3)
     n_child = max(2, round(config.poses * config.child_rate / config.parent_rate))
     parent_times_s = np.arange(config.poses) / config.parent_rate
     child_times_s = config.child_delay + np.arange(n_child) / config.child_rate
-    track = _ground_track(config, motion_rng, _LEAD_S + np.r_[parent_times_s, child_times_s])
-    Ts_pw_p, Ts_pw_p_at_child = np.split(_poses_on_terrain(config, *track), [config.poses])
+    times_s = _LEAD_S + np.r_[parent_times_s, child_times_s]
+    positions, headings = _ground_track(config, motion_rng, times_s)
+    Ts_pw_p = _poses_on_terrain(config, positions, headings)
+    Ts_pw_p_at_child = Ts_pw_p[config.poses :]
+    Ts_pw_p = Ts_pw_p[: config.poses]
     rotation = se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))[:3, :3]
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
     # Euler angles (rad) and translation (m) are differences of two uniform numbers from 0 to 1.
     angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
     T_pw_cw = se3.from_rotation_translation(se3.rotation_from_rpy(angles[::-1]), translation)
-    Ts_pw_p, Ts_cw_c = add_noise(
-        Ts_pw_p, se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child, noise, noise_rng
+    Ts_cw_c = se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child
+    Ts_pw_p, Ts_cw_c = add_noise(Ts_pw_p, Ts_cw_c, noise, noise_rng)
+
+    def trajectory(times_s: FloatArray, Ts_world_sensor: FloatArray, frame: str) -> Trajectory:
+        stamps_ns = round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(np.int64)
+        return Trajectory(stamps_ns, Ts_world_sensor, frame, f"{frame}_odom")
+
+    return SimulatedDrive(
+        trajectory(parent_times_s, Ts_pw_p, config.parent_frame),
+        trajectory(child_times_s, Ts_cw_c, config.child_frame),
+        T_parent_child,
+        T_pw_cw,
     )
-    start_ns = round(config.start_time * 1e9)
-    parent, child = (
-        Trajectory(start_ns + np.round(times_s * 1e9).astype(np.int64), Ts, frame, f"{frame}_odom")
-        for times_s, Ts, frame in (
-            (parent_times_s, Ts_pw_p, config.parent_frame),
-            (child_times_s, Ts_cw_c, config.child_frame),
-        )
-    )
-    return SimulatedDrive(parent, child, T_parent_child, T_pw_cw)
 
 
 def _ground_track(
     config: options.DriveConfig, rng: np.random.Generator, times_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions (N, 2) and headings (N,) along circular arcs, exact at any time since the start;
-    each yaw rate lasts for its hold time.
+    """Return positions (N, 2) and headings (N,) at any times (N,) since the start.
+
+    The track has circular arcs, because each yaw rate lasts for its hold time.
     """
-    holds = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
-    holds[0] = _FIRST_HOLD_S
-    yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds))
-    starts = np.cumsum(holds) - holds
-    headings = np.cumsum(yaw_rates * holds) - yaw_rates * holds
-    arcs = _arc(config.speed, headings, yaw_rates, holds)
+    holds_s = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
+    holds_s[0] = _FIRST_HOLD_S
+    yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds_s))
+    starts_s = np.cumsum(holds_s) - holds_s
+    headings = np.cumsum(yaw_rates * holds_s) - yaw_rates * holds_s
+    arcs = _arc(config.speed, headings, yaw_rates, holds_s)
     corners = _START * config.terrain_scale + (np.cumsum(arcs, axis=0) - arcs)
-    k = np.searchsorted(starts, times_s, side="right") - 1
-    elapsed = times_s - starts[k]
-    positions = corners[k] + _arc(config.speed, headings[k], yaw_rates[k], elapsed)
-    return positions, headings[k] + yaw_rates[k] * elapsed
+    arc = np.searchsorted(starts_s, times_s, side="right") - 1
+    elapsed_s = times_s - starts_s[arc]
+    positions = corners[arc] + _arc(config.speed, headings[arc], yaw_rates[arc], elapsed_s)
+    return positions, headings[arc] + yaw_rates[arc] * elapsed_s
 
 
 def _arc(
-    speed: float, heading: FloatArray, yaw_rate: FloatArray, duration: FloatArray
+    speed: float, heading: FloatArray, yaw_rate: FloatArray, duration_s: FloatArray
 ) -> FloatArray:
-    """Displacements (N, 2) along arcs; the chord has the mean of the headings at both ends."""
-    half_turn = 0.5 * yaw_rate * duration
-    chord = speed * duration * np.sinc(half_turn / np.pi)
-    return np.stack(
-        [chord * np.cos(heading + half_turn), chord * np.sin(heading + half_turn)], axis=-1
-    )
+    """Return displacements (N, 2) along arcs; a chord has the mean heading of both ends."""
+    half_turn = 0.5 * yaw_rate * duration_s
+    chord = speed * duration_s * np.sinc(half_turn / np.pi)
+    direction = heading + half_turn
+    return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
 
 
 def _poses_on_terrain(
     config: options.DriveConfig, positions: FloatArray, headings: FloatArray
 ) -> FloatArray:
-    """Poses (N, 4, 4) of the vehicle on the ground at positions (N, 2) with headings (N,)."""
+    """Return poses (N, 4, 4) of the vehicle at positions (N, 2) with headings (N,)."""
     x, y = positions.T
     z, slope_x, slope_y = surface(config, x, y)
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     if config.attitude == "published":
-        # From a fit to the noise-free poses (to 0.01 rad, heading exactly): yaw is the heading,
+        # Fitted to the noise-free poses: to 0.01 rad, the heading exactly. Yaw is the heading,
         # pitch and roll are the arc sines of x and y of the normal, the matrix is transposed.
         angles = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
         rotations = np.swapaxes(se3.rotation_from_rpy(angles[:, ::-1]), -1, -2)
@@ -180,10 +194,15 @@ def _poses_on_terrain(
 
 
 def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
-    """Height (N,) of the ground, m, and its slopes (N,) along x and y, at places (N,), m.
+    """Return height (N,) of the ground, m, and its slopes (N,) along x and y.
 
-    Its height and scale are metres per unit of :func:`_peaks` and of its arguments; arguments
-    beyond +/- its limit are mirrored back, so that a long drive stays on the hills.
+    Parameters
+    ----------
+    config : DriveConfig
+        Terrain height and scale are metres per unit of :func:`_peaks` and of its arguments.
+        Arguments beyond +/- the limit are mirrored, so that a long drive stays on the hills.
+    x, y : (N,) arrays
+        Places, m.
     """
     height = config.terrain_height
     scale = config.terrain_scale
@@ -196,8 +215,9 @@ def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[
 
 
 def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Height of three hills and three hollows around the origin, flat beyond about 3.5, and its
-    derivatives by x and y; arrays of one shape, no unit.
+    """Return the height of three hills and three hollows, and its derivatives by x and y.
+
+    The arrays have one shape and no unit. The ground is flat beyond about 3.5 from the origin.
     """
     hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
     middle = 10.0 * np.exp(-(x**2) - y**2)
@@ -212,43 +232,59 @@ def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
-    """Triangle wave, equal to its argument within +/- limit, and its slope."""
+    """Return a triangle wave, equal to its argument within +/- limit, and its slope."""
     phase = np.mod(values + limit, 4.0 * limit)
-    falling = phase > 2.0 * limit
-    return np.where(falling, 3.0 * limit - phase, phase - limit), np.where(falling, -1.0, 1.0)
+    is_falling = phase > 2.0 * limit
+    wave = np.where(is_falling, 3.0 * limit - phase, phase - limit)
+    return wave, np.where(is_falling, -1.0, 1.0)
 
 
 def add_noise(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """The trajectories (N, 4, 4) and (M, 4, 4) of both sensors with Gaussian noise, then drift
-    (child only), then jumps. Each kind of noise draws from a stream of its own: a change of one
-    does not change the others.
+    """Add Gaussian noise, then drift (child only), then jumps to both sensors.
+
+    Each kind of noise draws from its own random stream: a change of one kind does not change the
+    others.
+
+    Parameters
+    ----------
+    Ts_pw_p, Ts_cw_c : (N, 4, 4), (M, 4, 4) arrays
+    noise : NoiseConfig
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    (N, 4, 4), (M, 4, 4) arrays
     """
-    gaussian, drift, jumps = rng.spawn(3)
-    Ts_pw_p, Ts_cw_c = (_with_gaussian(Ts, noise, gaussian) for Ts in (Ts_pw_p, Ts_cw_c))
-    # So many metres per metre of each step are added to it, along one axis of the sensor.
-    axis = drift.integers(3)
-    lengths = np.linalg.norm(np.diff(Ts_cw_c[:, :3, 3], axis=0), axis=1)
-    steps = noise.drift * lengths[:, None] * Ts_cw_c[:-1, :3, axis]
+    gaussian_rng, drift_rng, jump_rng = rng.spawn(3)
+    Ts_pw_p = _with_gaussian(Ts_pw_p, noise, gaussian_rng)
+    Ts_cw_c = _with_gaussian(Ts_cw_c, noise, gaussian_rng)
+    # Each step grows by a share of its length along one axis of the sensor.
+    axis = drift_rng.integers(3)
+    lengths_m = np.linalg.norm(np.diff(Ts_cw_c[:, :3, 3], axis=0), axis=1)
+    steps = noise.drift * lengths_m[:, None] * Ts_cw_c[:-1, :3, axis]
     Ts_cw_c[1:, :3, 3] += np.cumsum(steps, axis=0)
-    return _with_jumps(Ts_pw_p, noise.outliers, jumps), _with_jumps(Ts_cw_c, noise.outliers, jumps)
+    Ts_pw_p = _with_jumps(Ts_pw_p, noise.outliers, jump_rng)
+    Ts_cw_c = _with_jumps(Ts_cw_c, noise.outliers, jump_rng)
+    return Ts_pw_p, Ts_cw_c
 
 
 def _with_gaussian(
     Ts_world_sensor: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
 ) -> FloatArray:
-    """Poses (N, 4, 4) with an independent error each, in the frame of the sensor."""
-    shape = len(Ts_world_sensor), 3
+    """Add an independent error to each pose (N, 4, 4), in the frame of the sensor."""
+    shape = (len(Ts_world_sensor), 3)
     angles = noise.gaussian * noise.rotation_per_metre * rng.standard_normal(shape)
     rotations = se3.rotation_from_rpy(angles[:, ::-1])
-    translation = noise.gaussian * rng.standard_normal(shape)
-    return Ts_world_sensor @ se3.from_rotation_translation(rotations, translation)
+    translations = noise.gaussian * rng.standard_normal(shape)
+    return Ts_world_sensor @ se3.from_rotation_translation(rotations, translations)
 
 
 def _with_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
-    """Poses (N, 4, 4) whose rest is shifted along the axes of the world at ``round(share * N)`` of
-    them, drawn with replacement.
+    """Shift the rest of a trajectory (N, 4, 4) along the axes of the world at random poses.
+
+    ``round(share * N)`` poses are drawn with replacement.
     """
     count = len(Ts_world_sensor)
     indices = rng.integers(count, size=round(share * count))

@@ -1,28 +1,34 @@
-"""Options of simulated drives and their noise (Välimäki et al. 2023, section 4.1)."""
+"""Options of simulated drives and of their noise (Välimäki et al. 2023, section 4.1)."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveConfig:
-    """Vehicle, terrain and sensors; all defaults but the attitude are those of the published
-    trajectories.
+    """Vehicle, terrain and sensors.
+
+    All defaults but the attitude are those of the published trajectories.
 
     Attributes
     ----------
     poses : int
-        Of the parent sensor.
+        Number of poses of the parent sensor.
     parent_rate, child_rate : float
         Poses per second, Hz.
-    child_delay, start_time : float
-        From the first pose of the parent to the first of the child; stamp of the former, s.
-    speed, max_yaw_rate, hold_time : float
-        Horizontal, m/s; yaw rates are drawn within +/- this, rad/s, and held so long, s.
+    child_delay : float
+        Time from the first pose of the parent to the first pose of the child, s.
+    start_time : float
+        Stamp of the first pose of the parent, s.
+    speed : float
+        Horizontal, m/s.
+    max_yaw_rate, hold_time : float
+        Yaw rates are drawn within +/- this limit, rad/s, and last this time, s.
     terrain_height, terrain_scale, terrain_limit : float
-        Of the surface, see :func:`~hand_eye_calib.extras.simulation.drive.surface`.
+        See :func:`~hand_eye_calib.extras.simulation.drive.surface`.
     attitude : {"vehicle", "published"}
-        x ahead and z along the normal of the surface; or the orientations of the published
-        trajectories, which no vehicle has (transposed, slopes not rotated with the heading).
+        "vehicle": x ahead and z along the normal of the surface. "published": the orientations of
+        the published trajectories, which no vehicle has (transposed, slopes not rotated with the
+        heading).
     """
 
     poses: int = 100
@@ -41,7 +47,7 @@ class DriveConfig:
     child_frame: str = "child"
 
 
-# Drives of the article, as published.
+# The published drives of the article.
 PUBLISHED_DRIVE = DriveConfig(attitude="published")
 
 # Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of
@@ -62,14 +68,14 @@ HILLY_DRIVE = DriveConfig(
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Level of each kind of noise; the default is none.
+    """Level of each kind of noise. Default: none.
 
     Attributes
     ----------
     gaussian : float
         Standard deviation of each pose's translation error per axis, m (published: 0 to 0.010).
     rotation_per_metre : float
-        That of each pose's Euler angles over it, rad/m.
+        Standard deviation of each pose's Euler angles, divided by that of its translation, rad/m.
     outliers : float
         Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).
     drift : float

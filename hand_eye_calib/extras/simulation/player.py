@@ -1,15 +1,18 @@
-"""Plays poses to a node ``calibrator`` in another process and waits for its answer: the far end of
-the middleware, for ``demo``.
+"""Play poses to a node ``calibrator`` in another process, and wait for its result.
+
+``demo`` uses it as the other side of the middleware.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 import rclpy
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
@@ -20,9 +23,11 @@ from hand_eye_calib.formats.bags.messages import transform_of
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.online.ros.conversions import LATCHED, to_time
 
-# Nothing is lost on the way to a subscription that is reliable too.
+# A reliable subscription receives every message.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+# Longest wait for one callback (s).
 _SPIN_S = 0.02
+# Longest wait for the node (s).
 _PATIENCE_S = 120.0
 
 
@@ -33,20 +38,71 @@ def play(
     until_ns: int,
     check: Callable[[], None],
 ) -> FloatArray:
-    """Publish poses on the topics of their streams, ``speed`` times as fast as they were recorded.
+    """Publish poses on the topics of their streams, and return the node's result.
 
-    ``check`` is called while waiting, and raises if that has become pointless.
+    Parameters
+    ----------
+    poses : PoseTable
+    topics : mapping of str to str
+        Topic of each stream.
+    speed : float
+        Factor by which the playback is faster than the recording.
+    until_ns : int
+        The result must use the poses up to this stamp.
+    check : callable
+        Called during waiting. Raises an error if the node has ended.
 
     Returns
     -------
     (4, 4) array
-        T_parent_child that the node publishes once it has used the poses until then.
+        T_parent_child that the node publishes.
 
     Raises
     ------
     HandEyeCalibError
-        If ROS cannot start, or the node does not do its part in time.
+        If ROS cannot start, or the node does not answer in time.
     """
+    with _player_node() as (node, executor):
+        results = [TransformStamped()]
+        publishers = {
+            name: node.create_publisher(Odometry, topics[name], _LOSSLESS) for name in topics
+        }
+        solve = node.create_client(Trigger, "calibrator/solve")
+        node.create_subscription(TransformStamped, "calibrator/extrinsic", results.append, LATCHED)
+
+        def wait(condition: Callable[[], object], purpose: str) -> None:
+            end_s = time.monotonic() + _PATIENCE_S
+            while not condition():
+                check()
+                if time.monotonic() > end_s:
+                    raise HandEyeCalibError(f"waited {_PATIENCE_S:g} s for the node to {purpose}")
+                executor.spin_once(timeout_sec=_SPIN_S)
+
+        def are_subscribed() -> bool:
+            return all(publisher.get_subscription_count() for publisher in publishers.values())
+
+        def is_covered() -> bool:
+            # Poses and service calls have no common order, so one call of ~/solve may be too early.
+            if requests[-1].done():
+                requests.append(solve.call_async(Trigger.Request()))
+            return transform_of(results[-1]).stamp_ns >= until_ns
+
+        wait(are_subscribed, "listen")
+        start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
+        for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
+            while (remaining_s := start_s + stamp_ns * 1e-9 / speed - time.monotonic()) > 0:
+                executor.spin_once(timeout_sec=remaining_s)
+            publishers[poses.streams[row]].publish(_odometry(poses, row))
+        wait(solve.service_is_ready, "serve ~/solve")
+        requests = [solve.call_async(Trigger.Request())]
+        wait(is_covered, "give a result with all poses")
+    result = transform_of(results[-1])
+    return se3.from_quat_xyzw(result.position, result.quat_xyzw)
+
+
+@contextmanager
+def _player_node() -> Iterator[tuple[Node, SingleThreadedExecutor]]:
+    """Start a node of its own; yield the node and its executor."""
     context = rclpy.Context()
     try:
         rclpy.init(args=[], context=context)
@@ -54,42 +110,13 @@ def play(
         raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
     node = rclpy.create_node("hand_eye_calib_player", context=context)
     executor = SingleThreadedExecutor(context=context)
-    heard = [TransformStamped()]
     executor.add_node(node)
-    publishers = {name: node.create_publisher(Odometry, topics[name], _LOSSLESS) for name in topics}
-    solve = node.create_client(Trigger, "calibrator/solve")
-    node.create_subscription(TransformStamped, "calibrator/extrinsic", heard.append, LATCHED)
-
-    def wait(condition: Callable[[], object], purpose: str) -> None:
-        end_s = time.monotonic() + _PATIENCE_S
-        while not condition():
-            check()
-            if time.monotonic() > end_s:
-                raise HandEyeCalibError(f"waited {_PATIENCE_S:g} s for the node to {purpose}")
-            executor.spin_once(timeout_sec=_SPIN_S)
-
-    def is_covered() -> bool:
-        # Poses and service calls share no order, so one call of ~/solve would not be enough.
-        if asked[-1].done():
-            asked.append(solve.call_async(Trigger.Request()))
-        return transform_of(heard[-1]).stamp_ns >= until_ns
-
     try:
-        wait(lambda: all(each.get_subscription_count() for each in publishers.values()), "listen")
-        start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
-        for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
-            while (remaining_s := start_s + stamp_ns * 1e-9 / speed - time.monotonic()) > 0:
-                executor.spin_once(timeout_sec=remaining_s)
-            publishers[poses.streams[row]].publish(_odometry(poses, row))
-        wait(solve.service_is_ready, "serve ~/solve")
-        asked = [solve.call_async(Trigger.Request())]
-        wait(is_covered, "give a result with all poses")
+        yield node, executor
     finally:
         executor.shutdown()
         node.destroy_node()
         context.try_shutdown()
-    found = transform_of(heard[-1])
-    return se3.from_quat_xyzw(found.position, found.quat_xyzw)
 
 
 def _odometry(poses: PoseTable, row: int) -> Odometry:

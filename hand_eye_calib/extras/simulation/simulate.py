@@ -1,4 +1,4 @@
-"""``simulate``: recordings with known truth, as trajectory files and bags."""
+"""Command ``simulate``: write recordings with known truth as trajectory files and bags."""
 
 import argparse
 import dataclasses
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Simulate and write; returns the exit code."""
+    """Simulate and write recordings; return the exit code."""
     from hand_eye_calib.core.geometry.trajectory import Trajectory
     from hand_eye_calib.extras.simulation.drive import simulate_drive
     from hand_eye_calib.formats.trajectory_files.table import write_trajectory
@@ -92,15 +92,17 @@ def run(arguments: argparse.Namespace) -> int:
         write_trajectory(folder / CHILD_FILE, drive.child)
         truth = Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
         write_trajectory(folder / TRUTH_FILE, truth)
-        streams = {PARENT_TOPIC: (drive.parent, _TYPE), CHILD_TOPIC: (drive.child, _TYPE)}
         if arguments.bag:
             from hand_eye_calib.formats.bags.writer import write_bag
 
             name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
+            streams = {PARENT_TOPIC: (drive.parent, _TYPE), CHILD_TOPIC: (drive.child, _TYPE)}
             write_bag(folder / name, streams, arguments.bag)
-    document = {"runs": [*map(str, folders)], "seed": arguments.seed}
-    told = f"{counted(len(folders), 'recording')} written to {arguments.out}"
-    print_result([told], document | {"drive": config, "noise": noise} if arguments.json else None)
+    document = None
+    if arguments.json:
+        runs = [str(folder) for folder in folders]
+        document = {"runs": runs, "seed": arguments.seed, "drive": config, "noise": noise}
+    print_result([f"{counted(len(folders), 'recording')} written to {arguments.out}"], document)
     return 0
 
 
