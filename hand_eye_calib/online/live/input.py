@@ -226,7 +226,6 @@ class PoseInput:
         self._refused = Counter[str]()
         self._arrived = 0
         self._lost = 0
-        self._null = 0
         self._reports = deque([_Counts(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._next_number: int | None = None
         # Times (steady, s) of the last message and of the last bad message, with its fault.
@@ -326,7 +325,6 @@ class PoseInput:
     def leave_out(self, message: str, reason: NoPoseError) -> None:
         """Count a message that states that it has no pose, such as that of a lost tracker."""
         self._refused["no pose"] += 1
-        self._null += 1
         self._log.debug(f"{self.topic}: message {message} is left out: {reason}")
 
     def _refuse_stamp(self, stamp_ns: int, text: str) -> None:
@@ -395,7 +393,7 @@ class PoseInput:
         may_rest : bool
             Whether silence is normal: there is a result, and the other input is silent too.
         """
-        now = _Counts(steady_s, self._arrived, self._lost, self._null)
+        now = _Counts(steady_s, self._arrived, self._lost, self._refused["no pose"])
         first = self._reports[0]
         if steady_s - self._reports[-1].at_s > REPORT_PERIOD_S / 2:
             self._reports.append(now)

@@ -41,8 +41,7 @@ class LiveSession:
 
     def __init__(self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()) -> None:
         self.engines = Calibrators(child=Calibrator(config))
-        for name in others:
-            self.engines[name] = Calibrator(_for_other_child(config))
+        self.engines |= {name: Calibrator(_for_other_child(config)) for name in others}
         self.number = 0
         self.topics: dict[str, str] = {}
         self.journal: SessionJournal | None = None

@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterator
 from io import StringIO
 from typing import TYPE_CHECKING
 
+from hand_eye_calib.online.watch.view import KEYS, View
+
 if TYPE_CHECKING:
     from hand_eye_calib.online.watch.board import Board
-    from hand_eye_calib.online.watch.view import View
 
 EXAMPLES = """\
 examples:
@@ -32,6 +33,8 @@ _LISTEN_S = 0.1
 
 # Time (s) within which the second press of a key confirms a request.
 _CONFIRM_S = 5.0
+
+_REQUESTS = {key: request for request, key in KEYS.items()}
 
 # Requests that need a second press of their key, with their consequence.
 _CONSEQUENCES = {
@@ -106,19 +109,16 @@ class Session:
     def __init__(
         self, board: "Board", requests: "queue.SimpleQueue[str]", keys: Callable[[], str]
     ) -> None:
-        from hand_eye_calib.online.watch.view import KEYS
-
         self.is_over = False
         self.shows_code = False
         self._board = board
         self._requests = requests
         self._keys = keys
-        self._request_of_key = {key: request for request, key in KEYS.items()}
         # Request that waits for a second press of its key, and the end of the wait (steady, s).
         self._unconfirmed = ""
         self._confirm_until_s = 0.0
 
-    def view(self) -> "View":
+    def view(self) -> View:
         """Process the pressed keys and return the view."""
         now_s = time.monotonic()
         for key in self._keys():
@@ -133,7 +133,7 @@ class Session:
 
     def _press(self, key: str, now_s: float) -> None:
         """Send the request of a key, or ask for a second press."""
-        request = self._request_of_key.get(key, "")
+        request = _REQUESTS.get(key, "")
         if request not in self._board.view(now_s).buttons:
             return
         is_confirmed = request == self._unconfirmed and now_s <= self._confirm_until_s
@@ -147,7 +147,7 @@ class Session:
 
 
 @contextlib.contextmanager
-def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
+def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
     """Function that displays a view, or the QR code of the page's address.
 
     A terminal displays the view on its whole screen. A file or a pipe receives lines. A line that
@@ -161,7 +161,7 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     if not sys.stdout.isatty():
         printed: set[str] = set()
 
-        def write(view: "View", shows_code: bool) -> None:
+        def write(view: View, shows_code: bool) -> None:
             before = printed.copy()
             printed.clear()
             for line in lines(view):
@@ -179,7 +179,7 @@ def _display(address: str) -> "Iterator[Callable[[View, bool], None]]":
     displayed: tuple[object, ...] = ()
     with Live(screen=True, auto_refresh=False) as live:
 
-        def draw(view: "View", shows_code: bool) -> None:
+        def draw(view: View, shows_code: bool) -> None:
             nonlocal displayed
             size = live.console.size
             content = view, size, shows_code

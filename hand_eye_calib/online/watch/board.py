@@ -108,9 +108,7 @@ class Board:
     @property
     def priors(self) -> Texts:
         """Axes whose prior is set on the displayed node."""
-        if self._newest is None:
-            return ()
-        return tuple(axis for axis, _ in _priors_of(self._newest[0]))
+        return tuple(dict(_priors_of(self._newest[0]))) if self._newest else ()
 
     @property
     def node(self) -> str:
@@ -197,14 +195,12 @@ def _view(state: NodeState, silent_s: float) -> View:
 def _with_result(view: View, state: NodeState) -> View:
     """Return the view of a node that calibrates, with its result."""
     view = replace(view, result=tuple(_result(state)))
-    result = state.result
-    if result is None:
-        return view
-    view = replace(view, reasons=result.reasons)
-    if state.standing is Standing.REFUTED:
-        return view
-    title = f"pose of {result.child_frame} in {result.parent_frame}"
-    return replace(view, title=title, values=tuple(_values(result)))
+    if result := state.result:
+        view = replace(view, reasons=result.reasons)
+        if state.standing is not Standing.REFUTED:
+            title = f"pose of {result.child_frame} in {result.parent_frame}"
+            view = replace(view, title=title, values=tuple(_values(result)))
+    return view
 
 
 def _with_mount(view: View, mount: MountState) -> View:

@@ -233,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
         while not self.server.stopping.wait(_LOOK_S if html else 0.0):
             now_s = time.monotonic()
             view = self.server.board.view(now_s)
-            # Unlike Path.is_file, which raises for a name that is too long.
+            # Path.is_file would raise an error for a name that is too long.
             files = [name for name in SAVED if os.path.isfile(f"{view.saved_in}/{name}")]
             newest = " ".join(fragment(view, files if view.saved_in else ()).splitlines())
             if newest != html:
