@@ -5,7 +5,7 @@ All are plain values under names, so that :mod:`hand_eye_calib.core.base.plain` 
 them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TypeAlias
@@ -184,6 +184,11 @@ class Finding:
     def __str__(self) -> str:
         cause = f" ({self.cause})" if self.cause else ""
         return f"{self.what.rstrip('.')}{cause}; {self.advice}"
+
+
+def has_error(findings: Iterable[Finding]) -> bool:
+    """Return whether a finding forbids the use of results from these streams."""
+    return any(finding.makes_unusable for finding in findings)
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -23,6 +23,7 @@ from hand_eye_calib.core.results.records import (
     Finding,
     Severity,
     SolveStatus,
+    has_error,
 )
 from hand_eye_calib.core.results.result import Result
 
@@ -219,13 +220,9 @@ def target_of(axis: str, result: Result) -> float:
 # ---------------------------------------------------------------- the rules
 
 
-def _has_error(result: Result) -> bool:
-    return any(finding.makes_unusable for finding in result.findings)
-
-
 def _not_converged(result: Result) -> Iterator[_Found]:
     # Poses that contradict each other have no solution; an error finding names the cause.
-    if result.status is SolveStatus.NOT_CONVERGED and not _has_error(result):
+    if result.status is SolveStatus.NOT_CONVERGED and not has_error(result.findings):
         yield "the solver did not converge", "record more varied motion", (), {}
 
 
@@ -240,7 +237,7 @@ def _contradicted(result: Result) -> Iterator[_Found]:
 
 
 def _nothing_known(result: Result) -> Iterator[_Found]:
-    if result.reference == "stops" and _has_error(result):
+    if result.reference == "stops" and has_error(result.findings):
         # Stops that contradict each other determine nothing; an error finding names the cause.
         return
     if all(axis.is_hidden for axis in _axes(result)):

@@ -1,8 +1,7 @@
 """Calibrations from stops of an arm or of two sensors: ``A X = Z B`` checked, solved and judged."""
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -108,8 +107,8 @@ def calibrate_stops(
             "read as poses of both sensors in their worlds; if both hold inverse poses, which fit "
             "as well, give parent_invert poses and child_invert poses"
         )
-    frames = Worlds(None, None, "parent_world", "child_world")
-    return _calibration_of(solved, warnings, "parent", "child", frames)
+    frames = _Frames("parent", "child", "parent_world", "child_world")
+    return _calibration_of(solved, warnings, frames)
 
 
 def calibrate_arm(
@@ -158,8 +157,8 @@ def calibrate_arm(
     config = _checked(config)
     if setup is not None and setup not in SETUPS:
         raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
-    frames = {"base": "base", "hand": "hand", "camera": "camera", "target": "target"}
-    frames |= names or {}
+    named = {"base": "base", "hand": "hand", "camera": "camera", "target": "target"}
+    named |= names or {}
     poses = _checked_poses({"robot": robot, "tracking": tracking}, config, is_arm=True)
     solved = solve_checked(poses, config, setup)
     solved = solved.adding(*_check_reading(solved.reading, setup))
@@ -167,14 +166,12 @@ def calibrate_arm(
     if solved.is_usable and not config.given >= _INVERSIONS:
         if not setup:
             warnings.append(_reading_in_words(solved.reading))
-        solved = solved.adding(*_check_distances(solved.reading, frames))
-    parent, parent_world = frames["hand"], frames["base"]
-    place = "hand"
+        solved = solved.adding(*_check_distances(solved.reading, named))
     if solved.reading.is_inverse:
-        parent, parent_world = parent_world, parent
-        place = "beside"
-    worlds = Worlds(None, None, parent_world, frames["target"], place)
-    return _calibration_of(solved, warnings, parent, frames["camera"], worlds)
+        frames = _Frames(named["base"], named["camera"], named["hand"], named["target"], "beside")
+    else:
+        frames = _Frames(named["hand"], named["camera"], named["base"], named["target"], "hand")
+    return _calibration_of(solved, warnings, frames)
 
 
 # ------------------------------------------------------------------ options and poses
@@ -314,24 +311,21 @@ def _check_left_out(weights: FloatArray) -> list[Finding]:
 # ------------------------------------------------------------------ the result
 
 
-def _calibration_of(
-    solved: SolvedStops,
-    warnings: list[str],
-    parent: str,
-    child: str,
-    worlds: Worlds,
-) -> Calibration:
-    """Return the result: the fit fused with the prior, its residuals and its findings.
+class _Frames(NamedTuple):
+    """Names of the frames of both sensors and of their worlds, and the setup of an arm.
 
-    Parameters
-    ----------
-    solved : SolvedStops
-    warnings : list of str
-    parent, child : str
-        Frames of both sensors, unless the options name them.
-    worlds : Worlds
-        Frames of both worlds, and the setup.
+    Options may name the sensors otherwise.
     """
+
+    parent: str
+    child: str
+    parent_world: str
+    child_world: str
+    setup: str = ""
+
+
+def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frames) -> Calibration:
+    """Return the result: the fit fused with the prior, its residuals and its findings."""
     fit = solved.reading.fit
     stops = solved.reading.stops
     config = solved.config
@@ -356,6 +350,7 @@ def _calibration_of(
         start_ns=rows,
         end_ns=rows,
     )
+    worlds = Worlds(Z, covariance_Z, frames.parent_world, frames.child_world, frames.setup)
     return calibration_of(
         fit,
         fused,
@@ -370,9 +365,9 @@ def _calibration_of(
         findings=solved.findings,
         scale=solved.reading.scale,
         scale_sigma=solved.reading.scale_sigma,
-        parent_frame=config.parent_frame or parent,
-        child_frame=config.child_frame or child,
-        parts={"worlds": replace(worlds, T_world_world=Z, cov_world_world=covariance_Z)},
+        parent_frame=config.parent_frame or frames.parent,
+        child_frame=config.child_frame or frames.child,
+        parts={"worlds": worlds},
     )
 
 

@@ -20,6 +20,7 @@ from hand_eye_calib.core.base.option import options_in_words
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, Severity, conventions, finding
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.records import has_error
 from hand_eye_calib.extras.stops.robot_world import solve
 from hand_eye_calib.extras.stops.rotation_checks import (
     CLEARLY_BETTER,
@@ -146,7 +147,7 @@ def examine(poses: StopPoses) -> Examination:
     if not (findings or repairs):
         findings = _check_agreement(chosen.fit)
     examination = Examination(tuple(findings), repairs)
-    if any(found.makes_unusable for found in findings):
+    if has_error(findings):
         return examination
     return _with_units(few, replace(examination, scale=chosen.fit.scale))
 
@@ -159,8 +160,7 @@ def _explain(few: StopPoses) -> tuple[_Hypothesis, list[Mistakes]]:
 
     The hypothesis has no mistakes unless some are certain.
     """
-    ways = (False, True) if few.is_arm else (False,)
-    plain = [_Hypothesis.of(few, Mistakes(is_inverse=way)) for way in ways]
+    plain = [_Hypothesis.of(few, Mistakes(is_inverse=way)) for way in few.ways]
     # Rotations decide whether the camera is on the hand; positions choose only where they do not.
     largest_turning = CLEARLY_BETTER * min(hypothesis.fit.turning for hypothesis in plain)
     agreeing = [hypothesis for hypothesis in plain if hypothesis.fit.turning <= largest_turning]
@@ -170,17 +170,21 @@ def _explain(few: StopPoses) -> tuple[_Hypothesis, list[Mistakes]]:
     objectives = {rival: rival.objective(few) for rival in _rivals(few, plain)}
     smallest = min(objectives.values())
     gain = min(hypothesis.objective(few) for hypothesis in plain) - smallest
+    good = _simplest([rival for rival in objectives if objectives[rival] < smallest + LEAST_LEAD])
     if gain < -LEAST_LEAD:
         return as_given, []
-    good = [rival for rival, value in objectives.items() if value < smallest + LEAST_LEAD]
-    simplest = min(rival.mistakes.complexity for rival in good)
-    good = [rival for rival in good if rival.mistakes.complexity == simplest]
     if gain < certain_gain(len(few)):
         return as_given, [rival.mistakes for rival in good]
     best = min(good, key=_unexplained)
     if best.fit.unexplained > LARGEST_SHARE:
         return as_given, []
     return best, [rival.mistakes for rival in good if rival is not best]
+
+
+def _simplest(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
+    """Return the hypotheses with the fewest different mistakes."""
+    fewest = min(hypothesis.mistakes.complexity for hypothesis in hypotheses)
+    return [hypothesis for hypothesis in hypotheses if hypothesis.mistakes.complexity == fewest]
 
 
 def _unexplained(hypothesis: _Hypothesis) -> float:
@@ -277,8 +281,8 @@ def _check_axes(few: StopPoses, fit: RoughFit) -> Finding | None:
         return None
     best = None
     largest = fit.log_likelihood + certain_gain(len(few))
-    for is_inverse in (False, True) if few.is_arm else (False,):
-        mistakes = Mistakes(is_inverse=is_inverse)
+    for way in few.ways:
+        mistakes = Mistakes(is_inverse=way)
         if rough_fit(few, mistakes).turning > LARGEST_SHARE:
             continue
         for axes, stream in itertools.product(_other_axes(), ("child", "parent")):

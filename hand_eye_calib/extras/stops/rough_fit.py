@@ -59,6 +59,11 @@ class StopPoses:
     def __len__(self) -> int:
         return len(self.parent)
 
+    @property
+    def ways(self) -> tuple[bool, ...]:
+        """Values of ``Mistakes.is_inverse`` that are no mistake."""
+        return (False, True) if self.is_arm else (False,)
+
     def few(self) -> "StopPoses":
         """Return at most 150 of the stops, evenly spread."""
         n = len(self)

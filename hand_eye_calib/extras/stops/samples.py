@@ -113,13 +113,15 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     """
     is_npz = Path(path).suffix == ".npz"
     document: Any = read_arrays(path) if is_npz else read_yaml(path, _EXPECTED)
-    if isinstance(document, Mapping):
-        with located(path):
-            samples = _opencv_samples(document)
-            if is_npz:
-                samples = samples or _stacked_samples(document)
-        if samples:
-            return samples
+    with located(path):
+        samples = _opencv_samples(document) if isinstance(document, Mapping) else None
+        if is_npz:
+            samples = samples or _stacked_samples(document)
+    return samples or _listed_samples(path, document)
+
+
+def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
+    """Return the samples of a document with a sample for each stop."""
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:

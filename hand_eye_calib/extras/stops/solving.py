@@ -11,7 +11,7 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, finding, repair_message
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.results.records import gravest_first
+from hand_eye_calib.core.results.records import gravest_first, has_error
 from hand_eye_calib.extras.stops.checks import LEAST_LEAD, Examination, examine
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
@@ -80,11 +80,36 @@ class SolvedStops:
     @property
     def is_usable(self) -> bool:
         """Whether no finding forbids the use of the result."""
-        return not any(found.makes_unusable for found in self.findings)
+        return not has_error(self.findings)
 
     def adding(self, *findings: Finding) -> "SolvedStops":
         """Return the same with further findings."""
         return replace(self, findings=gravest_first((*self.findings, *findings)))
+
+
+@dataclass(frozen=True)
+class _Repaired:
+    """Stops in the usual convention and in metres.
+
+    Attributes
+    ----------
+    poses : StopPoses
+    config : CalibratorConfig
+        With the options that repair the stops.
+    unit : float
+        Factor that the child's lengths were multiplied by.
+    rough_scale : float
+        Factor that is left, from a rough fit; 1 if that is unknown.
+    findings, warnings : lists
+        What was found and repaired; the solve adds to both.
+    """
+
+    poses: StopPoses
+    config: CalibratorConfig
+    unit: float
+    rough_scale: float
+    findings: list[Finding]
+    warnings: list[str]
 
 
 def solve_checked(
@@ -107,6 +132,35 @@ def solve_checked(
     """
     if config.scale == "estimate" and not poses.has_positions:
         raise ConfigError("scale estimate needs positions; both sides have rotations alone")
+    repaired = _repaired(poses, config)
+    poses = repaired.poses
+    findings = repaired.findings
+    reading = _likelier_reading(poses, repaired.rough_scale, setup)
+    if setup and reading.lead < -LEAST_LEAD:
+        other = "hand" if reading.is_inverse else "beside"
+        findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
+    is_used = False
+    if config.scale == "estimate" or _determines_scale(poses, findings):
+        free = _with_free_scale(poses, reading)
+        is_used = _judge_scale(free, repaired)
+    if is_used:
+        reading = free
+    elif reading.scale != 1.0:
+        reading = _likelier_reading(poses, 1.0, setup)
+    findings += _check_unknown(poses, reading.fit, findings)
+    reading = replace(
+        reading,
+        scale=repaired.unit * reading.scale,
+        scale_sigma=repaired.unit * reading.scale_sigma,
+    )
+    return SolvedStops(reading, repaired.config, gravest_first(findings), tuple(repaired.warnings))
+
+
+# ------------------------------------------------------------------ options and repairs
+
+
+def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
+    """Check stops, and repair what is certain and not set by the user."""
     unit = config.given_scale
     examination = examine(_in_metres(poses, config, unit))
     if config.scale in ("auto", "estimate"):
@@ -115,8 +169,8 @@ def solve_checked(
         examination = _without_child_unit(examination)
     findings, repairs = _beside_set_options(examination, config)
     # The rough scale is that of lengths whose units are put right.
-    is_repaired = len(repairs) == len(examination.repairs)
-    rough_scale = examination.scale if is_repaired else None
+    is_whole = len(repairs) == len(examination.repairs)
+    rough_scale = examination.scale if is_whole else None
     warnings = []
     if repairs:
         options = _options_of(repairs, config)
@@ -124,25 +178,7 @@ def solve_checked(
         config = replace(config, **options)
         unit = float(options.get("scale", unit))
     poses = _in_metres(poses, config, unit)
-    reading = _likelier_reading(poses, rough_scale or 1.0, setup)
-    if setup and reading.lead < -LEAST_LEAD:
-        other = "hand" if reading.is_inverse else "beside"
-        findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
-    free = None
-    if config.scale == "estimate" or _determines_scale(poses, findings):
-        free = _with_free_scale(poses, reading)
-        is_used = _judge_scale(free, config, unit, findings, warnings)
-        free = free if is_used else None
-    if free:
-        reading = free
-    elif reading.scale != 1.0:
-        reading = _likelier_reading(poses, 1.0, setup)
-    findings += _check_unknown(poses, reading.fit, findings)
-    reading = replace(reading, scale=unit * reading.scale, scale_sigma=unit * reading.scale_sigma)
-    return SolvedStops(reading, config, gravest_first(findings), tuple(warnings))
-
-
-# ------------------------------------------------------------------ options and repairs
+    return _Repaired(poses, config, unit, rough_scale or 1.0, findings, warnings)
 
 
 def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) -> StopPoses:
@@ -154,18 +190,16 @@ def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) ->
     )
 
 
-def _is_child_unit(found: Finding) -> bool:
-    return {*found.options} == {"scale"}
-
-
 def _child_unit(examination: Examination) -> float:
     """Return the factor to metres of the child's lengths; 1 if they are in metres."""
-    units = [
-        float(found.options["scale"])
-        for found in (*examination.findings, *examination.repairs)
-        if _is_child_unit(found)
-    ]
-    return units[-1] if units else 1.0
+    for found in (*examination.findings, *examination.repairs):
+        if _is_child_unit(found):
+            return float(found.options["scale"])
+    return 1.0
+
+
+def _is_child_unit(found: Finding) -> bool:
+    return {*found.options} == {"scale"}
 
 
 def _without_child_unit(examination: Examination) -> Examination:
@@ -227,7 +261,7 @@ def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[st
 def _likelier_reading(poses: StopPoses, scale: float, setup: str | None) -> Reading:
     """Return the likelier reading of stops, or that of a setup, whose lead may be negative."""
     readings = []
-    for is_inverse in (False, True) if poses.is_arm else (False,):
+    for is_inverse in poses.ways:
         stops = poses.without(Mistakes(is_inverse=is_inverse), scale)
         readings.append(Reading(solve(stops), stops, is_inverse, scale))
     if not poses.is_arm:
@@ -242,8 +276,7 @@ def _likelier_reading(poses: StopPoses, scale: float, setup: str | None) -> Read
 
 def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
     """Return whether stops without errors determine the factor of the child's lengths."""
-    has_errors = any(found.makes_unusable for found in findings)
-    return not has_errors and poses.has_positions and turns_about_two_axes(poses.parent)
+    return not has_error(findings) and poses.has_positions and turns_about_two_axes(poses.parent)
 
 
 def _with_free_scale(poses: StopPoses, reading: Reading) -> Reading:
@@ -262,39 +295,26 @@ def _with_free_scale(poses: StopPoses, reading: Reading) -> Reading:
     return replace(reading, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
 
 
-def _judge_scale(
-    free: Reading,
-    config: CalibratorConfig,
-    unit: float,
-    findings: list[Finding],
-    warnings: list[str],
-) -> bool:
-    """Return whether an estimated scale is used; add the finding and the warning about it.
-
-    ``unit`` is the factor that the child's lengths were multiplied by before.
-    """
+def _judge_scale(free: Reading, repaired: _Repaired) -> bool:
+    """Return whether an estimated scale is used; add the finding and the warning about it."""
+    config = repaired.config
+    unit = repaired.unit
     is_auto = config.scale == "auto"
     is_estimate = config.scale == "estimate"
     is_size = 1.0 / _LARGEST_SIZE < free.scale < _LARGEST_SIZE
     is_clear = _difference_from_one(free) > _SCALE_SHARE or (is_auto and unit != 1.0)
-    is_used = is_estimate or (is_clear and is_size and not config.is_known("scale"))
     is_asked = is_estimate or (is_auto and is_size)
     scale = unit * free.scale
     sigma = unit * free.scale_sigma
     if is_clear and not is_asked:
-        findings.append(
-            finding(
-                "target_scale",
-                "child",
-                options={"scale": "estimate"},
-                scale=scale,
-                sigma=sigma,
-                times=1.0 / scale,
-            )
-        )
-    if is_used and not is_estimate:
+        found = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
+        repaired.findings.append(replace(found, options={"scale": "estimate"}))
+    if is_estimate:
+        return True
+    is_used = is_clear and is_size and not config.is_known("scale")
+    if is_used:
         undo = "none" if unit == 1.0 or is_auto else unit
-        warnings.append(
+        repaired.warnings.append(
             f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as "
             f"they are, give scale {undo}"
         )
@@ -314,10 +334,9 @@ def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding
     """Return why directions are unknown: stops turn about one axis, or contradict each other."""
     if not turns_about_two_axes(poses.parent):
         return [finding("turning_about_one_axis")] if poses.has_positions else []
-    has_errors = any(found.makes_unusable for found in findings)
     rotations = poses.parent[:, :3, :3]
     turn_rad = median(se3.rotation_angle(rotations[0].T @ rotations))
-    if has_errors or not fit.undetermined().size or turn_rad < _FAR_RAD:
+    if has_error(findings) or not fit.undetermined().size or turn_rad < _FAR_RAD:
         return []
     share = min(float(np.sqrt(3.0)) * fit.level_rad / turn_rad, 1.0)
     return [finding("disagreeing_stops", part="rotations", share=share)]

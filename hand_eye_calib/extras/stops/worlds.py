@@ -25,9 +25,9 @@ class Worlds:
 
     Attributes
     ----------
-    T_world_world : (4, 4) array or None
+    T_world_world : (4, 4) array
         Pose of the child's world in the parent's world.
-    cov_world_world : (6, 6) array or None
+    cov_world_world : (6, 6) array
         Covariance of ``T_world_world``, in the child's world.
     parent_world_frame, child_world_frame : str
     setup : {"", "hand", "beside"}
@@ -35,10 +35,10 @@ class Worlds:
         an arm.
     """
 
-    T_world_world: FloatArray | None
-    cov_world_world: FloatArray | None
-    parent_world_frame: str = ""
-    child_world_frame: str = ""
+    T_world_world: FloatArray
+    cov_world_world: FloatArray
+    parent_world_frame: str
+    child_world_frame: str
     setup: str = ""
 
     def __post_init__(self) -> None:
@@ -68,52 +68,46 @@ class WorldsPart(Part):
         document: Document = {
             "parent_world_frame": value.parent_world_frame,
             "child_world_frame": value.child_world_frame,
+            "cov_world_world": matrix_of(
+                "error xi in T_world_world @ exp(xi)",
+                value.child_world_frame,
+                value.cov_world_world,
+            ),
         }
         if value.setup:
             document["setup"] = value.setup
-        if value.cov_world_world is not None:
-            error = "error xi in T_world_world @ exp(xi)"
-            document["cov_world_world"] = matrix_of(
-                error, value.child_world_frame, value.cov_world_world
-            )
         return document
 
     def read(self, document: Mapping[str, Any]) -> Worlds | None:
         """Return the part of a document; None if it has none."""
-        T = document.get("T_world_world")
-        covariance = document.get("cov_world_world")
-        texts = {name: from_plain(str, document.get(name, "")) for name in _TEXTS}
-        if T is None and covariance is None and not any(texts.values()):
+        if document.get("T_world_world") is None:
             return None
         return Worlds(
-            T_world_world=None if T is None else transform_of(T),
-            cov_world_world=None if covariance is None else covariance_of(covariance),
-            **texts,
+            T_world_world=transform_of(document["T_world_world"]),
+            cov_world_world=covariance_of(document["cov_world_world"]),
+            **{name: from_plain(str, document.get(name, "")) for name in _TEXTS},
         )
 
     def invert(self, value: Worlds) -> Worlds:
         """Return the part of the result with both sensors exchanged."""
-        inverse = replace(
+        T = value.T_world_world
+        return replace(
             value,
+            T_world_world=se3.inverse(T),
+            cov_world_world=inverse_covariance(T, value.cov_world_world),
             parent_world_frame=value.child_world_frame,
             child_world_frame=value.parent_world_frame,
         )
-        T = value.T_world_world
-        if T is None:
-            return inverse
-        covariance = value.cov_world_world
-        if covariance is not None:
-            covariance = inverse_covariance(T, covariance)
-        return replace(inverse, T_world_world=se3.inverse(T), cov_world_world=covariance)
 
     def transforms(self, value: Worlds) -> dict[str, ExtraTransform]:
-        """Return the transform between the worlds, if it is known with its covariance."""
-        T = value.T_world_world
-        covariance = value.cov_world_world
-        if T is None or covariance is None:
-            return {}
-        frames = value.child_world_frame, value.parent_world_frame
-        return {"T_world_world": ExtraTransform(T, *frames, covariance)}
+        """Return the transform between the worlds."""
+        transform = ExtraTransform(
+            value.T_world_world,
+            value.child_world_frame,
+            value.parent_world_frame,
+            value.cov_world_world,
+        )
+        return {"T_world_world": transform}
 
     def headline(self, value: Worlds) -> str:
         """Return where the camera is, and the option for the other place; empty without an arm."""
