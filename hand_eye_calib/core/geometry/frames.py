@@ -1,5 +1,6 @@
-"""Frames and their parents: the one tree behind robot descriptions, ``/tf`` and ``/tf_static``; and
-what these state of the pose of a sensor.
+"""Poses from outside, and the tree of frames.
+
+The tree serves robot descriptions, ``/tf`` and ``/tf_static``.
 """
 
 import math
@@ -21,33 +22,34 @@ from hand_eye_calib.core.geometry.trajectory import (
     far_position,
 )
 
-# A matrix whose rotation is further than this from one is none.
+# Tolerance of the elements of a rotation matrix.
 _ROTATION_WITHIN = 1e-2
 
-# The last row of a matrix is 0 0 0 1 within this.
+# Last row of a matrix.
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+# Tolerance of the last row.
 LAST_ROW_WITHIN = 1e-6
 
-# Words in the name of a frame that say that it stands still: a map, the start of an odometry.
+# Words in the name of a fixed frame: a map, the start of an odometry.
 _WORLDS = {"map", "odom", "odometry", "world", "earth", "ecef", "enu", "ned", "utm", "global"}
 _WORLDS |= {"origin", "init", "mocap", "vicon", "optitrack", "inertial"}
-# Words that say that it is something that a camera observes.
+# Words in the name of a frame that a camera observes.
 _TARGETS = {"aruco", "marker", "tag", "apriltag", "charuco", "target", "board", "chessboard"}
 _TARGETS |= {"checkerboard", "pattern", "fiducial", "aprilgrid"}
 
-# Edges that are listed in a message.
+# Largest number of edges in a message.
 _MOST_LISTED = 50
 
 
 def are_null(poses: FloatArray) -> BoolArray:
-    """Mask (N,) of rows x y z qx qy qz qw (N, 7) by which a source states that it has no pose.
+    """Return a mask (N,) of rows x y z qx qy qz qw (N, 7) without a pose.
 
     A value is not finite, or the quaternion is zero: trackers publish both when they are lost.
     """
-    qx, qy, qz, qw = poses[:, 3:].T
-    is_null = (qx == 0.0) & (qy == 0.0) & (qz == 0.0) & (qw == 0.0)
+    is_null = (poses[:, 3:] == 0.0).all(axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
         total = poses.sum()
-    if not np.isfinite(total):  # faster than to look at every row
+    if not np.isfinite(total):  # faster than a check of every row
         is_null |= ~np.isfinite(poses).all(axis=1)
     return np.asarray(is_null, dtype=bool)
 
@@ -61,8 +63,14 @@ def check_not_null(*values: float) -> None:
 
 
 def check_pose(*values: float) -> None:
-    """Raise InputError for x, y, z, qx, qy, qz, qw that are too far away, or have a quaternion that
-    is not of unit length; NoPoseError as :func:`check_not_null`.
+    """Check x, y, z, qx, qy, qz, qw of a pose.
+
+    Raises
+    ------
+    NoPoseError
+        If the source states that there is no pose, see :func:`are_null`.
+    InputError
+        If the quaternion is not of unit length, or the position is too far away.
     """
     check_not_null(*values)
     length = math.hypot(*values[3:])
@@ -73,7 +81,7 @@ def check_pose(*values: float) -> None:
 
 
 def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
-    """Pose (4, 4) of a transform as it comes from outside. Raises as :func:`check_pose`."""
+    """Return the pose (4, 4) of a position and a quaternion; raises as :func:`check_pose`."""
     t = np.asarray(position, dtype=float)
     quat_xyzw = np.asarray(quat_xyzw, dtype=float)
     check_pose(*t.tolist(), *quat_xyzw.tolist())
@@ -81,18 +89,22 @@ def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
 
 
 def pose_of(*values: Any) -> FloatArray:
-    """Pose (4, 4) of what a file has: a matrix of 12 or 16 numbers; x, y, z, qx, qy, qz, qw; a
-    message; or a translation and a rotation, as matrix, quaternion w, x, y, z, or roll, pitch and
-    yaw in degrees.
+    """Return the pose (4, 4) that values of a file stand for.
+
+    Parameters
+    ----------
+    *values
+        A matrix of 12 or 16 numbers; x, y, z, qx, qy, qz, qw; a message; or a translation and a
+        rotation, as matrix, quaternion w, x, y, z, or roll, pitch and yaw in degrees.
 
     Raises
     ------
     InputError
-        If it is none.
+        If the values are no pose.
     """
     parts = [numbers_of(value) for value in values]
     sizes = tuple(map(len, parts))
-    flat = np.array([number for part in parts for number in part])
+    flat = np.concatenate([[], *parts])
     T = np.eye(4)
     if not np.isfinite(flat).all():
         raise InputError("a number is not finite")
@@ -113,16 +125,12 @@ def pose_of(*values: Any) -> FloatArray:
             "expected a pose: 12 or 16 numbers of a matrix, 7 of x, y, z, qx, qy, qz, qw, or "
             "translation and rotation"
         )
-    rotation = se3.nearest_rotation(T[:3, :3])
-    if np.abs(rotation - T[:3, :3]).max() > _ROTATION_WITHIN:
-        raise InputError("the rotation is not one")
-    if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > LAST_ROW_WITHIN:
-        raise InputError(wrong_last_row(T))
-    return se3.from_rotation_translation(rotation, T[:3, 3])
+    (T,) = _rigid(T[None])
+    return T
 
 
 def pose_stack(values: Any, what: str) -> FloatArray:
-    """Poses (N, 4, 4) of many at once, checked.
+    """Return the poses (N, 4, 4) that arrays stand for, checked.
 
     Parameters
     ----------
@@ -135,24 +143,41 @@ def pose_stack(values: Any, what: str) -> FloatArray:
     Raises
     ------
     InputError
-        If a pose is none; the message names its row, counted from 1.
+        If a pose is invalid; the message names its row, counted from 1.
     """
     pair = _pair_of_stacks(values)
     Ts = _joined(*pair, what) if pair else _one_stack(values, what)
-    rows = np.flatnonzero(~np.isfinite(Ts).all(axis=(1, 2)))
-    if len(rows):
-        raise InputError(f"{what}, row {rows[0] + 1}: a number is not finite")
-    _require_last_row(Ts, what)
+    is_finite = np.isfinite(Ts).all(axis=(1, 2))
+    if not is_finite.all():
+        raise InputError(f"{what}, row {np.argmin(is_finite) + 1}: a number is not finite")
+    return _rigid(Ts, what)
+
+
+def _rigid(Ts: FloatArray, what: str = "") -> FloatArray:
+    """Return matrices (N, 4, 4) with exact rotations.
+
+    Raises InputError at the first matrix without a rotation, or with another last row than 0 0 0 1.
+    The message names the row of ``what``, if given.
+    """
     rotations = se3.nearest_rotation(Ts[:, :3, :3])
-    off = np.abs(rotations - Ts[:, :3, :3]).max(axis=(1, 2), initial=0.0)
-    rows = np.flatnonzero(off > _ROTATION_WITHIN)
-    if len(rows):
-        raise InputError(f"{what}, row {rows[0] + 1}: the rotation is not one")
+    deviations = np.abs(rotations - Ts[:, :3, :3]).max(axis=(1, 2), initial=0.0)
+    if (deviations > _ROTATION_WITHIN).any():
+        row = int(np.argmax(deviations > _ROTATION_WITHIN))
+        raise InputError(_place(what, row) + "the rotation is not one")
+    deviations = np.abs(Ts[:, 3] - _LAST_ROW).max(axis=1, initial=0.0)
+    if (deviations > LAST_ROW_WITHIN).any():
+        row = int(np.argmax(deviations > LAST_ROW_WITHIN))
+        raise InputError(_place(what, row) + wrong_last_row(Ts[row]))
     return se3.from_rotation_translation(rotations, Ts[:, :3, 3])
 
 
+def _place(what: str, row: int) -> str:
+    """Return the beginning of a message about a row."""
+    return f"{what}, row {row + 1}: " if what else ""
+
+
 def _numbers(values: Any) -> FloatArray | None:
-    """Values as an array; None if they are no numbers, or rows of different lengths."""
+    """Return values as an array; None if they are no numbers, or rows of different lengths."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -160,19 +185,20 @@ def _numbers(values: Any) -> FloatArray | None:
 
 
 def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
-    """Rotations and translations, if the values are such a pair."""
+    """Return rotations and translations if the values are such a pair."""
     if not isinstance(values, tuple | list) or len(values) != 2:
         return None
-    first, second = (_numbers(value) for value in values)
-    if first is None or second is None or first.ndim < 2 or second.ndim < 2:
+    rotations, translations = map(_numbers, values)
+    if rotations is None or translations is None:
         return None
-    if first.shape[1:] not in ((3, 3), (3,), (3, 1)) or second.shape[1:] not in ((3,), (3, 1)):
+    vectors = ((3,), (3, 1))
+    if rotations.shape[1:] not in ((3, 3), *vectors) or translations.shape[1:] not in vectors:
         return None
-    return first, second
+    return rotations, translations
 
 
 def _joined(rotations: FloatArray, translations: FloatArray, what: str) -> FloatArray:
-    """Poses (N, 4, 4) of rotations or rotation vectors, and translations."""
+    """Return poses (N, 4, 4) of rotations or rotation vectors, and translations."""
     if len(rotations) != len(translations):
         raise InputError(
             f"{what}: {len(rotations)} rotations, {len(translations)} translations; each pose "
@@ -184,12 +210,11 @@ def _joined(rotations: FloatArray, translations: FloatArray, what: str) -> Float
 
 
 def _one_stack(values: Any, what: str) -> FloatArray:
-    """Poses (N, 4, 4) of matrices or rows."""
+    """Return poses (N, 4, 4) of matrices or rows."""
     array = _numbers(values)
     if array is not None and array.ndim == 2 and array.shape[1] == 7:
-        rows = enumerate(array.tolist(), 1)
         stack = []
-        for number, row in rows:
+        for number, row in enumerate(array.tolist(), 1):
             with located(f"{what}, row {number}"):
                 stack.append(checked_pose(row[:3], row[3:]))
         return np.reshape(stack, (-1, 4, 4))
@@ -204,27 +229,18 @@ def _one_stack(values: Any, what: str) -> FloatArray:
     return array
 
 
-def _require_last_row(Ts: FloatArray, what: str) -> None:
-    """Check that the last row of matrices (N, 4, 4) is 0 0 0 1."""
-    last = np.array([0.0, 0.0, 0.0, 1.0])
-    wrong = np.abs(Ts[:, 3] - last).max(axis=1, initial=0.0) > LAST_ROW_WITHIN
-    if not wrong.any():
-        return
-    row = int(np.argmax(wrong))
-    raise InputError(f"{what}, row {row + 1}: {wrong_last_row(Ts[row])}")
-
-
 def wrong_last_row(T: FloatArray) -> str:
     """Return what is wrong with a matrix (4, 4) whose last row is not 0 0 0 1."""
     numbers = " ".join(f"{value:.4g}" for value in T[3])
-    is_transposed = np.allclose(T[:, 3], [0.0, 0.0, 0.0, 1.0], atol=LAST_ROW_WITHIN)
+    is_transposed = np.allclose(T[:, 3], _LAST_ROW, atol=LAST_ROW_WITHIN)
     cause = ": the matrix is transposed, write it row by row" if is_transposed else ""
     return f"the last row of the matrix is {numbers}, expected 0 0 0 1{cause}"
 
 
 def numbers_of(value: Any) -> list[float]:
-    """The numbers of nested lists, of a message, of OpenCV's matrix or of a text, in their order;
-    empty if something else is among them.
+    """Return the numbers of nested lists, a message, OpenCV's matrix or a text, in their order.
+
+    The list is empty if there is anything else.
     """
     if isinstance(value, Mapping):
         position = value.get("translation", value.get("position"))
@@ -249,14 +265,16 @@ def words_of(name: str) -> set[str]:
 
 @dataclass(frozen=True)
 class StreamFrames:
-    """Names of the frames of a stream of poses; empty if they are not known.
+    """Names of the frames of a stream of poses; empty if unknown.
 
     Attributes
     ----------
-    sensor, world : str
-        Of the sensor, and of the fixed frame in which its poses are, as the messages give them.
+    sensor : str
+        Name of the sensor's frame in the messages.
+    world : str
+        Name of the fixed frame in the messages.
     option : str
-        Of the sensor, as the user gave it.
+        Name of the sensor's frame that the user gave.
     """
 
     sensor: str = ""
@@ -272,9 +290,9 @@ class StreamFrames:
     def inverse_name(self) -> str:
         """Name of the sensor's frame if the poses have to be inverted.
 
-        Transforms camera -> marker of a fixed marker are inverse poses of the camera: the frames
-        change their roles. A publisher that writes inverse poses below the frames odom -> base_link
-        means base_link: a frame that is called a world is no sensor.
+        Transforms camera -> marker of a fixed marker are inverse poses of the camera, so the frames
+        change their roles. If inverse poses have the frames odom -> base_link, the sensor is
+        base_link: a frame with the name of a world is no sensor.
         """
         is_named_otherwise = self.option not in ("", self.sensor)
         if not self.world or is_named_otherwise:
@@ -292,11 +310,11 @@ class Extrinsic:
     ----------
     T_parent_child : (4, 4) array
     origin : str
-        Where it comes from, for a person.
+        Description of the source.
     covariance : (6, 6) array
-        Of the error xi in ``T_parent_child @ exp(xi)``; zero if the source states none.
+        Covariance of the error xi in ``T_parent_child @ exp(xi)``; zero if the source states none.
     is_calibration : bool
-        Whether it was found from motion, with the same sensors.
+        Whether the pose was estimated from motion, with the same sensors.
     """
 
     T_parent_child: FloatArray
@@ -307,7 +325,7 @@ class Extrinsic:
 
 @dataclass
 class Edge:
-    """A frame's parent, whether its pose in it is constant, and that (4, 4) if it is known."""
+    """Parent of a frame, whether the frame is fixed to it, and the pose (4, 4) in it if known."""
 
     parent: str
     is_static: bool = True
@@ -315,17 +333,17 @@ class Edge:
 
 
 class FrameTree:
-    """Frames with their parents.
+    """Tree of frames.
 
     Parameters
     ----------
     origin : str
-        Where the frames come from, for messages.
+        Source of the frames, for messages.
 
     Attributes
     ----------
     edges : dict of str to Edge
-        Frame to the edge that leads up from it.
+        Frame to the edge to its parent.
     """
 
     def __init__(self, origin: str = "the transforms") -> None:
@@ -335,7 +353,7 @@ class FrameTree:
     def add(
         self, parent: str, frame: str, pose: FloatArray | None = None, is_static: bool = True
     ) -> Edge:
-        """Add an edge, or its newest pose. An edge that has ever moved is not static.
+        """Add an edge, or its newest pose. An edge that has moved once is not static.
 
         Raises
         ------
@@ -357,64 +375,71 @@ class FrameTree:
     def pose(
         self, frame: str, of: str, moving: Mapping[str, FloatArray] | None = None
     ) -> FloatArray:
-        """Pose (..., 4, 4) of the frame ``of`` in ``frame``, with the poses (..., 4, 4) of those
-        whose edges move.
+        """Return the pose (..., 4, 4) of the frame ``of`` in ``frame``.
+
+        Parameters
+        ----------
+        frame, of : str
+        moving : mapping, optional
+            Frame to its poses (..., 4, 4) in its parent, for edges that move.
 
         Raises
         ------
         InputError
-            If one of both is not there, or they are not fixed to each other.
+            If a frame is missing, or both frames are not fixed to each other.
         """
         up, down = self.route(frame, of)
         T_frame_of = np.eye(4)
-        for each in up + down:
-            edge = self.edges[each]
-            T = moving[each] if moving and each in moving else edge.pose
+        moving = moving or {}
+        for step in up + down:
+            edge = self.edges[step]
+            T = moving.get(step, edge.pose)
             if T is None or not (edge.is_static or moving):
-                raise InputError(f"{frame} and {of} are not fixed to each other: {each} moves")
-            T_frame_of = T_frame_of @ (se3.inverse(T) if each in up else T)
+                raise InputError(f"{frame} and {of} are not fixed to each other: {step} moves")
+            T_frame_of = T_frame_of @ (se3.inverse(T) if step in up else T)
         return T_frame_of
 
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
-        """Frames whose edges lead up from ``frame``, and those whose edges lead down to ``of``.
+        """Return the frames whose edges lead up from ``frame``, and down to ``of``.
 
         Raises
         ------
         InputError
-            If one of both is not there, or they are not connected.
+            If a frame is missing, or both frames are not connected.
         """
         up = self.above(frame_name(frame))
         down = self.above(frame_name(of))
         if up[-1] != down[-1]:
             raise InputError(f"frames {frame!r} and {of!r} are not connected; {self.listing()}")
-        shared = {*up} & {*down}
-        down = [each for each in down if each not in shared]
-        return [each for each in up if each not in shared], down[::-1]
+        while up and down and up[-1] == down[-1]:
+            del up[-1], down[-1]
+        return up, down[::-1]
 
     def above(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on to the root.
+        """Return the frame, its parent, and so on to the root.
 
         Raises
         ------
         InputError
-            If it is not there, or the frames above it form a loop.
+            If the frame is missing, or the frames above it form a loop.
         """
         if frame not in self.edges and all(edge.parent != frame for edge in self.edges.values()):
             raise InputError(f"no frame {frame!r} in {self._origin}; {self.listing()}")
-        found = {frame: None}
+        frames = [frame]
         while frame in self.edges:
             frame = self.edges[frame].parent
-            if frame in found:
+            if frame in frames:
                 raise InputError(f"{self._origin} form a loop through frame {frame!r}")
-            found[frame] = None
-        return [*found]
+            frames.append(frame)
+        return frames
 
     def listing(self) -> str:
         """List the edges in one line."""
-        edges = sorted(
-            f"{edge.parent}:{frame}{' (static)' * edge.is_static}"
-            for frame, edge in self.edges.items()
-        )
+        edges = []
+        for frame, edge in self.edges.items():
+            suffix = " (static)" if edge.is_static else ""
+            edges.append(f"{edge.parent}:{frame}{suffix}")
+        edges.sort()
         if len(edges) > _MOST_LISTED:
             edges[_MOST_LISTED:] = [f"and {len(edges) - _MOST_LISTED} more"]
         return f"it has {', '.join(edges) or 'none'}"
