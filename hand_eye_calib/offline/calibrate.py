@@ -18,7 +18,7 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import CrossCheck
 
 MethodName: TypeAlias = Literal[
-    "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive"
+    "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive", "robust"
 ]
 _Measures: TypeAlias = Literal["auto", "poses", "positions", "rotations", "rates"]
 _Invert: TypeAlias = Literal["none", "poses", "orientations"]

@@ -82,7 +82,7 @@ def test_noise_free_truth_is_found(method, seed, truth):
     assert solution.converged
     np.testing.assert_allclose(solution.T_parent_child, truth, atol=1e-6)
     assert solution.objective == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_array_equal(solution.weights, np.ones(N_POSES - 1))
+    np.testing.assert_allclose(solution.weights, np.ones(N_POSES - 1), atol=1e-12)
 
 
 @pytest.mark.parametrize("method", PAPER_METHODS)

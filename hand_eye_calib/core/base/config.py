@@ -54,6 +54,7 @@ METHODS = {
     "dnl": MethodRecord(backends=BACKENDS),
     **dict.fromkeys(("park", "taylor", "zhuang", "ali"), MethodRecord()),
     "adaptive": MethodRecord(uses_reference=False, rejects_outliers=True),
+    "robust": MethodRecord(rejects_outliers=True),
 }
 
 
@@ -156,8 +157,8 @@ class CalibratorConfig(OptionSet):
     method: str = option(
         "auto",
         "How the extrinsic is solved; auto: adaptive, dnlo where its noise model cannot work, and "
-        "dnlo if a reference is given; dnlo rejects outliers, adaptive estimates the noise and "
-        "uses no reference, the others use all motion pairs.",
+        "dnlo if a reference is given; dnlo rejects outliers, robust weights them down, adaptive "
+        "estimates the noise and uses no reference, the others use all motion pairs.",
         choices=tuple(METHODS),
     )
     reference: str = option(

@@ -30,6 +30,7 @@ from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Sol
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
+from hand_eye_calib.core.solvers.robust import solve_best_stride
 
 # Largest share of the increments that may be jumps without a warning. With jumps at a tenth of the
 # poses of both trajectories, a fifth of the increments are jumps.
@@ -388,7 +389,10 @@ def _solve_pairs(
     reason = ""
     spread = _no_spread()
     warnings: tuple[str, ...] = ()
-    if reference == "auto":
+    if reference == "auto" and method.name == "robust":
+        _, reference = solve_best_stride(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+        reason = f"{reference}: of all numbers of poses, its covariance is the smallest"
+    elif reference == "auto":
         from hand_eye_calib.core.assessment.reference_selection import select_reference
 
         choice = select_reference(pose_pairs, replace(method, backend="fast"), solution=adaptive)

@@ -2,17 +2,25 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
-from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, require_backend
+from hand_eye_calib.core.base.config import CalibratorConfig, require_backend
 from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
-from hand_eye_calib.core.solvers import all_pairs, certificate, dnlo, quadratic_form, zhuang
+from hand_eye_calib.core.solvers import (
+    all_pairs,
+    certificate,
+    dnlo,
+    quadratic_form,
+    robust,
+    zhuang,
+)
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-# Signature: pairs, plus threshold and min_inlier_fraction for methods that reject outliers.
+# Arguments: motion pairs; for dnlo also a threshold and the least share of inliers.
 _SOLVERS: dict[str, Callable[..., Solution]] = {
     "dnlo": dnlo.solve,
     "dnl": all_pairs.solve_dnl,
@@ -20,6 +28,7 @@ _SOLVERS: dict[str, Callable[..., Solution]] = {
     "taylor": all_pairs.solve_park,
     "zhuang": zhuang.solve,
     "ali": all_pairs.solve_ali,
+    "robust": robust.solve,
 }
 
 
@@ -72,7 +81,7 @@ class Method:
             from hand_eye_calib.core.solvers import ipopt
 
             solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
-        if METHODS[self.name].rejects_outliers:
+        if self.name == "dnlo":
             return solve(pairs, self.threshold, self.min_inlier_fraction)
         return solve(pairs)
 
@@ -109,4 +118,7 @@ class Method:
             return dnlo.solve_without(
                 pairs, solution, left_out, self.threshold, self.min_inlier_fraction
             )
-        return np.stack([self.solve(pairs[~row]).T_parent_child for row in left_out])
+        solve = self.solve
+        if self.name == "robust":
+            solve = partial(robust.solve, T_start=solution.T_parent_child)
+        return np.stack([solve(pairs[~row]).T_parent_child for row in left_out])

@@ -1,0 +1,85 @@
+"""The robust least squares."""
+
+import numpy as np
+import pytest
+from motions import (
+    T_PARENT_CHILD,
+    child_of,
+    disturbed,
+    noisy_pair,
+    planar_poses,
+    wandering_poses,
+)
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
+from hand_eye_calib.core.solvers.robust import solve, solve_best_stride
+
+N_POSES = 400
+SIGMA_M = 0.004
+SIGMA_RAD = 0.002
+
+
+def noisy_poses(seed):
+    """Poses (N_POSES, 4, 4) of both sensors with white noise."""
+    parent = wandering_poses(N_POSES, seed)
+    child = child_of(parent)
+    noisy_parent = disturbed(parent, [seed, 1], SIGMA_M, SIGMA_RAD)
+    noisy_child = disturbed(child, [seed, 2], SIGMA_M, SIGMA_RAD)
+    return noisy_parent, noisy_child
+
+
+def error_of(solution):
+    return se3.log(se3.inverse(T_PARENT_CHILD) @ solution.T_parent_child)
+
+
+class TestSolver:
+    @pytest.mark.parametrize("share", [0.0, 0.1, 0.3])
+    def test_outliers_hardly_move_the_answer(self, share):
+        rng = np.random.default_rng(8)
+        parent, child = noisy_poses(8)
+        pairs = motion_pairs(parent, child, "B5")
+        clean = solve(pairs)
+        motions = pairs.Ts_childi_childj.copy()
+        is_outlier = rng.random(len(motions)) < share
+        motions[is_outlier] = se3.exp(rng.normal(size=(is_outlier.sum(), 6)))
+        spoilt = solve(type(pairs)(**{**vars(pairs), "Ts_childi_childj": motions}))
+        moved = np.abs(se3.log(se3.inverse(clean.T_parent_child) @ spoilt.T_parent_child))
+        sigmas = np.sqrt(np.diag(clean.cov_parent_child_in_child))
+        assert (moved < 3.0 * sigmas).all()
+
+    @pytest.mark.parametrize("reference", ["B1", "B5", "B10"])
+    def test_covariance_counts_that_motions_overlap(self, reference):
+        nees = []
+        for seed in range(30):
+            solution = solve(motion_pairs(*noisy_poses(seed), reference))
+            error = error_of(solution)
+            nees.append(error @ np.linalg.solve(solution.cov_parent_child_in_child, error))
+        # Six degrees of freedom; few independent motions widen the distribution.
+        assert 4.0 < np.mean(nees) < 11.0, "covariance is of the wrong size"
+
+    def test_flat_ground_leaves_the_height_open(self):
+        parent = planar_poses(200)
+        mount = se3.from_rotation_translation(np.eye(3), [0.4, -0.2, 0.7])
+        solution = solve(motion_pairs(parent, child_of(parent, mount), "B3"))
+        np.testing.assert_allclose(np.abs(solution.unseen[:, 0]), [0, 0, 1, 0, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(solution.T_parent_child[:2], mount[:2], atol=1e-6)
+
+    def test_the_stride_with_the_smallest_covariance_is_taken(self):
+        parent, child = noisy_poses(3)
+        best, reference = solve_best_stride(parent, child)
+        assert reference != "B1"
+        short = solve(motion_pairs(parent, child, "B1"))
+        of_best = np.linalg.slogdet(best.cov_parent_child_in_child)[1]
+        assert of_best < np.linalg.slogdet(short.cov_parent_child_in_child)[1]
+
+
+class TestMethod:
+    def test_calibrate_says_which_stride_it_took(self):
+        parent, child = noisy_pair(wandering_poses(N_POSES, 5), 5, SIGMA_M, SIGMA_RAD)
+        result = hec.calibrate(parent, child, method="robust")
+        assert result.method == "robust"
+        assert result.reference_reason.startswith(f"{result.reference}: ")
+        errors = np.abs(se3.deviation(result.T_parent_child, T_PARENT_CHILD))
+        assert (errors < 4.0 * result.sigmas_measured).all()
