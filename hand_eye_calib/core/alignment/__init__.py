@@ -1,1 +1,1 @@
-"""Clock offset and scale of the child's stream, found before a method can solve."""
+"""Clock offset, clock rate and scale between two streams."""

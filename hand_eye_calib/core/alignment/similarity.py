@@ -1,18 +1,17 @@
-"""Robust fit of extrinsic, scale and time offset together, and of how much motion it leaves
-unexplained.
+"""Robust fit of extrinsic, scale and time offset.
 
-The methods of this package assume one clock and one unit of length. If that is not known, this fit
-comes first. It finds X, the factor s of the child's lengths and a correction d of the clock offset
-from the same motion pairs,
+Model: X = (R, t), the factor s of the child's lengths and a correction d of the clock offset
+satisfy for all motion pairs A, B
 
     (R_A - I) t + t_A = s R t_B,      R_A R = R R_B,      B = B(d).
 
-It needs no start value and tolerates a minority of outliers. Its scale and offset hold for every
-method. Its residuals tell whether both streams can be on one rigid body.
+The methods of this package assume one clock and one unit of length; this fit comes first if these
+are not known. The fit needs no start value and tolerates a minority of outliers. Its residuals
+decide whether both streams can be on one rigid body.
 
-A start is found on random small subsets: their linear relaxation is the quadratic form of
-:mod:`~hand_eye_calib.core.solvers.quadratic_form` over (vec M, t, 1) with any 3 x 3 matrix M for s
-R. Gauss-Newton steps with Geman-McClure weights follow.
+Starts come from random small subsets of the pairs: the quadratic form of
+:mod:`~hand_eye_calib.core.solvers.quadratic_form` over (vec M, t, 1) is minimised with any 3 x 3
+matrix M for s R. Gauss-Newton steps with Geman-McClure weights follow.
 """
 
 from collections.abc import Sequence
@@ -28,47 +27,66 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers import all_pairs, quadratic_form
 
-# Starts: so many random subsets of each size, of so many pairs; and how many are refined.
+# Number of random subsets for starts.
 _SUBSETS = 32
+
+# Sizes of the subsets, in motion pairs.
 _SUBSET_SIZES = (12, 24, 48)
+
+# Largest number of motion pairs that the subsets are drawn from.
 _MAX_RANKED_PAIRS = 300
+
+# Number of starts that are refined.
 _REFINED_STARTS = 3
-# Steps end below this share of a standard deviation in every direction that is determined.
+
+# Largest number of Gauss-Newton steps.
 _MAX_STEPS = 30
+
+# Gauss-Newton ends with a step below this many standard deviations.
 _STEP_TOLERANCE = 1e-2
 
-# Residuals of this many standard deviations have a quarter of the weight.
+# Residual, in standard deviations, whose weight is a quarter.
 _TUNING = 3.0
 
-# Blocks of time, for the jackknife and for a clock that drifts.
+# Number of blocks of time, for the jackknife and for a clock rate.
 _N_BLOCKS = 10
 
-# A fit that leaves no more than this share of the motion unexplained ends the search for others.
+# Unexplained share of the motion that ends the search for other fits.
 EXPLAINED = 0.03
 
-# Largest share of the translations that may stay unexplained for the scale and the offset of a fit
-# to mean something.
+# Largest unexplained share of the translations with which the scale and the offset of a fit count.
 _MAX_UNEXPLAINED_TRANSLATION = 0.3
 
-# Smallest standard deviations: of rotations (rad), and of translations as a share of the motion.
-# Smaller ones are rounding.
+# Smallest standard deviation of rotations (rad): smaller ones are rounding.
 _MIN_SIGMA_ROTATION = 1e-7
+
+# Smallest standard deviation of translations, as a share of the motion.
 _MIN_SIGMA_TRANSLATION = 1e-9
 
-# Fewer motions are not compared. For the scale they are over these times (s); that of the smallest
-# relative standard deviation wins. Long motions show the scale best.
+# Smallest number of motion pairs of a fit.
 MIN_PAIRS = 20
+
+# Durations (s) of the motions that are compared for the scale; long motions determine it best.
 _SCALE_LAGS_S = (3.0, 1.0, 8.0)
 
-# A scale differs from 1 if it is off by more than this and by so many standard deviations, and if
-# the fit leaves less than this of the motion unexplained: many jumps could imitate a scale.
+# Smallest difference of a scale from 1 that counts.
 _MIN_DIFFERENCE = 0.01
+
+# Smallest such difference in standard deviations.
 _MIN_SIGMAS = 5.0
+
+# Largest unexplained share of the translations with which a scale may differ from 1: many jumps
+# imitate a scale.
 _MAX_UNEXPLAINED_TO_DIFFER = 0.1
 
-# Unknowns: (rho, phi), the logarithm of the scale, and the offset.
-_UNKNOWNS = [*"xyz", "roll", "pitch", "yaw", "scale", "offset"]
-_SCALE, _OFFSET = map(_UNKNOWNS.index, ("scale", "offset"))
+# Number of unknowns: rho (3), phi (3), log s, d.
+_N_UNKNOWNS = 8
+
+# Index of log s.
+_SCALE = 6
+
+# Index of d.
+_OFFSET = 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,34 +100,36 @@ class SimilarityFit:
     scale : float
         s: factor from the child's unit of length to the parent's.
     offset_s : float
-        d: seconds to add to the child's stamps, beyond what was added already. 0 without twists.
+        d: seconds to add to the child's stamps, besides the offset that they have. 0 without
+        twists.
     sigmas : (8,) array
         Standard deviations of (rho, phi, log s, d), by the delete-a-block jackknife over time. Zero
         for d without twists.
     scale_sigma, offset_sigma_s : float
-        Those of s and d.
+        Standard deviations of s and d.
     sensitivity : (6, 2) array
-        Derivative of (rho, phi) by log s and by d.
+        Derivatives of (rho, phi) by log s and by d.
     offsets_of_blocks : (2, B) array
-        By how much d would differ in each block of time, X and s as they are, and the weight of
-        that. Zero without twists.
+        Differences of d in each block of time at this X and s, and the weights of the differences.
+        Zero without twists.
     held : float
-        Those offsets, steps with fixed robust weights, as a share of what they should be.
+        Ratio of these differences to the right ones: steps with fixed robust weights are too short.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
     unexplained_translation, unexplained : float
-        Unexplained share of the translations, and of the motion, translation and rotation together:
-        the former over the root mean square of the parent's translations or of the child's times s,
-        whichever are smaller: a scale near zero explains nothing, however small the residuals. If
-        the scale is kept at 1, whichever are larger.
+        Unexplained share of the translations, and of the whole motion. The former is relative to
+        the root mean square of the parent's translations or of the child's times s, the smaller of
+        both: a scale near zero explains nothing, however small the residuals. If the scale is kept
+        at 1, the larger of both.
     explains_translation : bool
         Whether the fit explains enough of the translations to trust its scale and offset.
-    is_in_one_unit, has_own_unit : bool
-        Whether the lengths of both streams clearly do not differ by enough to matter; and whether
-        they do, significantly.
+    is_in_one_unit : bool
+        Whether s is certainly within 1 % of 1.
+    has_own_unit : bool
+        Whether s certainly differs from 1 by more than 1 %.
     scale_bias : float
-        By how much s differs from the scale with the streams exchanged, as noise of the child makes
-        it. Computed if the lengths differ significantly, otherwise zero.
+        Difference of s from the scale with the streams exchanged, which noise of the child causes.
+        Zero unless the lengths differ significantly.
     """
 
     T_parent_child: FloatArray
@@ -145,15 +165,15 @@ def fit_similarity(
     pairs : MotionPairs
         K pairs in order of time, K >= 4.
     twists : ((K, 6) array, (K, 6) array), optional
-        Velocity of the child sensor in its own frame, (v in m/s, w in rad/s), at the start and the
-        end of every pair.
-    start : SimilarityFit, optional
-        Fit whose X and scale to start at; a start is searched for without one.
+        Velocities of the child sensor in its own frame, (v in m/s, w in rad/s), at the start and
+        the end of every pair.
+    start : SimilarityFit or (4, 4) array, optional
+        Fit or X to start at; without one, starts are searched for.
     same_unit : bool
-        Keep the scale at 1. A sensor that the body only rotates about hardly moves, and any small
-        scale would do.
-    most : float
-        Starts that leave more than this share unexplained are not refined; by default, all are.
+        Keep the scale at 1. If the body only rotates about a sensor, that sensor hardly moves, and
+        any small scale would fit.
+    most : float, optional
+        Starts that leave more than this share of the motion unexplained are not refined.
 
     Returns
     -------
@@ -172,23 +192,23 @@ def fit_similarity(
             if fits[-1].unexplained < EXPLAINED:
                 break
     fits = fits or [problem.describe(T, scale, 0.0)]
-    # The volume that the residuals spread over, in the smaller unit of length.
+    # The smallest volume of the residuals, in the smaller unit of length.
     return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
 
 
 def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
-    Noise of the child makes the factor too small, as that of any regressor does, and the standard
-    deviation does not contain that. With the streams exchanged it is too large. The child has a
-    unit of its own only if both fits say so.
+    Noise of the child makes the factor too small, as noise of any regressor does; the standard
+    deviation does not contain this bias. With the streams exchanged the factor is too large. The
+    child has a unit of its own only if both fits find one.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     known : sequence of SimilarityFit, optional
-        Fits of the same streams over the first of the times that are compared; a start is searched
-        for without any.
+        Fits of the same streams over the first of the durations that are compared; without them, a
+        start is searched for.
 
     Raises
     ------
@@ -224,22 +244,21 @@ def _best_scale(
             f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "
             f"{MIN_PAIRS} of them are {min(_SCALE_LAGS_S):g} s apart; record longer, or give scale"
         )
-    # By the relative standard deviation, plus the unexplained share if the fit does not hold.
-    unexplained = [0.0 if fit.explains_translation else fit.unexplained_translation for fit in fits]
-    doubts = [
-        fit.scale_sigma / fit.scale + more for fit, more in zip(fits, unexplained, strict=True)
-    ]
-    return fits[int(np.argmin(doubts))]
+
+    def doubt(fit: SimilarityFit) -> float:
+        relative_sigma = fit.scale_sigma / fit.scale
+        return relative_sigma + (0.0 if fit.explains_translation else fit.unexplained_translation)
+
+    return min(fits, key=doubt)
 
 
 def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, SimilarityFit | None]:
-    """The scale to use, given or estimated as the option ``scale`` asks for, and the fit that it
-    comes from if it was estimated.
+    """Return the scale that the option ``scale`` asks for, and its fit if the scale is estimated.
 
     Raises
     ------
     NotEnoughDataError
-        If it is to be estimated and cannot be.
+        If the option asks for an estimate and the scale cannot be estimated.
     """
     if not isinstance(option, str):
         return option, None
@@ -264,8 +283,10 @@ def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, Sim
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
-    """The most promising (X, scale): answers of random subsets of the pairs, one of which without
-    outliers suffices, and of all pairs with the start rotations of dnl.
+    """Return the best starts (X, scale).
+
+    Candidates are the solutions of random subsets of the pairs, of which one without outliers
+    suffices, and those of all pairs at the start rotations of dnl.
     """
     ranked = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
     parent = ranked.Ts_parenti_parentj.copy()
@@ -307,7 +328,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
 
 
 class _Problem:
-    """Residuals of all pairs, their derivatives, and the iteration."""
+    """Residuals of all motion pairs, their derivatives, and the Gauss-Newton iteration."""
 
     def __init__(
         self, pairs: MotionPairs, twists: tuple[FloatArray, FloatArray] | None, same_unit: bool
@@ -323,15 +344,17 @@ class _Problem:
         self.quats_a = se3.to_quat_xyzw(rotation_a)
         self.quats_b = se3.to_quat_xyzw(rotation_b)
         self.skew_b = se3.skew(self.translation_b)
-        lengths = (np.linalg.norm(Ts[:, :3, 3]) / len(pairs) ** 0.5 for Ts in (A, B))
-        self.rms_a, self.rms_b = map(float, lengths)
+        self.rms_a = float(np.linalg.norm(A[:, :3, 3]) / len(pairs) ** 0.5)
+        self.rms_b = float(np.linalg.norm(B[:, :3, 3]) / len(pairs) ** 0.5)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
         self.free = list(range(_SCALE))
-        self.free += [] if same_unit else [_SCALE]
-        self.free += [] if twists is None else [_OFFSET]
+        if not same_unit:
+            self.free.append(_SCALE)
+        if twists is not None:
+            self.free.append(_OFFSET)
         twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
-        # Derivatives of B by d. Adding to the child's stamps moves its poses at given instants
-        # back.
+        # Derivatives of B by d: with d added to its stamps, the child is at every instant where it
+        # was d before.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
         self.rotation_by_offset = rotated_i - twists_j[:, 3:]
         moved_i = twists_i[:, :3] + se3.cross(twists_i[:, 3:], self.translation_b)
@@ -341,14 +364,22 @@ class _Problem:
     def rows(
         self, T: FloatArray, scale: float, offset_s: float = 0.0
     ) -> tuple[list[FloatArray], tuple[float, float], FloatArray]:
-        """Derivatives of the residuals of translation and of rotation, in the parent's axes, by
-        (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; the residuals in the last
-        column. Two (K, 3, 9) arrays in standard deviations and times their robust weights, these
-        deviations per axis (m, rad), and these weights (K,).
+        """Return the weighted derivatives and residuals at X, s and d.
+
+        Returns
+        -------
+        parts : list of two (K, 3, 9) arrays
+            Derivatives of the residuals of translation and of rotation, in the parent's axes, by
+            (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; in the last column the
+            residuals. All are in standard deviations, times the roots of the robust weights.
+        sigmas : (float, float)
+            Standard deviations per axis of the residuals, m and rad.
+        root : (K,) array
+            Roots of the robust weights.
         """
         rotation = T[:3, :3]
         back = T[:3, :3].T
-        of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, len(_UNKNOWNS) + 1))
+        of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _N_UNKNOWNS + 1))
         of_translation[:, :, :3] = _times(self.chord_a, rotation)
         of_translation[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
         of_translation[:, :, _SCALE] = -scale * self.translation_b @ back
@@ -380,14 +411,14 @@ class _Problem:
         return parts, sigmas, root
 
     def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
-        """X, scale and offset after Gauss-Newton steps with robust weights until they are small."""
+        """Return X, scale and offset after Gauss-Newton steps with robust weights."""
         offset_s = 0.0
         for _ in range(_MAX_STEPS):
-            moments = np.zeros((len(_UNKNOWNS) + 1,) * 2)
+            moments = np.zeros((_N_UNKNOWNS + 1,) * 2)
             for part in self.rows(T, scale, offset_s)[0]:
-                flat = part.reshape(-1, len(_UNKNOWNS) + 1)
+                flat = part.reshape(-1, _N_UNKNOWNS + 1)
                 moments += flat.T @ flat
-            step = np.zeros(len(_UNKNOWNS))
+            step = np.zeros(_N_UNKNOWNS)
             step[self.free] = -solve(moments, self.free)
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             T = se3.retracted(T, step[:6])
@@ -398,8 +429,11 @@ class _Problem:
         return T, scale, offset_s
 
     def shares(self, sigmas: tuple[float, float], scale: float) -> tuple[float, float]:
-        """Unexplained shares of translations and motion, from the residuals' sigmas (m, rad)."""
-        # Of the stream that moves less or, with one unit of length, of the one that moves more.
+        """Return the unexplained shares of the translations and of the motion.
+
+        ``sigmas`` are the standard deviations of the residuals, m and rad.
+        """
+        # Relative to the stream that moves less; to the one that moves more if the scale is fixed.
         lengths = (self.rms_a, scale * self.rms_b)
         rms_translation = min(lengths) if _SCALE in self.free else max(lengths)
         of_translation = sigmas[0] / max(rms_translation, 1e-12)
@@ -407,15 +441,16 @@ class _Problem:
         return of_translation, float(np.hypot(of_translation, of_rotation))
 
     def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
-        """The result, with its uncertainty."""
+        """Return the fit at X, s and d with its uncertainty."""
         parts, sigmas_of_residuals, root = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
         blocks = Blocks.of_rows(rows, min(_N_BLOCKS, len(rows)))
-        sigmas = np.zeros(len(_UNKNOWNS))
+        sigmas = np.zeros(_N_UNKNOWNS)
         sigmas[self.free] = np.sqrt(np.diag(blocks.jackknife(self.free)))
-        by = [-solve(blocks.total, range(_SCALE), column) for column in (_SCALE, _OFFSET)]
+        by_scale = -solve(blocks.total, range(_SCALE), _SCALE)
+        by_offset = -solve(blocks.total, range(_SCALE), _OFFSET)
         weights = blocks.sums[:, _OFFSET, _OFFSET]
-        # Robust weights fall as the offset moves, so that a step is shorter than it should be.
+        # A step with fixed robust weights is too short: the weights fall as the offset moves.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
         fall = pulls.sum() / (1.5 * _TUNING**2) / max(weights.sum(), 1e-300)
         held = float(np.clip(1.0 - fall, 0.5, 1.0))
@@ -431,7 +466,7 @@ class _Problem:
             sigmas=sigmas,
             scale_sigma=scale_sigma,
             offset_sigma_s=float(sigmas[_OFFSET]) / held,
-            sensitivity=np.column_stack(by),
+            sensitivity=np.column_stack([by_scale, by_offset]),
             offsets_of_blocks=np.stack([offsets, weights]),
             held=held,
             sigma_translation=sigmas_of_residuals[0],
@@ -445,5 +480,5 @@ class _Problem:
 
 
 def _times(matrices: FloatArray, right: FloatArray) -> FloatArray:
-    """``matrices @ right`` for (K, 3, 3) and (3, 3), in one product."""
+    """Return ``matrices @ right`` for (K, 3, 3) and (3, 3), by one product."""
     return (matrices.reshape(-1, 3) @ right).reshape(-1, 3, 3)

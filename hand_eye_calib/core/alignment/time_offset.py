@@ -1,10 +1,13 @@
-"""The clock offset: seconds to add to the child's stamps to get the parent's clock, and by how much
-that changes from second to second.
+"""Offset and rate of the child's clock.
 
-Two sensors on one rigid body rotate through the same angle in the same time, however they are
-mounted. So the offset at which their angular rates agree best is that of the clocks, coarsely. This
-needs no extrinsic, no common world, no common scale and no particular quaternion order: reordered
-or inverted quaternions have the same angles. Then it is refined together with X.
+The offset is the seconds to add to the child's stamps to get the parent's clock. The rate is the
+change of the offset per second.
+
+Model: two sensors on one rigid body rotate through the same angle in the same time, however they
+are mounted. The coarse offset is that with the best correlation of their angular rates. It needs no
+extrinsic, no common world, no common scale and no particular quaternion order: reordered or
+inverted quaternions have the same angles. The fine offset is estimated together with X and the
+scale (:mod:`~hand_eye_calib.core.alignment.similarity`).
 """
 
 from dataclasses import dataclass, replace
@@ -18,87 +21,109 @@ from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
 from hand_eye_calib.core.base.stats import quantile
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, repetitions
-from hand_eye_calib.core.pairing.motion_pairs import MAX_PAIRS, find_leap, pairs_over, synchronise
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MAX_PAIRS,
+    MotionPairs,
+    find_leap,
+    pairs_over,
+    synchronise,
+)
 from hand_eye_calib.core.results.records import ClockRate
 
-# Angles are taken over windows of this many sampling steps, and at least so long, so that the noise
-# of single poses does not hide the motion. Sampling steps are within bounds, and at most so many.
+# Length of a window in which an angle is measured, in sampling steps: noise of single poses must
+# not exceed the motion.
 _WINDOW_STEPS = 3
+
+# Smallest length of a window (s).
 _MIN_WINDOW_S = 0.2
+
+# Bounds of the sampling step (s).
 _MIN_STEP_S = 0.02
 _MAX_STEP_S = 1.0
+
+# Largest number of sampling steps.
 _MAX_SAMPLES = 200_000
 
-# Angular rates above those of all but this share of the windows are clipped: jumps of a stream are
-# not motion.
+# Share of the windows whose angular rates are clipped: jumps of a stream are not motion.
 _CLIPPED_SHARE = 0.03
 
-# Offsets are considered if at least this share of the shorter stream, and this long, overlaps.
+# Smallest overlap at an offset: share of the shorter stream, and duration (s).
 _MIN_OVERLAP_SHARE = 0.25
 _MIN_OVERLAP_S = 5.0
 
-# Another offset is a rival only beyond this distance: close to the peak the correlation is high
-# anyway.
+# Smallest distance of a rival from the best offset, in seconds and in windows: close to the peak,
+# the correlation is always high.
 _PEAK_WIDTH_S = 2.0
 _PEAK_WIDTH_WINDOWS = 5.0
 
-# Streams of one body are 5 to 12 times better correlated at their offset than at any other,
-# unrelated streams at most 1.3 times (measured on sixteen real recordings).
+# Smallest ratio of the significance of the best offset to that of its best rival. In sixteen real
+# recordings the ratio was 5 to 12 for streams of one body, and at most 1.3 for unrelated streams.
 _DISTINCT = 2.0
+
+# Smallest correlation coefficient that counts.
 _CORRELATED = 0.5
 
-# Poses that are repeated for so long (s) may be those of a stream that froze.
+# Shortest repetition of a pose (s) that may come from a frozen stream.
 _REPEATS_S = 1.0
 
-# Smallest standard deviation of the angular rate (rad/s) that can be correlated.
+# Smallest standard deviation of an angular rate (rad/s) for a correlation.
 MIN_VARIATION = 0.01
 
-# Motions over these times (s) are compared; the lag with the smallest standard deviation wins.
-# Short motions show the offset best. Most motions that are compared if there is a rate to be
-# measured.
+# Durations (s) of the motions of the fits. The fit with the smallest standard deviation is used;
+# short motions determine the offset best.
 _LAGS_S = (1.0, 0.3, 3.0)
+
+# Largest number of motions of a fit with a clock rate.
 _PAIRS_OF_RATE = 5 * MAX_PAIRS
 
-# Time on either side of a stamp (s) over which the child's velocity is taken: at least; at most; in
-# intervals of the child's stream, so that no pose is in the velocity and in the motion; and in
-# standard deviations of rotations by the angular rate, so that noise is little of the velocity.
-# Noise in both, or much of it, draws the offset, and its standard deviation is too small.
-_LEAST_SPAN_S = 0.05
-_MOST_SPAN_S = 0.3
+# Half of the span of time over which the child's velocity at a stamp is measured. The span must not
+# contain poses of the motion, and noise must be a small share of the velocity: otherwise the offset
+# is biased and its standard deviation is too small. Bounds in seconds.
+_MIN_SPAN_S = 0.05
+_MAX_SPAN_S = 0.3
+
+# Smallest half span, in intervals of the child's stream.
 _SPAN_INTERVALS = 2.0
+
+# Smallest half span, in standard deviations of rotations over the angular rate.
 _SPAN_OF_NOISE = 1.4
 
+# Largest number of linearisations of a fit.
 _MAX_ROUNDS = 8
+
+# Change of the offset (s) that ends the linearisations.
 _SETTLED_S = 2e-5
 
-# A rate of the clock is known to this beforehand (75 ppm are usual for USB devices); one beyond so
-# many standard deviations is there.
+# Prior standard deviation of a clock rate (75 ppm are usual for USB devices).
 _RATE_PRIOR = 1e-4
-_PLAIN_RATE = 4.0
 
-# Most that the fine offset may differ from the coarse one: seconds, or intervals of the slower
-# stream if those are longer.
+# Smallest clock rate that is used, in standard deviations.
+_CLEAR_RATE = 4.0
+
+# Largest difference between fine and coarse offset, in seconds and in intervals of the slower
+# stream; the longer of both counts.
 _FINE_RANGE_S = 0.25
 _FINE_RANGE_INTERVALS = 2.0
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """Best correlation of the angular rates of two streams, over all clock offsets; by default no
-    evidence of any.
+    """Best correlation of the angular rates of two streams over all clock offsets.
+
+    The defaults mean no evidence of any offset.
 
     Attributes
     ----------
     offset_s : float
-        Seconds to add to the child's stamps; accurate to about a tenth of a sampling step.
+        Seconds to add to the child's stamps, accurate to about a tenth of a sampling step.
     correlation : float
         Correlation coefficient of the angular rates at that offset.
     distinctness : float
-        Ratio of its significance to that of the best rival.
+        Ratio of the significance of that offset to that of its best rival.
     variation : float
-        Standard deviation of the angular rate, of the stream that varies less, rad/s.
+        Standard deviation of the angular rate (rad/s) of the stream that varies less.
     ratio : float
-        Of the child's angular rates to the parent's.
+        Ratio of the child's angular rates to the parent's.
     """
 
     offset_s: float = 0.0
@@ -113,8 +138,9 @@ class Correlation:
         return not self.doubt()
 
     def doubt(self, quantity: str = "angular rates") -> str:
-        """What is wrong with the evidence, in words; empty if nothing is. ``quantity`` is what was
-        correlated.
+        """Return what is wrong with the evidence of an offset; empty if nothing is.
+
+        ``quantity`` names what was correlated.
         """
         if self.variation < MIN_VARIATION:
             return "the streams hardly rotate, or rotate at a constant rate"
@@ -137,33 +163,43 @@ def correlate_rates(
     max_gap_s: float = CalibratorConfig.max_gap,
     of_speed: bool = False,
 ) -> Correlation:
-    """Find the clock offset at which the angular rates of two streams agree best, or their speeds,
-    for sensors without an orientation; there is no evidence if a stream is too short.
+    """Find the clock offset with the best correlation of the angular rates of two streams.
 
-    Windows that touch a gap between poses longer than ``max_gap_s`` are left out. The time ranges
-    of both need not overlap.
+    The time ranges of the streams need not overlap. A stream that is too short gives no evidence.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+    max_gap_s : float
+        Windows that touch a longer gap between poses are left out.
+    of_speed : bool
+        Correlate speeds instead, for a sensor without orientation.
     """
     if min(len(parent), len(child)) < 4:
         return Correlation()
     step_s = float(np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S))
     step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
-    of_parent, of_child = (
-        angular_rates(each, window_s, step_s, max_gap_s, of_speed) for each in (parent, child)
-    )
-    if min(np.isfinite(each).sum() for each in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
+    parent_rates = angular_rates(parent, window_s, step_s, max_gap_s, of_speed)
+    child_rates = angular_rates(child, window_s, step_s, max_gap_s, of_speed)
+    if _shorter_s(parent_rates, child_rates, step_s) < _MIN_OVERLAP_S:
         return Correlation()
     start_s = float(parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
-    best = _best_correlation(of_parent, of_child, start_s, step_s, window_s)
+    best = _best_correlation(parent_rates, child_rates, start_s, step_s, window_s)
     if best.is_clear:
         return best
-    # A stream that froze for a while hides the offset.
-    for stream, rates in ((parent, of_parent), (child, of_child)):
-        _leave_out_repetitions(stream, rates, step_s, window_s)
-    if min(np.isfinite(rates).sum() for rates in (of_parent, of_child)) * step_s < _MIN_OVERLAP_S:
+    # Poses that a frozen stream repeats may hide the offset.
+    _leave_out_repetitions(parent, parent_rates, step_s, window_s)
+    _leave_out_repetitions(child, child_rates, step_s, window_s)
+    if _shorter_s(parent_rates, child_rates, step_s) < _MIN_OVERLAP_S:
         return best
-    without = _best_correlation(of_parent, of_child, start_s, step_s, window_s)
+    without = _best_correlation(parent_rates, child_rates, start_s, step_s, window_s)
     return without if without.is_clear else best
+
+
+def _shorter_s(parent_rates: FloatArray, child_rates: FloatArray, step_s: float) -> float:
+    """Return the duration (s) of the finite rates of the stream that has fewer."""
+    return min(np.isfinite(parent_rates).sum(), np.isfinite(child_rates).sum()) * step_s
 
 
 def _leave_out_repetitions(
@@ -180,8 +216,9 @@ def _leave_out_repetitions(
 def _best_correlation(
     of_parent: FloatArray, of_child: FloatArray, start_s: float, step_s: float, window_s: float
 ) -> Correlation:
-    """Return the best correlation of rates (M,), (N,) over all lags; ``start_s`` is the parent's
-    first stamp less the child's.
+    """Return the best correlation of rates (M,) and (N,) over all lags.
+
+    ``start_s`` is the parent's first stamp less the child's.
     """
     lags, coefficients, overlaps, ratios = _masked_correlation(of_parent, of_child)
     durations = overlaps * step_s
@@ -210,8 +247,10 @@ def _best_correlation(
 def angular_rates(
     trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float, of_speed: bool = False
 ) -> FloatArray:
-    """Angular rates (M,), rad/s, or speeds, m/s, over windows of ``window_s`` seconds that start
-    every ``step_s`` seconds; NaN for windows that touch a gap.
+    """Return angular rates (M,) in rad/s, or speeds in m/s, of windows of a trajectory.
+
+    Windows of ``window_s`` seconds start every ``step_s`` seconds. Windows that touch a gap of more
+    than ``max_gap_s`` are NaN.
     """
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
@@ -233,8 +272,19 @@ def angular_rates(
 def _masked_correlation(
     first: FloatArray, second: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Lags, correlation coefficients, counts of common samples, and how many times the second is as
-    large, of rates: first[i + lag] against second[i], NaNs left out.
+    """Correlate rates (M,) and (N,) at all lags: ``first[i + lag]`` with ``second[i]``.
+
+    NaNs are left out (masked normalised cross-correlation by FFT, Padfield 2012).
+
+    Returns
+    -------
+    lags : (L,) int array
+    coefficients : (L,) array
+        Correlation coefficients.
+    counts : (L,) array
+        Numbers of common samples.
+    ratios : (L,) array
+        Ratios of the second rates to the first.
     """
     size = 1 << (len(first) + len(second) - 1).bit_length()
     spectra = []
@@ -256,18 +306,18 @@ def _masked_correlation(
     square_b = np.fft.irfft(one_a * bb, size)
     variance_a = square_a - sum_a**2 / divisor
     variance_b = square_b - sum_b**2 / divisor
-    varied = variance_a > 1e-9 * square_a.max(initial=0.0)
-    varied &= variance_b > 1e-9 * square_b.max(initial=0.0)
-    scale = np.sqrt(np.where(varied, variance_a * variance_b, 1.0))
-    ratios = np.where(varied, variance_b, 1.0) / np.where(varied, variance_a, 1.0)
+    has_variance = variance_a > 1e-9 * square_a.max(initial=0.0)
+    has_variance &= variance_b > 1e-9 * square_b.max(initial=0.0)
+    scale = np.sqrt(np.where(has_variance, variance_a * variance_b, 1.0))
+    ratios = np.where(has_variance, variance_b, 1.0) / np.where(has_variance, variance_a, 1.0)
     lags = np.arange(size)
     lags = np.where(lags < len(first), lags, lags - size)
-    return lags, np.where(varied, covariance / scale, 0.0), count, ratios
+    return lags, np.where(has_variance, covariance / scale, 0.0), count, ratios
 
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """An estimated clock offset; by default nothing is known of one.
+    """An estimated clock offset. The defaults mean no information.
 
     Attributes
     ----------
@@ -276,14 +326,15 @@ class TimeOffset:
     sigma_s : float
         Standard deviation.
     correlation : Correlation
-        Correlation of the angular rates that gave the coarse offset.
+        Correlation of the angular rates, with the coarse offset.
     fit : SimilarityFit or None
-        The fit that gave the fine offset; None if no fit held.
+        Fit with the fine offset; None if no fit explains the motion.
     spread_s : float
         Largest difference between the offsets from motions over different times; infinite unless
-        there is a fit over each.
+        there is a fit for each time.
     rate : ClockRate or None
-        By how much the offset changes with time; None if no fit held, or it was too short.
+        Change of the offset with time; None if no fit explains the motion, or if the recording is
+        too short.
     """
 
     seconds: float = 0.0
@@ -294,11 +345,11 @@ class TimeOffset:
     rate: ClockRate | None = None
 
     def steadied(self, child: Trajectory) -> Trajectory:
-        """The child's poses at a constant offset: with stamps freed of a rate that is used."""
+        """Return the child's poses with stamps without a clock rate, if the rate is used."""
         return child.shifted(0.0, self.rate.used, self.rate.at_ns) if self.rate else child
 
     def largest_s(self, duration_s: float) -> float:
-        """Largest size of the offset in a recording, with a rate that is used."""
+        """Return the largest size (s) of the offset in a recording, with a rate that is used."""
         changed_s = 0.5 * self.rate.used * duration_s if self.rate else 0.0
         return abs(self.seconds) + abs(changed_s)
 
@@ -309,69 +360,84 @@ def estimate_time_offset(
     max_gap_s: float = CalibratorConfig.max_gap,
     of_speed: bool = False,
 ) -> TimeOffset:
-    """Estimate the offset of the child's clock: coarse from the angular rates, then fine together
-    with X and the scale.
+    """Estimate the offset of the child's clock.
+
+    The coarse offset comes from the angular rates, the fine one from a fit with X and the scale.
 
     Parameters
     ----------
     parent, child : Trajectory
         Their time ranges need not overlap.
     max_gap_s : float
-        Longest time between two poses that interpolation may bridge, in seconds.
+        Longest gap between two poses that is interpolated across, s.
     of_speed : bool
-        From the speeds of both sensors alone, coarsely: one of them has no orientation.
+        Estimate only the coarse offset, from speeds: a sensor has no orientation.
 
     Raises
     ------
     NotEnoughDataError
-        If the evidence is weak; the message says why.
+        If the evidence is weak; the message has the reason.
     InputError
         If a stream's stamps leap by days.
     """
     for name, stream in (("parent", parent), ("child", child)):
-        if leap := find_leap(stream.stamps_ns):
+        leap = find_leap(stream.stamps_ns)
+        if leap:
             raise InputError(f"the {name} stream's {'; '.join(leap)}")
     correlation = correlate_rates(parent, child, max_gap_s, of_speed)
-    if correlation.is_clear and of_speed:
+    if not correlation.is_clear:
+        doubt = correlation.doubt("speeds" if of_speed else "angular rates")
+        raise NotEnoughDataError(
+            f"the time offset cannot be estimated: {doubt}; drive with more turns and "
+            "changes of speed, or give time_offset in seconds"
+        )
+    if of_speed:
         sigma_s = max(parent.interval_s, child.interval_s) / 5
         return TimeOffset(correlation.offset_s, sigma_s, correlation)
-    if correlation.is_clear:
-        coarse = TimeOffset(correlation.offset_s, correlation=correlation)
-        return refine_time_offset(parent, child, coarse, max_gap_s)
-    doubt = correlation.doubt("speeds" if of_speed else "angular rates")
-    raise NotEnoughDataError(
-        f"the time offset cannot be estimated: {doubt}; drive with more turns and "
-        "changes of speed, or give time_offset in seconds"
-    )
+    coarse = TimeOffset(correlation.offset_s, correlation=correlation)
+    return refine_time_offset(parent, child, coarse, max_gap_s)
 
 
 def refine_time_offset(
     parent: Trajectory, child: Trajectory, at: TimeOffset, max_gap_s: float, least_s: float = 0.0
 ) -> TimeOffset:
-    """Refine an offset ``at`` which the streams are about; the coarse one, with a wide sigma, if no
-    fit explains the motion. An offset below ``least_s`` of motions over one time need not be
-    compared with those over others.
+    """Refine a clock offset by fits of motions over several times.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+    at : TimeOffset
+        Offset to start at, with the coarse offset in its correlation.
+    max_gap_s : float
+        Longest gap between two poses that is interpolated across, s.
+    least_s : float
+        Stop after the first fit whose offset is smaller than this.
+
+    Returns
+    -------
+    TimeOffset
+        The coarse offset, with a wide standard deviation, if no fit explains the motion.
     """
     reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
     coarse_s = at.correlation.offset_s
     best = TimeOffset(coarse_s, reach_s / 5, at.correlation)
-    held = list[float]()
+    offsets_s = list[float]()
     for lag_s in _LAGS_S:
-        found = offset_over(lag_s, parent, child, at, max_gap_s, least_s)
-        at = replace(at, fit=found.fit)
-        holds = found.fit and found.fit.explains_translation
-        if not holds or abs(found.seconds - coarse_s) > reach_s:
+        offset = offset_over(lag_s, parent, child, at, max_gap_s, least_s)
+        at = replace(at, fit=offset.fit)
+        explains = offset.fit and offset.fit.explains_translation
+        if not explains or abs(offset.seconds - coarse_s) > reach_s:
             continue
-        held.append(found.seconds)
-        if found.sigma_s < best.sigma_s:
-            best = found
-        if found.largest_s(child.duration_s) < least_s:
+        offsets_s.append(offset.seconds)
+        if offset.sigma_s < best.sigma_s:
+            best = offset
+        if offset.largest_s(child.duration_s) < least_s:
             break
-    if len(held) < len(_LAGS_S):
+    if len(offsets_s) < len(_LAGS_S):
         return best
-    # What lasts for longer than the jackknife's blocks shows in how these offsets differ.
-    sigma_s = float(np.hypot(best.sigma_s, np.std(held, ddof=1)))
-    return replace(best, spread_s=np.ptp(held), sigma_s=sigma_s)
+    # Errors that last longer than the blocks of the jackknife make these offsets differ.
+    sigma_s = float(np.hypot(best.sigma_s, np.std(offsets_s, ddof=1)))
+    return replace(best, spread_s=np.ptp(offsets_s), sigma_s=sigma_s)
 
 
 def offset_over(
@@ -384,11 +450,31 @@ def offset_over(
     start: SimilarityFit | FloatArray | None = None,
     most: float | None = None,
 ) -> TimeOffset:
-    """Offset and fit over motions of ``lag_s``, from an offset ``at`` and its fit, or X to start
-    at; no fit if there are too few. A clearly smaller offset than ``least_s`` is not refined,
-    others no better than that asks for; nor is a fit whose start leaves more than ``most``.
+    """Estimate the offset from motions over one time.
+
+    Parameters
+    ----------
+    lag_s : float
+        Duration of the motions, s.
+    parent, child : Trajectory
+    at : TimeOffset
+        Offset, fit and rate to start at.
+    max_gap_s : float
+        Longest gap between two poses that is interpolated across, s.
+    least_s : float
+        Stop early if the offset is clearly smaller than this; otherwise refine to a twentieth of
+        this.
+    start : SimilarityFit or (4, 4) array, optional
+        Fit or X to start at, if ``at`` has no fit.
+    most : float, optional
+        Do not refine a fit whose start leaves more than this share of the motion unexplained.
+
+    Returns
+    -------
+    TimeOffset
+        Without a fit if there are too few motions.
     """
-    span_s = max(_LEAST_SPAN_S, _SPAN_INTERVALS * child.interval_s)
+    span_s = max(_MIN_SPAN_S, _SPAN_INTERVALS * child.interval_s)
     middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
     offset_s = at.seconds
     start = at.fit or start
@@ -401,53 +487,80 @@ def offset_over(
         pairs = pairs_over(pose_pairs, lag_s, most_pairs)
         if len(pairs) < MIN_PAIRS:
             return TimeOffset(offset_s, np.inf, at.correlation)
-        # Velocities of the child in its own frame, over less at the ends of the trajectory.
-        ends, where = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
-        stamps_ns = pose_pairs.stamps_ns[ends]
-        span_ns = round(span_s * 1e9)
-        ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*shifted.stamps_ns[[0, -1]])
-        before, after = np.split(shifted.at(ends_ns.ravel()), 2)
-        steps = se3.log(se3.inverse(before) @ after)
-        spans_s = np.diff(ends_ns, axis=0)[0] * 1e-9
-        twists = (steps / spans_s[:, None])[where]
-        of_child = twists[: len(pairs)], twists[len(pairs) :]
-        start = fit = fit_similarity(pairs, of_child, start=start, most=most)
-        if not fit.explains_translation and most is None:
-            # A body that rotates about one of its sensors shows no scale.
-            in_one_unit = fit_similarity(pairs, of_child, same_unit=True)
-            start = fit = in_one_unit if in_one_unit.explains_translation else fit
+        ends, index_of_end = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
+        twists = _twists(shifted, pose_pairs.stamps_ns[ends], span_s)[index_of_end]
+        of_pairs = twists[: len(pairs)], twists[len(pairs) :]
+        fit = start = _fit_of(pairs, of_pairs, start, most)
         speed = float(np.sqrt(np.mean((twists[:, 3:] ** 2).sum(axis=1))))
         of_noise_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(speed, 1e-9)
-        span_s = max(span_s, min(of_noise_s, _MOST_SPAN_S))
+        span_s = max(span_s, min(of_noise_s, _MAX_SPAN_S))
         offset_s = float(offset_s + fit.offset_s)
         is_small = abs(offset_s) + abs(fit.offset_s) < least_s / 2
         if abs(fit.offset_s) < settled_s or is_small:
-            earlier = rate
-            rate = _rate(fit, pose_pairs.stamps_ns[pairs.i], rate)
-            is_settled = abs(rate.used - earlier.used) * child.duration_s < settled_s
+            before = rate
+            rate = _rate(fit, pose_pairs.stamps_ns[pairs.i], before)
+            is_settled = abs(rate.used - before.used) * child.duration_s < settled_s
             if is_settled and (most_pairs > MAX_PAIRS or not rate.is_used):
                 break
-    known = rate if np.isfinite(rate.sigma_ppm) else None
-    return TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit, rate=known)
+    estimated_rate = rate if np.isfinite(rate.sigma_ppm) else None
+    return TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit, rate=estimated_rate)
+
+
+def _fit_of(
+    pairs: MotionPairs,
+    twists: tuple[FloatArray, FloatArray],
+    start: SimilarityFit | FloatArray | None,
+    most: float | None,
+) -> SimilarityFit:
+    """Fit X, scale and offset; or X and offset, if the scale makes the fit fail."""
+    fit = fit_similarity(pairs, twists, start=start, most=most)
+    if fit.explains_translation or most is not None:
+        return fit
+    # The motion does not determine the scale if the body rotates about one of its sensors.
+    in_one_unit = fit_similarity(pairs, twists, same_unit=True)
+    return in_one_unit if in_one_unit.explains_translation else fit
+
+
+def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> FloatArray:
+    """Return velocities (N, 6), m/s and rad/s, of a sensor in its own frame at stamps (N,).
+
+    The velocities are means over ``span_s`` before and after each stamp, or less at the ends of the
+    trajectory.
+    """
+    span_ns = round(span_s * 1e9)
+    ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*trajectory.stamps_ns[[0, -1]])
+    before, after = np.split(trajectory.at(ends_ns.ravel()), 2)
+    steps = se3.log(se3.inverse(before) @ after)
+    spans_s = np.diff(ends_ns, axis=0)[0] * 1e-9
+    return np.asarray(steps / spans_s[:, None])
 
 
 def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:
-    """Estimate the clock rate. To the rate before comes the slope of a line through the offsets
-    that are left in blocks of time; ``stamps_ns`` (K,) of the pairs are on the parent's clock.
-    Its variance is that of Student's t, as the blocks are few.
+    """Estimate the clock rate from the offsets of a fit in blocks of time.
+
+    The slope of a line through these offsets is added to the rate before. Its variance is that of
+    Student's t distribution, because the blocks are few.
+
+    Parameters
+    ----------
+    fit : SimilarityFit
+    stamps_ns : (K,) int64 array
+        Stamps of the motion pairs, on the parent's clock.
+    before : ClockRate
+        Rate that the child's stamps are corrected for in the fit.
     """
     offsets_s, weights = fit.offsets_of_blocks
     if weights.min() <= 0.0:
         return before
     blocks_s = np.array_split((stamps_ns - stamps_ns[0]) * 1e-9, len(offsets_s))
-    times_s = [float(each.mean()) for each in blocks_s]
-    away_s = times_s - np.average(times_s, weights=weights)
-    left_s = offsets_s - np.average(offsets_s, weights=weights)
-    spread = float(weights @ away_s**2)
-    slope = float(weights @ (away_s * left_s)) / spread
-    residuals_s = left_s - slope * away_s
+    block_times_s = [float(block.mean()) for block in blocks_s]
+    times_s = block_times_s - np.average(block_times_s, weights=weights)
+    centred_s = offsets_s - np.average(offsets_s, weights=weights)
+    spread = float(weights @ times_s**2)
+    slope = float(weights @ (times_s * centred_s)) / spread
+    residuals_s = centred_s - slope * times_s
     variance = float(weights @ residuals_s**2) / (len(offsets_s) - 4) / spread / fit.held**2
     total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
     sigma = float(np.sqrt(variance))
-    is_used = abs(total) > _PLAIN_RATE * sigma
+    is_used = abs(total) > _CLEAR_RATE * sigma
     return replace(before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used)

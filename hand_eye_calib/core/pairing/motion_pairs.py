@@ -1,5 +1,8 @@
-"""Two streams to pairs: their poses at common instants, by interpolation; and relative motions of
-both between these, what every AX = XB solver starts from.
+"""Pose pairs and motion pairs of two streams.
+
+Pose pairs are poses of both sensors at common instants, by interpolation. Motion pairs are relative
+motions A and B of both sensors between two of these instants: the input of every AX = XB solver
+(Välimäki et al. 2023, eqs 1-2).
 """
 
 from dataclasses import dataclass, replace
@@ -13,17 +16,16 @@ from hand_eye_calib.core.base.text import parse_reference
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 
-# Streams whose intervals differ by less than this factor count as equally fast: they are paired at
-# the child's stamps.
+# Streams whose median intervals differ by less than this factor are paired at the child's stamps.
 _EQUALLY_FAST = 1.2
 
-# Number of poses checked at once in the search for the next keyframe.
+# Number of poses that are checked at once for the next keyframe.
 _WINDOW = 64
 
-# No recording pauses this long (s): a stamp is wrong.
+# Longest pause of a recording, s: after a longer one, the stamps are wrong.
 _LEAP_S = 86_400.0
 
-# Pairs that are compared where the choice of poses is free.
+# Largest number of motion pairs of a fit, unless the fit needs more.
 MAX_PAIRS = 800
 
 
@@ -44,20 +46,21 @@ class PosePairs(Columns):
     Ts_cw_c: FloatArray
 
     def child_scaled(self, factor: float) -> Self:
-        """The same poses with the child's translations times ``factor``."""
+        """Return the poses with the child's translations multiplied by ``factor``."""
         Ts_cw_c = self.Ts_cw_c.copy()
         Ts_cw_c[:, :3, 3] *= factor
         return replace(self, Ts_cw_c=Ts_cw_c)
 
     @classmethod
     def empty(cls) -> Self:
-        """No poses."""
+        """Return pairs of length 0."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
 
 
 def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
-    """The stream at whose stamps to pair, "parent" or "child": the slower one by the median
-    interval; the child if both are about equally fast.
+    """Return the stream with the longer median interval, "parent" or "child".
+
+    It is the child if both intervals are about equal, or if a stream has fewer than two stamps.
     """
     if len(parent_stamps_ns) < 2 or len(child_stamps_ns) < 2:
         return "child"
@@ -71,8 +74,8 @@ def synchronise(
 ) -> PosePairs:
     """Interpolate the faster stream at the slower stream's stamps.
 
-    An instant outside the faster stream, or between two of its poses that are more than
-    ``max_gap_s`` apart, is left out. An instant at which it has a pose of its own is always kept.
+    Instants outside the faster stream are skipped, and instants between two of its poses that are
+    more than ``max_gap_s`` apart. An instant at which the faster stream has a pose is always used.
 
     Parameters
     ----------
@@ -81,24 +84,28 @@ def synchronise(
     max_gap_s : float
         Seconds.
     at : {"parent", "child"}, optional
-        The stream at whose stamps to pair; the slower one by default.
+        Stream whose stamps the pairs have; the slower one by default.
     """
     if len(parent) == 0 or len(child) == 0:
         return PosePairs.empty()
     at = at or slower_stream(parent.stamps_ns, child.stamps_ns)
     slow, fast = (parent, child) if at == "parent" else (child, parent)
-    # Wanted stamps at which the faster stream has a pose, or may be interpolated.
     after = np.searchsorted(fast.stamps_ns, slow.stamps_ns)
-    inside = after < len(fast)
+    is_inside = after < len(fast)
     after = np.minimum(after, len(fast) - 1)
     gap_ns = fast.stamps_ns[after] - fast.stamps_ns[np.maximum(after - 1, 0)]
-    exact = fast.stamps_ns[after] == slow.stamps_ns
-    keep = inside & (exact | ((after > 0) & (gap_ns <= max_gap_s * 1e9)))
-    stamps_ns = slow.stamps_ns[keep]
-    is_one = len(fast) == 1
-    fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0) if is_one else fast.at(stamps_ns)
-    both = (slow.poses[keep], fast_poses) if at == "parent" else (fast_poses, slow.poses[keep])
-    return PosePairs(stamps_ns, *both)
+    is_exact = fast.stamps_ns[after] == slow.stamps_ns
+    is_interpolated = (after > 0) & (gap_ns <= max_gap_s * 1e9)
+    is_used = is_inside & (is_exact | is_interpolated)
+    stamps_ns = slow.stamps_ns[is_used]
+    slow_poses = slow.poses[is_used]
+    if len(fast) == 1:
+        fast_poses = np.repeat(fast.poses, len(stamps_ns), axis=0)
+    else:
+        fast_poses = fast.at(stamps_ns)
+    if at == "parent":
+        return PosePairs(stamps_ns, slow_poses, fast_poses)
+    return PosePairs(stamps_ns, fast_poses, slow_poses)
 
 
 def select_keyframes(
@@ -108,51 +115,64 @@ def select_keyframes(
     min_interval_s: float,
     previous: PosePairs | None = None,
 ) -> IntArray:
-    """Indices of the pose pairs to keep, in order.
+    """Return the indices of the keyframes among pose pairs, in order.
 
-    A pose pair is kept if ``min_interval_s`` has passed since the last one kept and the parent
-    sensor has since moved ``min_translation`` or rotated by ``min_rotation``. A threshold of zero
-    switches that criterion off.
+    A pose pair is a keyframe if ``min_interval_s`` has passed since the last keyframe and the
+    parent sensor has moved ``min_translation`` or rotated by ``min_rotation`` since. A threshold of
+    zero switches its criterion off.
 
-    Thresholds are in m, rad and s; ``previous`` is the last one kept before these, of length 1 (0
-    for none).
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    min_translation, min_rotation, min_interval_s : float
+        Thresholds in m, rad and s.
+    previous : PosePairs, optional
+        The last keyframe before these pose pairs, of length 1; of length 0 for none.
     """
     n_poses = len(pose_pairs)
     if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
         return np.arange(n_poses)
     stamps_ns = pose_pairs.stamps_ns
     poses = pose_pairs.Ts_pw_p
-    kept = []
     if previous is not None and len(previous):
+        keyframes = []
         last_ns = previous.stamps_ns[-1]
         T_last = previous.Ts_pw_p[-1]
     else:
-        kept = [0]
+        keyframes = [0]
         last_ns = stamps_ns[0]
         T_last = poses[0]
-    index = len(kept)
+    index = len(keyframes)
     while index < n_poses:
         window = slice(index, index + _WINDOW)
-        wanted = stamps_ns[window] - last_ns >= min_interval_s * 1e9
-        has_moved = np.full(len(wanted), max(min_translation, min_rotation) == 0.0)
+        is_late = stamps_ns[window] - last_ns >= min_interval_s * 1e9
+        has_moved = np.full(len(is_late), max(min_translation, min_rotation) == 0.0)
         if min_translation > 0.0:
-            away_m = np.linalg.norm(poses[window, :3, 3] - T_last[:3, 3], axis=1)
-            has_moved |= away_m >= min_translation
+            distances_m = np.linalg.norm(poses[window, :3, 3] - T_last[:3, 3], axis=1)
+            has_moved |= distances_m >= min_translation
         if min_rotation > 0.0:
-            turned = se3.rotation_angle(T_last[:3, :3].T @ poses[window, :3, :3])
-            has_moved |= turned >= min_rotation
-        hits = index + np.flatnonzero(wanted & has_moved)
-        if hits.size:
-            kept.append(int(hits[0]))
-            last_ns = stamps_ns[hits[0]]
-            T_last = poses[hits[0]]
-        index = kept[-1] + 1 if hits.size else index + _WINDOW
-    return np.array(kept, dtype=int)
+            angles = se3.rotation_angle(T_last[:3, :3].T @ poses[window, :3, :3])
+            has_moved |= angles >= min_rotation
+        candidates = np.flatnonzero(is_late & has_moved)
+        if not candidates.size:
+            index += _WINDOW
+            continue
+        keyframe = index + int(candidates[0])
+        keyframes.append(keyframe)
+        last_ns = stamps_ns[keyframe]
+        T_last = poses[keyframe]
+        index = keyframe + 1
+    return np.array(keyframes, dtype=int)
 
 
 def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
-    """The longest leap in stamps (N,), in rising order, of a stream: what it is, to follow "the
-    parent stream's", and what to do about it; None without one.
+    """Find a leap of more than a day in the rising stamps (N,) of a stream.
+
+    Returns
+    -------
+    (str, str) or None
+        What is wrong, as a text to follow "the parent stream's", and what to do; None without a
+        leap.
     """
     if len(stamps_ns) < 2:
         return None
@@ -169,7 +189,7 @@ def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
 
 @dataclass(frozen=True, eq=False)
 class MotionPairs(Columns):
-    """K relative motions of both sensors between the same instants i and j.
+    """Relative motions of both sensors between the same instants i and j, K of them.
 
     Attributes
     ----------
@@ -187,44 +207,45 @@ class MotionPairs(Columns):
     j: IntArray
 
     def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (K, 3) of translation and of rotation at X (4, 4).
+        """Return the residuals (K, 3) of translation and (K, 3) of rotation at X (4, 4).
 
-        ``R_A t + t_A - R t_B - t``, in m, in the axes of the parent sensor at instant i: Välimäki
-        et al. 2023, eq. (6). The article prints its last term with the opposite sign; its published
-        results have this one. Rotation vectors, in rad, in the axes of the child sensor at instant
-        j, of the rotation from ``R_A R`` to ``R R_B``; their lengths are the angles of eq. (7).
+        Translation: ``R_A t + t_A - R t_B - t`` in m, in the axes of the parent sensor at instant
+        i: Välimäki et al. 2023, eq. (6). The article prints the last term with the opposite sign;
+        its published results have this sign. Rotation: rotation vectors in rad, in the axes of the
+        child sensor at instant j, from ``R_A R`` to ``R R_B``. Their lengths are the angles of
+        eq. (7).
         """
         rotation = T_parent_child[:3, :3]
         translation = T_parent_child[:3, 3]
         chord = self.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
         moved_child = self.Ts_childi_childj[:, :3, 3] @ rotation.T
-        apart = chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
+        of_translation = chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
         via_parent = self.Ts_parenti_parentj[:, :3, :3] @ rotation
         via_child = rotation @ self.Ts_childi_childj[:, :3, :3]
-        return apart, se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
+        return of_translation, se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
 
 
 def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> MotionPairs:
-    """Relative motions of two synchronised trajectories (Välimäki et al. 2023, eqs 1-2).
+    """Return the relative motions of two synchronised trajectories between referenced poses.
 
     Parameters
     ----------
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of parent and child sensor in their own worlds at the same N instants.
     reference : str
-        ``"A"``: every pose with the first. ``"B<n>"``: with the n-th before it. ``"C<n>"``: with
-        the keyframe that starts its segment of n poses; a last segment whose keyframe is N - n or
-        later is left out, as in the published results.
+        ``"A"``: every pose with the first. ``"B<n>"``: every pose with the n-th before it.
+        ``"C<n>"``: every pose with the keyframe that starts its segment of n poses; a last segment
+        whose keyframe is N - n or later is skipped, as in the published results.
 
     Returns
     -------
     MotionPairs
-        Of length 0 if there are too few poses.
+        The pairs; of length 0 if there are too few poses.
 
     Raises
     ------
     ConfigError
-        If the reference has another form: n is at least 1, of C at least 2.
+        If the reference has another form. n is at least 1, and at least 2 after C.
     """
     kind, step = parse_reference("reference", reference)
     n_poses = len(Ts_pw_p)
@@ -241,36 +262,46 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
 def pairs_between(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, i: IntArray, j: IntArray
 ) -> MotionPairs:
-    """MotionPairs from the instants i to the instants j, (K,) int arrays."""
-    parent, child = (motions(Ts.take(i, axis=0), Ts.take(j, axis=0)) for Ts in (Ts_pw_p, Ts_cw_c))
+    """Return the MotionPairs from the instants i to the instants j, (K,) int arrays."""
+    parent = motions(Ts_pw_p.take(i, axis=0), Ts_pw_p.take(j, axis=0))
+    child = motions(Ts_cw_c.take(i, axis=0), Ts_cw_c.take(j, axis=0))
     return MotionPairs(parent, child, i, j)
 
 
 def motions(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Motions (..., 4, 4) from poses to poses, (..., 4, 4) each, of one sensor.
+    """Return the motions (..., 4, 4) of a sensor between two stacks of poses (..., 4, 4).
 
     The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
     first costs ten digits.
     """
-    moved = end.copy()
-    moved[..., :3, 3] -= start[..., :3, 3]
-    moved[..., :3, :] = np.swapaxes(start[..., :3, :3], -1, -2) @ moved[..., :3, :]
-    return moved
+    motion = end.copy()
+    motion[..., :3, 3] -= start[..., :3, 3]
+    motion[..., :3, :] = np.swapaxes(start[..., :3, :3], -1, -2) @ motion[..., :3, :]
+    return motion
 
 
 def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) -> MotionPairs:
-    """Motion pairs between poses about ``lag_s`` seconds apart (their interval if that is longer),
-    evenly over the recording; none if no two poses lie that far apart.
+    """Return motion pairs between poses about ``lag_s`` seconds apart, evenly over the recording.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    lag_s : float
+        Seconds between the poses of a pair; the median interval if that is longer.
+    max_pairs : int
+        Largest number of pairs.
     """
     stamps_ns = pose_pairs.stamps_ns
     if len(stamps_ns) > 1:
         lag_s = max(lag_s, median(np.diff(stamps_ns)) * 1e-9)
     i = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), max_pairs)).astype(int)
+    after = np.maximum(np.searchsorted(stamps_ns, stamps_ns[i] + round(lag_s * 1e9)), i + 1)
+    has_end = after < len(stamps_ns)
+    i = i[has_end]
+    after = after[has_end]
+    # The pose nearest to the end: the first pose after the end would more often have a late stamp.
     ends_ns = stamps_ns[i] + round(lag_s * 1e9)
-    after = np.maximum(np.searchsorted(stamps_ns, ends_ns), i + 1)
-    i, ends_ns, after = (each[after < len(stamps_ns)] for each in (i, ends_ns, after))
-    # The nearest: of the poses after that, those with late stamps would be the first more often.
     is_before = ends_ns - stamps_ns[after - 1] < stamps_ns[after] - ends_ns
     j = np.maximum(after - is_before, i + 1)
-    near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9
-    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i[near], j[near])
+    is_near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9
+    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i[is_near], j[is_near])
