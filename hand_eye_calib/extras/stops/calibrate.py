@@ -41,22 +41,23 @@ _HOW_TO_GIVE_OPENCV = (
     "t_target2cam)"
 )
 
-# A mount is the identity within so many standard deviations, or within these lengths (m) and angles
+# A mount is the identity within so many standard deviations, or within this length (m) and angle
 # (rad).
 _IDENTITY_SIGMAS = 3.0
-_IDENTITY_M = 0.001
-_IDENTITY_RAD = 0.001
+_IDENTITY = 0.001
 
-# Largest distance (m) of what is mounted on a hand, unless its counterpart is more than half as far
-# from the base.
+# A camera or target on a hand is nearer to it than this (m), or than twice the distance of its
+# counterpart from the base.
 _ON_HAND_M = 0.3
 _NEARER = 0.5
 
 # A direction of rotations alone is unknown if its rotation part is longer than this.
 _ROTATION_PART = 0.5
 
-# Stops that were left out: the share above which care is asked for, and how many are listed.
+# Share of stops that were left out above which the verdict is USE WITH CARE.
 _LARGEST_LEFT_OUT = 0.1
+
+# Largest number of stops that are listed in a message.
 _MOST_LISTED = 8
 
 
@@ -254,8 +255,7 @@ def _is_copy(fit: RobotWorld) -> bool:
     """
     offsets = np.r_[se3.log(fit.Ts_parent_child[0]), se3.log(fit.Ts_world_world[0])]
     sigmas = np.sqrt(np.diag(fit.covariance))
-    least = np.tile(np.repeat([_IDENTITY_M, _IDENTITY_RAD], 3), 2)
-    return bool(np.all(np.abs(offsets) < np.maximum(least, _IDENTITY_SIGMAS * sigmas)))
+    return bool(np.all(np.abs(offsets) < np.maximum(_IDENTITY, _IDENTITY_SIGMAS * sigmas)))
 
 
 def _reading_in_words(reading: Reading) -> str:
@@ -268,7 +268,10 @@ def _reading_in_words(reading: Reading) -> str:
 
 
 def _check_distances(reading: Reading, frames: Mapping[str, str]) -> list[Finding]:
-    """Return a finding if what is on the hand is far from it, and its counterpart near the base."""
+    """Return a finding if the camera or target on the hand is far from it.
+
+    The finding needs a counterpart near the base: then inverse poses are more probable.
+    """
     fit = reading.fit
     if fit.undetermined().size or not reading.stops.Ts_world_child[:, :3, 3].any():
         return []

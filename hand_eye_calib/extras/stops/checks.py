@@ -127,53 +127,53 @@ def examine(poses: StopPoses) -> Examination:
     if len(poses) < FEWEST_STOPS:
         return Examination()
     findings = [*check_frozen(poses)]
-    if all(found.evidence["share"] < 1.0 for found in findings):
+    if all(issue.evidence["share"] < 1.0 for issue in findings):
         findings += check_rows(poses)
     findings = findings or [*check_angles(poses)]
     if findings:
         return Examination(tuple(findings))
-    few = poses.few()
+    sample = poses.sample()
     if not turns_about_two_axes(poses.parent):
         # The rotations do not determine where the positions belong.
-        return _with_units(few, Examination())
-    chosen, rivals = _explain(few)
-    if axes := _check_axes(few, chosen.fit):
+        return _with_units(sample, Examination())
+    chosen, rivals = _explain(sample)
+    if axes := _check_axes(sample, chosen.fit):
         return Examination((axes,))
     repairs = tuple(
         finding(code, stream, options=conventions(code, stream))
         for code, stream in _streams(chosen.mistakes)
     )
-    findings = _check_conventions(few, chosen.mistakes, rivals)
+    findings = _check_conventions(sample, chosen.mistakes, rivals)
     if not (findings or repairs):
         findings = _check_agreement(chosen.fit)
     examination = Examination(tuple(findings), repairs)
     if has_error(findings):
         return examination
-    return _with_units(few, replace(examination, scale=chosen.fit.scale))
+    return _with_units(sample, replace(examination, scale=chosen.fit.scale))
 
 
 # ------------------------------------------------------------------ conventions
 
 
-def _explain(few: StopPoses) -> tuple[_Hypothesis, list[Mistakes]]:
+def _explain(sample: StopPoses) -> tuple[_Hypothesis, list[Mistakes]]:
     """Return the hypothesis that explains the stops, and mistakes that explain them equally well.
 
     The hypothesis has no mistakes unless some are certain.
     """
-    plain = [_Hypothesis.of(few, Mistakes(is_inverse=way)) for way in few.ways]
+    plain = [_Hypothesis.of(sample, Mistakes(is_inverse=way)) for way in sample.ways]
     # Rotations decide whether the camera is on the hand; positions choose only where they do not.
     largest_turning = CLEARLY_BETTER * min(hypothesis.fit.turning for hypothesis in plain)
     agreeing = [hypothesis for hypothesis in plain if hypothesis.fit.turning <= largest_turning]
     as_given = min(agreeing, key=_unexplained)
-    if as_given.fit.unexplained < EXPLAINED_SHARE or not few.has_positions:
+    if as_given.fit.unexplained < EXPLAINED_SHARE or not sample.has_positions:
         return as_given, []
-    objectives = {rival: rival.objective(few) for rival in _rivals(few, plain)}
+    objectives = {rival: rival.objective(sample) for rival in _rivals(sample, plain)}
     smallest = min(objectives.values())
-    gain = min(hypothesis.objective(few) for hypothesis in plain) - smallest
+    gain = min(hypothesis.objective(sample) for hypothesis in plain) - smallest
     good = _simplest([rival for rival in objectives if objectives[rival] < smallest + LEAST_LEAD])
     if gain < -LEAST_LEAD:
         return as_given, []
-    if gain < certain_gain(len(few)):
+    if gain < certain_gain(len(sample)):
         return as_given, [rival.mistakes for rival in good]
     best = min(good, key=_unexplained)
     if best.fit.unexplained > LARGEST_SHARE:
@@ -191,14 +191,14 @@ def _unexplained(hypothesis: _Hypothesis) -> float:
     return hypothesis.fit.unexplained
 
 
-def _rivals(few: StopPoses, plain: Sequence[_Hypothesis]) -> list[_Hypothesis]:
+def _rivals(sample: StopPoses, plain: Sequence[_Hypothesis]) -> list[_Hypothesis]:
     """Return the mistakes with the best rough fits."""
     plain_mistakes = [hypothesis.mistakes for hypothesis in plain]
     rivals = []
     for parent, child, is_inverse in itertools.product(_CODES, _CODES, (False, True)):
         mistakes = Mistakes(parent, child, is_inverse)
         if mistakes not in plain_mistakes:
-            rivals.append(_Hypothesis.of(few, mistakes))
+            rivals.append(_Hypothesis.of(sample, mistakes))
     rivals.sort(key=lambda rival: -rival.fit.log_likelihood)
     return rivals[:_MOST_SOLVED]
 
@@ -272,7 +272,7 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
 # ------------------------------------------------------------------ axes
 
 
-def _check_axes(few: StopPoses, fit: RoughFit) -> Finding | None:
+def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
     """Return a finding if the positions of one side are clearly in other axes.
 
     Other axes must explain more than the best of the other mistakes, whose fit is ``fit``.
@@ -280,15 +280,15 @@ def _check_axes(few: StopPoses, fit: RoughFit) -> Finding | None:
     if fit.unexplained < EXPLAINED_SHARE:
         return None
     best = None
-    largest = fit.log_likelihood + certain_gain(len(few))
-    for way in few.ways:
+    largest = fit.log_likelihood + certain_gain(len(sample))
+    for way in sample.ways:
         mistakes = Mistakes(is_inverse=way)
-        if rough_fit(few, mistakes).turning > LARGEST_SHARE:
+        if rough_fit(sample, mistakes).turning > LARGEST_SHARE:
             continue
         for axes, stream in itertools.product(_other_axes(), ("child", "parent")):
-            Ts = getattr(few, stream)
+            Ts = getattr(sample, stream)
             turned = se3.from_rotation_translation(Ts[:, :3, :3], Ts[:, :3, 3] @ axes.T)
-            other = rough_fit(few.with_side(stream, turned), mistakes)
+            other = rough_fit(sample.with_side(stream, turned), mistakes)
             if other.log_likelihood > largest and other.unexplained < LARGEST_SHARE:
                 best = finding("axes", stream, detail=_axes_in_words(axes))
                 largest = other.log_likelihood
@@ -316,15 +316,15 @@ def _axes_in_words(axes: FloatArray) -> str:
 # ------------------------------------------------------------------ lengths
 
 
-def _with_units(few: StopPoses, examination: Examination) -> Examination:
+def _with_units(sample: StopPoses, examination: Examination) -> Examination:
     """Return the examination with findings or repairs of lengths in other units, and with the scale
     that remains.
     """
-    if not few.has_positions:
+    if not sample.has_positions:
         return examination
     scale = examination.scale
-    of_parent = _unit_of_size(few.parent[:, :3, 3])
-    of_child = _unit_of_size(few.child[:, :3, 3])
+    of_parent = _unit_of_size(sample.parent[:, :3, 3])
+    of_child = _unit_of_size(sample.child[:, :3, 3])
     if scale is not None:
         to_metres = scale * of_parent
         nearest = min((1.0, *_UNITS), key=lambda unit: abs(np.log(to_metres / unit)))
@@ -340,7 +340,7 @@ def _with_units(few: StopPoses, examination: Examination) -> Examination:
             options = {option: unit}
             units.append(finding("stop_units", stream, options=options, unit=_UNITS[unit]))
     # Stops of two vehicles may be far apart; an arm is not that large.
-    if few.is_arm or (len(units) == 1 and scale is not None):
+    if sample.is_arm or (len(units) == 1 and scale is not None):
         return replace(examination, repairs=(*examination.repairs, *units), scale=scale)
     return replace(examination, findings=(*examination.findings, *units), scale=scale)
 

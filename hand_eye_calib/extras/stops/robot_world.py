@@ -116,21 +116,6 @@ class RobotWorld:
         return directions[:, eigenvalues < _DETERMINED * self.level_rad**2]
 
 
-class _Model(NamedTuple):
-    """Choices of a fit.
-
-    Attributes
-    ----------
-    in_world : bool
-        Whether errors are normal in the frame of the child's world, rather than in the child's.
-    degrees : float
-        Degrees of freedom of the Student-t distribution.
-    """
-
-    in_world: bool
-    degrees: float
-
-
 class _Pair(NamedTuple):
     """A child with one of its worlds: rows (K,) of its stops, columns (12,) of its X and Z."""
 
@@ -200,12 +185,13 @@ def _fit_without_outliers(
     n_poses = sum(map(len, starts))
     # With heavier tails a few stops fit exactly, and all others are outliers.
     fewest_degrees = 8.0 * n_poses / max(n - n_poses, 0.1)
-    rough = _fit(stops, starts, _Model(in_world, max(fewest_degrees, _OUTLIER_DEGREES)), rests)
+    rough = _fit(stops, starts, in_world, max(fewest_degrees, _OUTLIER_DEGREES), rests)
     is_kept = rough.weights > 0.0
     fit = _fit(
         stops[is_kept],
         (rough.Ts_parent_child, rough.Ts_world_world),
-        _Model(in_world, max(fewest_degrees, _DEGREES)),
+        in_world,
+        max(fewest_degrees, _DEGREES),
         rests[is_kept],
     )
     weights = np.zeros(n)
@@ -273,8 +259,20 @@ def _variances(means: FloatArray, stops: Stops, n_values: int) -> FloatArray:
     return np.maximum(means, _SMALLEST_VARIANCE)
 
 
+def _gauss_newton_step(products: FloatArray) -> FloatArray:
+    """Return the step (n,) of the products (n + 1, n + 1) of derivatives and errors."""
+    normal = products[:-1, :-1]
+    # Undetermined directions stay where they are.
+    damping = 1e-13 * np.trace(normal) * np.eye(len(normal))
+    return -np.linalg.solve(normal + damping, products[:-1, -1])
+
+
 def _fit(
-    stops: Stops, starts: tuple[FloatArray, FloatArray], model: _Model, rests: FloatArray
+    stops: Stops,
+    starts: tuple[FloatArray, FloatArray],
+    in_world: bool,
+    degrees: float,
+    rests: FloatArray,
 ) -> RobotWorld:
     """Estimate weights, variances and Gauss-Newton steps in turn.
 
@@ -283,12 +281,14 @@ def _fit(
     stops : Stops
     starts : arrays (C, 4, 4) and (W, 4, 4)
         X and Z to start from.
-    model : _Model
+    in_world : bool
+        Whether errors are normal in the frame of the child's world, rather than in the child's.
+    degrees : float
+        Degrees of freedom of the Student-t distribution.
     rests : (N,) array
         Weights of stops at one place.
     """
     Xs, Zs = starts
-    degrees = model.degrees
     n = len(stops)
     n_values = 6 * (len(Xs) + len(Zs))
     pairs = _pairs(stops, len(Xs))
@@ -299,7 +299,7 @@ def _fit(
     final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     weights = rests
     for _ in range(_ROUNDS):
-        errors, jacobian = _linearise(stops, Xs, Zs, model.in_world)
+        errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         means = final_sum / weights.sum() * (weights @ squared) / n_free
         variances = _variances(means, stops, n_values)
@@ -308,15 +308,11 @@ def _fit(
         whitening = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
         rows = whitening[..., None] * np.concatenate([jacobian, errors[..., None]], axis=2)
         products = _products(rows, pairs, n_values)
-        normal = products[:-1, :-1]
-        gradient = products[:-1, -1]
-        # Undetermined directions stay where they are.
-        damping = 1e-13 * np.trace(normal) * np.eye(n_values)
-        step = -np.linalg.solve(normal + damping, gradient)
+        step = _gauss_newton_step(products)
         transforms = se3.exp(step.reshape(-1, 6))
         Xs = Xs @ transforms[: len(Xs)]
         Zs = Zs @ transforms[len(Xs) :]
-        converged = bool(-step @ gradient < _SMALL_STEP**2)
+        converged = bool(-step @ products[:-1, -1] < _SMALL_STEP**2)
         if converged:
             break
     # Information of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust
@@ -413,9 +409,11 @@ def _with_lasting_errors(
             step = longer.step
             sigma = longer.sigma
     # Few stops hardly determine the levels.
-    few = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * len(scores), 0.5)
-    covariance = few * (fit.covariance + fit.covariance @ scores @ fit.covariance)
-    return replace(fit, covariance=covariance, scale_step=step, scale_sigma=sigma * math.sqrt(few))
+    level_factor = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * len(scores), 0.5)
+    covariance = level_factor * (fit.covariance + fit.covariance @ scores @ fit.covariance)
+    return replace(
+        fit, covariance=covariance, scale_step=step, scale_sigma=sigma * math.sqrt(level_factor)
+    )
 
 
 def _whitened_rows(stops: Stops, fit: RobotWorld, in_world: bool) -> FloatArray:

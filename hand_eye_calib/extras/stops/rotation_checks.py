@@ -240,16 +240,16 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
     """Yield a finding if the rotations agree only with their numbers read as other angles, or in no
     way.
     """
-    few = poses.few()
-    of_parent = angles_between(few.parent)
-    of_child = angles_between(few.child)
+    sample = poses.sample()
+    of_parent = angles_between(sample.parent)
+    of_child = angles_between(sample.child)
     difference_rad = median_difference(of_parent, of_child)
     turn_rad = max(median(above_diagonal(of_parent)), median(above_diagonal(of_child)))
     are_equal = difference_rad < LARGEST_SHARE * LEAST_TURN_RAD
     if are_equal or difference_rad < EXPLAINED_SHARE * turn_rad:
         return
     within_rad = min(difference_rad / CLEARLY_BETTER, LARGEST_SHARE * turn_rad)
-    readings = [*_readings(few, "parent", of_child), *_readings(few, "child", of_parent)]
+    readings = [*_readings(sample, "parent", of_child), *_readings(sample, "child", of_parent)]
     agreeing = [reading for reading in readings if reading.difference_rad < within_rad]
     if agreeing:
         smallest_rad = min(reading.difference_rad for reading in agreeing)
@@ -262,12 +262,12 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
         yield finding("unrelated_stops", off_deg=float(np.degrees(difference_rad)))
 
 
-def _readings(few: StopPoses, stream: str, of_other: FloatArray) -> Iterator[_AngleReading]:
+def _readings(sample: StopPoses, stream: str, of_other: FloatArray) -> Iterator[_AngleReading]:
     """Yield other readings of the rotations of a stream.
 
     ``of_other`` has the angles (N, N) between the stops of the other side, rad.
     """
-    Ts = getattr(few, stream)
+    Ts = getattr(sample, stream)
     for read_as, numbers_of in _NUMBERS_OF:
         numbers = numbers_of(Ts[:, :3, :3])
         for meant, rotations_of in _ROTATIONS_OF.items():
@@ -279,7 +279,7 @@ def _readings(few: StopPoses, stream: str, of_other: FloatArray) -> Iterator[_An
                 difference_rad=median_difference(angles_between(reread), of_other),
                 stream=stream,
                 text=f"{meant}, not {read_as}",
-                poses=few.with_side(stream, reread),
+                poses=sample.with_side(stream, reread),
             )
 
 

@@ -64,7 +64,7 @@ class StopPoses:
         """Values of ``Mistakes.is_inverse`` that are no mistake."""
         return (False, True) if self.is_arm else (False,)
 
-    def few(self) -> "StopPoses":
+    def sample(self) -> "StopPoses":
         """Return at most 150 of the stops, evenly spread."""
         n = len(self)
         rows = np.unique(np.linspace(0, n - 1, min(n, MOST_COMPARED)).astype(np.int64))
@@ -187,7 +187,7 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
         weights = robust_weights("cauchy", (angles_rad / max(median(angles_rad), _TINY)) ** 2)
     error_rad = median(angles_rad)
     turns_rad = [median(above_diagonal(angles_between(Ts))) for Ts in (A, B)]
-    # Rotations of a few degrees are not judged: noise may be as large.
+    # Rotations of few degrees are not judged: noise may be as large.
     turning = error_rad / max(*turns_rad, LEAST_TURN_RAD)
     if not poses.has_positions:
         return RoughFit(turning, 0.0)

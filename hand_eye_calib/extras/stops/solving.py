@@ -23,7 +23,7 @@ from hand_eye_calib.extras.stops.rough_fit import (
 )
 from hand_eye_calib.extras.stops.worlds import SETUPS
 
-# A scale differs from 1 if it does by so many standard deviations, and by this share.
+# A scale is not 1 if it differs by so many standard deviations, and by this share beyond them.
 _SCALE_SIGMAS = 3.0
 _SCALE_SHARE = 0.01
 
@@ -39,7 +39,7 @@ _LARGEST_SIZE = 10.0
 _SCALE_ROUNDS = 10
 _SMALL_STEP = 0.02
 
-# Stops that rotate by more than this (rad; 10 deg) in the median determine all directions, unless
+# Stops whose median rotation is larger than this (rad; 10 deg) determine all directions, unless
 # their errors are larger than those of any camera.
 _FAR_RAD = 0.17
 
@@ -70,7 +70,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class SolvedStops:
-    """A reading of stops with the options, findings and warnings that lead to it."""
+    """Solved stops: their reading, and the options, findings and warnings that lead to it."""
 
     reading: Reading
     config: CalibratorConfig
@@ -83,7 +83,7 @@ class SolvedStops:
         return not has_error(self.findings)
 
     def adding(self, *findings: Finding) -> "SolvedStops":
-        """Return the same with further findings."""
+        """Return the solved stops with further findings."""
         return replace(self, findings=gravest_first((*self.findings, *findings)))
 
 
@@ -99,9 +99,9 @@ class _Repaired:
     unit : float
         Factor that the child's lengths were multiplied by.
     rough_scale : float
-        Factor that is left, from a rough fit; 1 if that is unknown.
+        Further factor of the child's lengths, from a rough fit; 1 if it is unknown.
     findings, warnings : lists
-        What was found and repaired; the solve adds to both.
+        Findings, and warnings about repairs; the solve adds to both.
     """
 
     poses: StopPoses
@@ -167,7 +167,7 @@ def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
         # The unit of the child's lengths is a part of the scale that is estimated.
         unit = _child_unit(examination)
         examination = _without_child_unit(examination)
-    findings, repairs = _beside_set_options(examination, config)
+    findings, repairs = _with_user_options(examination, config)
     # The rough scale is that of lengths whose units are put right.
     is_whole = len(repairs) == len(examination.repairs)
     rough_scale = examination.scale if is_whole else None
@@ -192,48 +192,48 @@ def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) ->
 
 def _child_unit(examination: Examination) -> float:
     """Return the factor to metres of the child's lengths; 1 if they are in metres."""
-    for found in (*examination.findings, *examination.repairs):
-        if _is_child_unit(found):
-            return float(found.options["scale"])
+    for issue in (*examination.findings, *examination.repairs):
+        if _is_child_unit(issue):
+            return float(issue.options["scale"])
     return 1.0
 
 
-def _is_child_unit(found: Finding) -> bool:
-    return {*found.options} == {"scale"}
+def _is_child_unit(issue: Finding) -> bool:
+    return {*issue.options} == {"scale"}
 
 
 def _without_child_unit(examination: Examination) -> Examination:
     """Return the examination without the finding about the unit of the child's lengths."""
-    findings = tuple(found for found in examination.findings if not _is_child_unit(found))
-    repairs = tuple(found for found in examination.repairs if not _is_child_unit(found))
+    findings = tuple(issue for issue in examination.findings if not _is_child_unit(issue))
+    repairs = tuple(issue for issue in examination.repairs if not _is_child_unit(issue))
     return replace(examination, findings=findings, repairs=repairs)
 
 
-def _beside_set_options(
+def _with_user_options(
     examination: Examination, config: CalibratorConfig
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings and repairs, where a repair of an option that the user set is a finding."""
+    """Return findings and repairs; a repair of an option that the user set becomes a finding."""
     findings = []
-    for found in examination.findings:
-        if found.code != "ambiguous":
-            findings.append(_beside_set_values(found, config))
-        elif not {*found.options} <= config.given:
+    for issue in examination.findings:
+        if issue.code != "ambiguous":
+            findings.append(_with_user_values(issue, config))
+        elif not {*issue.options} <= config.given:
             # A user who sets the conventions of both sides has decided.
-            findings.append(found)
-    settled_codes = {found.code for found in examination.repairs if {*found.options} & config.given}
+            findings.append(issue)
+    settled_codes = {issue.code for issue in examination.repairs if {*issue.options} & config.given}
     repairs = []
-    for found in examination.repairs:
-        if found.code in settled_codes:
-            findings.append(_beside_set_values(found, config))
+    for issue in examination.repairs:
+        if issue.code in settled_codes:
+            findings.append(_with_user_values(issue, config))
         else:
-            repairs.append(found)
+            repairs.append(issue)
     return findings, repairs
 
 
-def _beside_set_values(found: Finding, config: CalibratorConfig) -> Finding:
-    """Return a finding whose options are combined with the values that the user set."""
+def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
+    """Return a finding whose options include the values that the user set."""
     options: dict[str, float | str] = {}
-    for name, value in found.options.items():
+    for name, value in issue.options.items():
         current = getattr(config, name)
         if current == value or {current, value} == {"wxyz", "yzwx"}:
             # A convention that is undone twice, or by its contrary, was right before.
@@ -242,11 +242,11 @@ def _beside_set_values(found: Finding, config: CalibratorConfig) -> Finding:
             options[name] = value * current
         else:
             options[name] = value
-    return replace(found, options=options)
+    return replace(issue, options=options)
 
 
 def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[str, Any]:
-    """Return the options of all repairs; the factor of the parent's lengths times that set."""
+    """Return the options of all repairs, multiplied by a factor that the user set."""
     options: dict[str, Any] = {}
     for repair in repairs:
         options |= repair.options
@@ -259,7 +259,10 @@ def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[st
 
 
 def _likelier_reading(poses: StopPoses, scale: float, setup: str | None) -> Reading:
-    """Return the likelier reading of stops, or that of a setup, whose lead may be negative."""
+    """Return the likelier reading of stops, or the reading of a setup.
+
+    The lead of a setup is negative if the other one is likelier.
+    """
     readings = []
     for is_inverse in poses.ways:
         stops = poses.without(Mistakes(is_inverse=is_inverse), scale)
@@ -307,8 +310,8 @@ def _judge_scale(free: Reading, repaired: _Repaired) -> bool:
     scale = unit * free.scale
     sigma = unit * free.scale_sigma
     if is_clear and not is_asked:
-        found = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
-        repaired.findings.append(replace(found, options={"scale": "estimate"}))
+        issue = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
+        repaired.findings.append(replace(issue, options={"scale": "estimate"}))
     if is_estimate:
         return True
     is_used = is_clear and is_size and not config.is_known("scale")
@@ -322,7 +325,7 @@ def _judge_scale(free: Reading, repaired: _Repaired) -> bool:
 
 
 def _difference_from_one(free: Reading) -> float:
-    """Return by which share an estimated scale differs from 1, beyond its errors and its bias."""
+    """Return the difference of an estimated scale from 1, as a share beyond its errors and bias."""
     share = free.scale_sigma / free.scale
     bias = _BIAS_BY_NOISE * len(free.stops) * share**2
     lowest = np.log(free.scale) - _SCALE_SIGMAS * share
@@ -331,7 +334,10 @@ def _difference_from_one(free: Reading) -> float:
 
 
 def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:
-    """Return why directions are unknown: stops turn about one axis, or contradict each other."""
+    """Return a finding if directions are unknown.
+
+    Stops that turn about one axis leave directions unknown, and so do contradicting stops.
+    """
     if not turns_about_two_axes(poses.parent):
         return [finding("turning_about_one_axis")] if poses.has_positions else []
     rotations = poses.parent[:, :3, :3]
