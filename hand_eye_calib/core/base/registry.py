@@ -157,3 +157,7 @@ OUT_OF_REACH: Registry[tuple[str, ...]] = Registry("kind of streams")
 #: Functions that return a kind of data (:class:`hand_eye_calib.core.engine.kinds.Kind`), by what
 #: both sensors measure together.
 KINDS: Registry[Callable[[], Any]] = Registry("kind of streams")
+
+#: Sentences of the findings of extras: functions that return
+#: :class:`hand_eye_calib.core.checks.words.FindingWords` by the key of the finding.
+FINDING_WORDS: Registry[Callable[[], Any]] = Registry("sentences of findings")

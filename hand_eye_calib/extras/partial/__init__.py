@@ -2,12 +2,13 @@
 
 from typing import Any
 
-from hand_eye_calib.core.base.registry import KINDS, RESULT_PARTS
+from hand_eye_calib.core.base.registry import FINDING_WORDS, KINDS, RESULT_PARTS
 
 
 def register() -> None:
     """Register both kinds of streams, and the bias of angular rates."""
     RESULT_PARTS["rate_bias"] = _rate_bias
+    FINDING_WORDS["partial"] = _words
     KINDS["positions"] = _positions
     KINDS["rotations"] = _rotations
 
@@ -29,3 +30,9 @@ def _rate_bias() -> Any:
     from hand_eye_calib.extras.partial.rate_bias import RateBias
 
     return Part("rate_bias", lambda: RateBias)
+
+
+def _words() -> Any:
+    from hand_eye_calib.extras.partial.words import WORDS
+
+    return WORDS

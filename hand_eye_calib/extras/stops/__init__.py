@@ -4,7 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.registry import PUBLIC_NAMES, RESULT_PARTS, ROUTES, Route
+from hand_eye_calib.core.base.registry import (
+    FINDING_WORDS,
+    PUBLIC_NAMES,
+    RESULT_PARTS,
+    ROUTES,
+    Route,
+)
 
 # Files of an arm's samples.
 _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
@@ -13,6 +19,7 @@ _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 def register() -> None:
     """Register stops for ``calibrate``."""
     RESULT_PARTS["worlds"] = _worlds
+    FINDING_WORDS["stops"] = _words
     PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.extras.stops.samples"
@@ -68,3 +75,9 @@ def _worlds() -> Any:
     from hand_eye_calib.extras.stops.worlds import WorldsPart
 
     return WorldsPart()
+
+
+def _words() -> Any:
+    from hand_eye_calib.extras.stops.words import WORDS
+
+    return WORDS

@@ -1,0 +1,309 @@
+"""Sentences of the stream checks: one row per finding, filled with the values of the finding."""
+
+from dataclasses import dataclass
+from functools import cache
+
+from hand_eye_calib.core.base.registry import FINDING_WORDS
+from hand_eye_calib.core.results.records import Severity
+
+
+@dataclass(frozen=True)
+class FindingWords:
+    """Templates of a finding.
+
+    All texts may name the values of the finding in braces. Every finding has ``{stream}`` (parent,
+    child or both) and ``{whose}`` ("the child stream's").
+
+    Attributes
+    ----------
+    what : str
+        What was found.
+    advice : str
+        What to do.
+    cause : str
+        Usual cause, if ``what`` does not name it.
+    severity : Severity
+        Severity unless the check states another.
+    code : str
+        Public code; empty if it is the key of the row.
+    """
+
+    what: str
+    advice: str
+    cause: str = ""
+    severity: Severity = Severity.ERROR
+    code: str = ""
+
+
+_WORDS = {
+    # Of one stream.
+    "disorder": FindingWords("{text}", "repair the source of the stamps", severity=Severity.NOTE),
+    "leap": FindingWords("{whose} {text}", "{remedy}"),
+    "gaps": FindingWords(
+        "the {stream} stream has {gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the time)",
+        "nothing is paired across a gap; raise max_gap if the motion there is smooth",
+        severity=Severity.NOTE,
+    ),
+    "jumps": FindingWords(
+        "{share:.1%} of {whose} steps are jumps: far from the motion before and after",
+        "keep a method that rejects outliers; better, repair the source",
+        "relocalisations, loop closures or wrong detections",
+        severity=Severity.WARNING,
+    ),
+    "frozen": FindingWords(
+        "the {stream} stream repeats the same pose for {frozen_s:.1f} s ({share:.1%} of the time) "
+        "while the other sensor moves",
+        "find out why its source stopped, and cut that part out",
+    ),
+    "interleaved": FindingWords(
+        "{whose} poses alternate between two levels {distance_m:.2g} m apart",
+        "give each its own topic, and calibrate one",
+        "two sensors, or two programs, publish on one topic",
+    ),
+    "coarse_positions": FindingWords(
+        "{whose} positions are multiples of {step_m:.3g} m",
+        "write positions with 64 bits and all digits, or relative to a near origin",
+        "rounding, or numbers of 32 bits far from the origin, such as map coordinates",
+        severity=Severity.NOTE,
+    ),
+    "flat": FindingWords(
+        "the {stream} stream has only x, y and yaw, while the {other} tilts by {tilt_deg:.1f} deg "
+        "(root mean square)",
+        "give poses with all six degrees of freedom, or record on level ground and measure height, "
+        "roll and pitch by hand",
+        "odometry in 2D, such as that of wheels",
+    ),
+    "lengths": FindingWords(
+        "{whose} lengths seem to be in {unit}: in metres the parent would move at "
+        "{speed_m_s:.0f} m/s and change its velocity by {acceleration_m_s2:.0f} m/s within a "
+        "second{beside}, which no vehicle does",
+        "give all lengths in metres, those of a file also by the unit in its header, such as "
+        "x_mm; {condition}solve with",
+    ),
+    # Of both streams together.
+    "unrelated": FindingWords(
+        "{text}",
+        "check that both sensors are on one rigid body, and that both streams are of one recording "
+        "and in known units; if the clocks differ, have the offset estimated (time_offset "
+        "estimate); in a file, call angles that are clockwise from north heading, not yaw",
+    ),
+    "no_turning": FindingWords(
+        "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
+        "be checked",
+        "rotate about several axes (a vehicle: curves, and slopes if there are any)",
+    ),
+    "too_short": FindingWords("{text}", "record longer"),
+    "not_independent": FindingWords(
+        "{evidence}. Was one computed from the other (TF, fusion)? Then this result only returns "
+        "the old transform",
+        "give the poses that each sensor measured by itself; if both are exact (motion capture, "
+        "surveyed, simulated), give parent_kind exact and child_kind exact",
+        severity=Severity.WARNING,
+    ),
+    "noisy": FindingWords(
+        "the streams rotate together, but {share:.0%} of the motion stays unexplained: noise or "
+        "jumps are strong",
+        "expect large standard deviations; record longer and with more motion, or repair the "
+        "source",
+        severity=Severity.NOTE,
+    ),
+    "quaternion_order": FindingWords(
+        "{whose} quaternions seem to be written w x y z and read as x y z w",
+        "write them as x y z w",
+    ),
+    "quaternion_names": FindingWords(
+        "{whose} quaternions seem to be written x y z w, under names that say w x y z",
+        "put the names of the columns in the order of their values",
+        code="quaternion_order",
+    ),
+    "inverse_orientation": FindingWords(
+        "{whose} orientations seem to be inverted (of the world in the sensor), while the "
+        "positions are those of the sensor in its world",
+        "invert the orientations alone: negate x, y and z of every quaternion",
+    ),
+    "left_handed": FindingWords(
+        "{whose} axes are left-handed: with all positions mirrored the streams agree",
+        "convert the stream to right-handed axes (REP 103)",
+    ),
+    "axes": FindingWords(
+        "{whose} positions are in other axes than its orientations: (x, y, z) should be ({detail})",
+        "write positions and orientations in the same right-handed axes; of angles in a file name "
+        "the column heading if they are clockwise from north, otherwise yaw",
+    ),
+    "euler_order": FindingWords(
+        "{whose} orientations seem to be angles in the other order: roll about x first, in turning "
+        "axes, and read as about fixed axes",
+        "write quaternions, or roll, pitch and yaw about the fixed axes x, y and z (REP 103)",
+    ),
+    "motions": FindingWords(
+        "the {stream} stream holds motions since the pose before, not poses: chained, they agree "
+        "with the other stream",
+        "write the poses in one world; of motions, the product of all up to each",
+        "such as odometry or scan matching that writes increments",
+    ),
+    "positions_turned": FindingWords(
+        "{whose} positions are in other axes than its orientations, turned by {turned_deg:.0f} deg",
+        "write positions and orientations in one and the same world",
+    ),
+    "earth_centred": FindingWords(
+        "{whose} positions count from the centre of the earth (ECEF), its orientations do not: "
+        "they are relative to local axes such as east, north, up",
+        "write both in local axes, such as east, north, up (ENU), or both earth-centred; or give "
+        "latitude, longitude and height in place of the positions",
+    ),
+    "ambiguous": FindingWords(
+        "this motion fits another explanation as well: {whose} positions are in other axes, "
+        "(x, y, z) for ({detail}). That gives another rotation",
+        "look at the result, or rotate about other axes, too (a vehicle: over slopes or kerbs)",
+        severity=Severity.WARNING,
+    ),
+    "inverse": FindingWords(
+        "the {stream} stream seems to hold inverse poses (of the world in the sensor, not of the "
+        "sensor in its world)",
+        "invert every pose of the {stream} stream",
+    ),
+    "inverse_both": FindingWords(
+        "both streams seem to hold inverse poses (of the world in the sensor): inverted, their "
+        "paths and the lever arm between them are shorter",
+        "invert every pose of both streams, or the result is the pose of one world in the other "
+        "(which is what a fixed camera beside an arm needs)",
+    ),
+    "inverse_unclear": FindingWords(
+        "two readings fit alike: {first}, or {second}. Neither noise nor shape of the motion tells "
+        "which is right",
+        "give parent_invert and child_invert: none for poses of the sensor in its world, poses for "
+        "poses of the world in the sensor",
+        "small or short motion, or a fixed camera beside an arm",
+        code="{code}",
+    ),
+    "inverse_small": FindingWords(
+        "both streams were inverted, as their noise and shape ask for; poses of a fixed camera "
+        "beside an arm look like that, too",
+        "give parent_invert none and child_invert none for a fixed camera beside an arm",
+        severity=Severity.WARNING,
+        code="inverse_both",
+    ),
+    "time_offset": FindingWords(
+        "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
+        "add {total_s} s in all to the child's stamps, or have it estimated",
+    ),
+    "large_time_offset": FindingWords(
+        "the child's clock is {size_s:.2f} s {direction} the parent's, and no offset was given",
+        "check that both streams are of one vehicle; if the clocks differ so much, give "
+        "time_offset {total_s} or estimate",
+        "a clock of another epoch (start of the computer or of the recording, GPS week) or time "
+        "scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a vehicle that follows",
+        severity=Severity.WARNING,
+        code="time_offset",
+    ),
+    "units": FindingWords(
+        "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
+        "{sigma:.2g})",
+        "convert them to metres; if the child has no unit, such as a single camera, have the scale "
+        "estimated",
+    ),
+    "unit_or_scale": FindingWords(
+        "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g}: the parent's are "
+        "{unit}, or the child has a scale of its own",
+        "give parent_scale {factor:g} if the parent's lengths are {unit}, or scale estimate if not",
+    ),
+    "scale": FindingWords(
+        "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
+        "parent's",
+        "have the scale estimated, or find out which of the two measures wrongly",
+    ),
+    "one_axis": FindingWords(
+        "{axes} cannot be determined from this motion, and will be unobservable",
+        "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {it} and give "
+        "a prior",
+        severity=Severity.NOTE,
+    ),
+    "same_frame": FindingWords(
+        "both streams are of the same frame: the extrinsic is the identity within {size}",
+        "give the stream of the child sensor itself",
+        "such as two topics of one odometry, or odometry of the robot's base that was derived from "
+        "the other sensor",
+    ),
+    "same_position": FindingWords(
+        "both streams have the same positions and other orientations: the translation between the "
+        "sensors is zero ({size})",
+        "give positions of the child sensor itself",
+        "such as positions that were fused from the other sensor, or computed for another point of "
+        "the robot than the sensor",
+    ),
+    "rotation_gain": FindingWords(
+        "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
+        "the parent sensor's frame",
+        "calibrate that scale first",
+        "a gyroscope or wheel base with a wrong scale, in either stream",
+    ),
+    "turns": FindingWords(
+        "every rotation of the child is {times:.2g} times that of the parent",
+        "correct its orientations: x, y, z of a quaternion are for half the angle; angles in a "
+        "file need their unit in the header, such as yaw_deg",
+        "radians read as degrees, or half or twice the angles",
+        code="rotation_gain",
+    ),
+    "late": FindingWords(
+        "{whose} {part} are {delay_s:.3f} +/- {sigma_s:.3f} s later than its {others}: at this "
+        "speed they are off by {shift_m:.2g} m",
+        "use poses from one source, before any filter",
+        "positions, or heights of a barometer, from another source or filter than the rest, or "
+        "another stream of another body, such as a trailer",
+        code="{code}",
+    ),
+    "worlds_turned": FindingWords(
+        "{whose} positions are turned against its orientations by {turned_deg:.2f} deg, mainly "
+        "about {axis} of its world",
+        "give positions and orientations in one and the same world",
+        "magnetic declination or grid convergence in one of them, or poses that were fused with "
+        "the other sensor's through a wrong transform",
+    ),
+    "model_scale": FindingWords(
+        "the child's lengths are {size} % {than} than the parent's; the result allows for it",
+        "find out which of the two measures wrongly; have the scale estimated if neither is to be "
+        "trusted",
+        "a wheel radius, a camera's baseline or a map that is stretched",
+    ),
+    "axis_scale": FindingWords(
+        "{whose} {axis} coordinates are {factor:.4f} +/- {sigma:.4f} times as long as its others",
+        "write all coordinates in metres, from one source",
+        "heights in feet, of a barometer or constant (2D), or map coordinates whose scale depends "
+        "on the latitude",
+    ),
+    "smoothed": FindingWords(
+        "{whose} {part} are smoothed over about {smoothing_s:.2f} s, the other's are not: this "
+        "displaces poses by about {shift_m:.2g} m, and the translation by as much or more",
+        "use the poses before that filter",
+        "a low-pass or smoothing filter",
+        code="smoothed_{part}",
+    ),
+    "world_drift": FindingWords(
+        "the child's world rotates by {deg_per_minute:.2g} deg and moves by {m_per_minute:.2g} m a "
+        "minute against the parent's: at {percent:.2g} % of the sensor's speed",
+        "use the poses before that correction, in the frame of the odometry",
+        "a map that is corrected bit by bit, a heading that drifts, or poses published in a frame "
+        "that moves",
+        severity=Severity.WARNING,
+    ),
+    "parts_turned": FindingWords(
+        "two parts of the recording are sound by themselves, and their rotations differ by {size}",
+        "calibrate the parts before and after on their own",
+        "a source that started anew with other axes, or streams that were swapped",
+        code="mount_moved",
+    ),
+    "mount_moved": FindingWords(
+        "the extrinsic changes {at_s:.0f} s after the start by {size}",
+        "tighten it and record again, or calibrate the parts before and after on their own",
+        "a mount that came loose or was knocked, or an estimator that started anew",
+    ),
+}
+
+
+@cache
+def words_of(key: str) -> FindingWords:
+    """Return the templates of a finding by the key of its row, those of extras included."""
+    words = {**_WORDS}
+    for load in FINDING_WORDS.values():
+        words |= load()
+    return words[key]

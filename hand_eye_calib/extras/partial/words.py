@@ -1,0 +1,45 @@
+"""Sentences of the findings about streams of positions, rotations or angular rates."""
+
+from hand_eye_calib.core.checks.words import FindingWords
+
+WORDS = {
+    "rate_unit": FindingWords(
+        "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "
+        "and were read as {read_as}",
+        "name the unit in the header, such as wx_deg_s or wx_rad_s; a message has rad/s",
+    ),
+    "no_lever_arm": FindingWords(
+        "the positions are those of the other sensor: the lever arm is zero ({size})",
+        "give the positions of the antenna or prism itself; if it is there, say so by priors, such "
+        "as prior.x 0+/-0.01",
+        "such as positions of a fused pose, or of the other topic of one receiver",
+        code="same_position",
+    ),
+    "parallel_axes": FindingWords(
+        "the rotation between the sensors is zero ({size}): both streams seem to be of one sensor",
+        "give the rates of the child sensor itself; if the axes are parallel, say so by priors, "
+        "such as prior.yaw 0+/-1deg",
+        "such as the rates of the parent's own gyroscope",
+        code="same_frame",
+    ),
+    "interpolated": FindingWords(
+        "{share:.0%} of {whose} positions lie on straight lines between their neighbours: they are "
+        "interpolated between few measured ones",
+        "give the positions as they were measured",
+    ),
+    "mirrored_positions": FindingWords(
+        "{whose} positions are in left-handed axes",
+        "correct the sign of one coordinate, or the order of two (REP 103: x east, y north, z up)",
+        code="left_handed",
+    ),
+    "mirrored_rates": FindingWords(
+        "{whose} rates are about left-handed axes",
+        "correct the sign of one axis, or the order of two",
+        code="left_handed",
+    ),
+    "misaligned": FindingWords(
+        "two axes of {whose} rates are not perpendicular, by {degrees:.2f} deg",
+        "calibrate the axes of the gyroscope first",
+        "a misaligned axis of a gyroscope",
+    ),
+}

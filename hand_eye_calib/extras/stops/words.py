@@ -1,0 +1,96 @@
+"""Sentences of the findings about stops."""
+
+from hand_eye_calib.core.checks.words import FindingWords
+from hand_eye_calib.core.results.records import Severity
+
+WORDS = {
+    "frozen_stops": FindingWords(
+        "the {stream}'s pose is the same as before at {share:.0%} of the stops, while the other "
+        "side moves",
+        "read the pose anew at every stop, once it stands still; leave these stops out",
+        "a pose that was stored before it was updated",
+        code="frozen",
+    ),
+    "rows": FindingWords(
+        "the rows of both sides do not belong together: they agree {text}",
+        "pair each pose with the one of the same stop",
+        "a row that is missing on one side, or files sorted by name",
+    ),
+    "angles": FindingWords(
+        "{whose} rotations agree with the other's if their numbers are {detail}",
+        "convert them, or name the columns of the file by what they are: roll_deg, pitch_deg, "
+        "yaw_deg or rotvec_x, rotvec_y, rotvec_z",
+    ),
+    "unrelated_stops": FindingWords(
+        "both sides rotate by different angles between the stops ({off_deg:.0f} deg in the median)",
+        "check that both are of one session and row by row of the same stops, and what the numbers "
+        "of the rotations are: angles or rotation vectors, degrees or radians",
+        code="unrelated",
+    ),
+    "disagreeing_stops": FindingWords(
+        "no camera and target explain {share:.0%} of the {part} of these stops",
+        "check axes and conventions of both sides, that the camera and the target are fixed, and "
+        "that rows belong together",
+        "positions of another frame than the rotations, a target or a camera that moved, wrong "
+        "parameters of the arm",
+        code="unrelated",
+    ),
+    "inverse_stops": FindingWords(
+        "one of the two files has inverse poses (of the world in the sensor, such as a target in "
+        "the camera)",
+        "give parent_invert poses if it is the parent's; if it is the child's",
+        code="inverse",
+    ),
+    "ambiguous_stops": FindingWords(
+        "two conventions explain these stops alike: {given}, or {other}",
+        "look up the convention of both sources and give the options of the first, or",
+        code="ambiguous",
+    ),
+    "both_readings": FindingWords(
+        "a camera on the hand and one beside the robot fit these stops equally well",
+        "record more stops, with rotations about two axes: 15 or more are good",
+        code="ambiguous",
+    ),
+    "setup": FindingWords(
+        "the stops fit a camera {other}, not one {place}",
+        "leave setup out; or, if one side or both hold inverse poses, give parent_invert poses "
+        "(robot), child_invert poses (target), or both",
+    ),
+    "copied_stops": FindingWords(
+        "the poses of the target are those of the robot: the camera and the target would be at the "
+        "origins of hand and base",
+        "give the poses of the target as the camera measured them",
+        code="same_frame",
+    ),
+    "outlier_stops": FindingWords(
+        "{count} of {n_stops} stops do not fit the others and were left out: {numbers}",
+        "look at these stops: is the target detected well, and does the arm rest?",
+        "a target that was detected mirrored, or a stop during a motion",
+        severity=Severity.WARNING,
+        code="outliers",
+    ),
+    "stop_units": FindingWords(
+        "{whose} lengths are {unit}",
+        "convert them to metres, or solve with",
+        code="units",
+    ),
+    "target_scale": FindingWords(
+        "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f}: they are "
+        "{times:.4g} times as long as the parent's",
+        "measure the target and give its size, or have the scale estimated",
+        "a target of another size, or a wrong focal length",
+        code="scale",
+    ),
+    "reading": FindingWords(
+        "{what}: probably the poses of one or both sides are inverse, or both are exchanged",
+        "give parent_invert poses if the robot's are, child_invert poses if the target's are, both "
+        "if both are, and parent_invert none with child_invert none if all is right",
+        code="inverse",
+    ),
+    "turning_about_one_axis": FindingWords(
+        "the stops do not turn about two axes",
+        "turn the hand about at least two axes between them",
+        severity=Severity.NOTE,
+        code="one_axis",
+    ),
+}
