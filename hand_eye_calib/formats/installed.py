@@ -1,5 +1,6 @@
-"""What is installed now: from a robot description, an earlier result, a file of another program, a
-bag, or numbers.
+"""Extrinsic that is installed now.
+
+Its source is a robot description, an earlier result, a file of another program, a bag, or numbers.
 """
 
 import os
@@ -19,12 +20,12 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic, FrameTree, numbers_of, pose_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
-from hand_eye_calib.formats.exports import arranged, formats
+from hand_eye_calib.formats.exports import Layout, arranged, formats
 from hand_eye_calib.formats.files import read_bytes
 from hand_eye_calib.formats.results import FILE_NAME, load_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
-# Results say what they are.
+# Format that a result states.
 _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
@@ -35,16 +36,27 @@ _EXPECTED = (
 
 
 def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
-    """Read what is installed before the sensors' frames are known: the parent's and the child's
-    give the pose of the child sensor in the parent sensor's frame, or an InputError.
+    """Read the installed extrinsic before the frames of the sensors are known.
 
     Parameters
     ----------
     text : str
         A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a file of
         another program, one of formats/exports.py, a bag with ``/tf_static``, or
-        ``X Y Z ROLL PITCH YAW`` in m and rad; an InputError if it cannot be read, a ConfigError if
-        it is neither a file nor six numbers.
+        ``X Y Z ROLL PITCH YAW`` in m and rad.
+
+    Returns
+    -------
+    callable
+        Takes the parent's and the child's frame, and returns the pose of the child sensor in the
+        parent sensor's frame. Raises an InputError if the source has no such pose.
+
+    Raises
+    ------
+    InputError
+        If the source cannot be read.
+    ConfigError
+        If the text is neither a file nor six numbers.
     """
     path = Path(text)
     if not os.path.exists(text):
@@ -74,15 +86,19 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
 def stated(
     find: Callable[[str, str], FloatArray], origin: str, parent_frame: str, child_frame: str
 ) -> Extrinsic:
-    """The installed pose that a source finds by the names of both frames; if it does not, an
-    InputError that begins with the origin.
+    """Return the installed pose from a source, by the names of both frames.
+
+    Raises
+    ------
+    InputError
+        If the source does not have it. The message begins with the origin.
     """
     with located(origin):
         return Extrinsic(find(parent_frame, child_frame), origin)
 
 
 def frames_of_bag(path: str | Path) -> FrameTree:
-    """The frames of a bag's ``/tf_static``."""
+    """Return the frames of a bag's ``/tf_static``."""
     from hand_eye_calib.formats.bags.reader import PoseBag
 
     with PoseBag(path) as bag:
@@ -90,13 +106,15 @@ def frames_of_bag(path: str | Path) -> FrameTree:
 
 
 def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
-    found = frame_name(result.parent_frame), frame_name(result.child_frame)
-    wanted = frame_name(parent_frame), frame_name(child_frame)
-    if found == wanted[::-1]:
+    result_parent = frame_name(result.parent_frame)
+    result_child = frame_name(result.child_frame)
+    wanted = (frame_name(parent_frame), frame_name(child_frame))
+    if (result_child, result_parent) == wanted:
         result = result.inverse()
-    elif found != wanted:
+    elif (result_parent, result_child) != wanted:
         raise InputError(
-            f"{path}: is about {found[1]} in {found[0]}; expected {child_frame} in {parent_frame}"
+            f"{path}: is about {result_child} in {result_parent}; expected {child_frame} in "
+            f"{parent_frame}"
         )
     return Extrinsic(
         result.T_parent_child, str(path), result.covariance_measured, is_calibration=True
@@ -107,101 +125,124 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
 
 
 def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
-    """The pose of the child sensor in the parent sensor's frame, in a document of any format; an
-    InputError if it is not there.
+    """Return the pose of the child sensor in the parent sensor's frame, from any document.
+
+    Raises
+    ------
+    InputError
+        If the document has no such pose.
     """
     nodes = [*_nodes(document, ())]
     frames = FrameTree("the file")
-    for parent, child, *pose in filter(None, (_named(*each) for each in nodes)):
-        frames.add(str(parent), str(child), pose_of(*pose))
+    for path, node in nodes:
+        if edge := _named(path, node):
+            parent, child, *pose = edge
+            frames.add(str(parent), str(child), pose_of(*pose))
     if frames.edges:
         return frames.pose(parent_frame, child_frame)
     for layouts in formats().values():
-        fitting = [
-            each for each in layouts if each.keys and any(_at(node, each.keys) for _, node in nodes)
-        ]
+        fitting = [layout for layout in layouts if _fits(layout, nodes)]
         if fitting:
             layout, is_inverted, _ = arranged(fitting, parent_frame, child_frame)
             names, values = _of_sensors(nodes, layout.keys, {parent_frame, child_frame})
-            if layout.is_inverted is not None and child_frame not in names:
-                is_inverted ^= parent_frame in names  # where the format names its child
-            return se3.inverse(pose_of(*values)) if is_inverted else pose_of(*values)
+            is_fixed = layout.is_inverted is not None
+            if is_fixed and child_frame not in names and parent_frame in names:
+                is_inverted = not is_inverted  # the format names its child
+            T = pose_of(*values)
+            return se3.inverse(T) if is_inverted else T
     if len(numbers_of(document)) in (12, 16):
         return pose_of(document)
     raise InputError(f"expected {_EXPECTED}")
+
+
+def _fits(layout: Layout, nodes: "Sequence[_Node]") -> bool:
+    return bool(layout.keys) and any(_values_at(node, layout.keys) for _, node in nodes)
 
 
 # A mapping, and the keys that lead to it.
 _Node = tuple[tuple[str, ...], Mapping[str, Any]]
 
 
-def _nodes(document: Any, above: tuple[str, ...]) -> Iterator[_Node]:
-    """All mappings of a document."""
+def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
+    """Yield all mappings of a document."""
     if isinstance(document, Mapping):
-        yield above, document
-        for name, each in document.items():
-            yield from _nodes(each, (*above, str(name)))
+        yield path, document
+        for name, value in document.items():
+            yield from _nodes(value, (*path, str(name)))
     elif isinstance(document, list):
-        for each in document:
-            yield from _nodes(each, above)
+        for item in document:
+            yield from _nodes(item, path)
 
 
-def _named(above: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Parent, child and pose of a node that names both frames; empty for another one."""
+def _named(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return parent, child and pose of a node that names both frames; empty for other nodes."""
     header = node.get("header")
-    about = node.get("parameters")
+    parameters = node.get("parameters")
     if isinstance(header, Mapping) and "child_frame_id" in node:  # TransformStamped
         return header.get("frame_id"), node["child_frame_id"], node.get("transform")
     if {"parent", "child", "value"} <= node.keys():
         return node["parent"], node["child"], node["value"]
-    if {*AXES} <= node.keys() and len(above) > 1:
+    if {*AXES} <= node.keys() and len(path) > 1:
         rpy_deg = np.degrees(numbers_of([node[name] for name in ROTATIONS]))
-        return *above[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
-    if isinstance(about, Mapping) and "transform" in node:  # easy_handeye2
-        is_fixed = about.get("calibration_type") == "eye_on_base"
-        robot = about.get("robot_base_frame" if is_fixed else "robot_effector_frame")
-        return robot, about.get("tracking_base_frame"), node["transform"]
+        return *path[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
+    if isinstance(parameters, Mapping) and "transform" in node:  # easy_handeye2
+        is_fixed = parameters.get("calibration_type") == "eye_on_base"
+        robot = parameters.get("robot_base_frame" if is_fixed else "robot_effector_frame")
+        return robot, parameters.get("tracking_base_frame"), node["transform"]
     return ()
 
 
 def _of_sensors(
     nodes: list[_Node], keys: Sequence[str], frames: set[str]
 ) -> tuple[set[str], list[Any]]:
-    """What stands under some keys, and which of the frames name it, beside or else above; of
-    several, that of these frames.
+    """Return the frames that an extrinsic names, and the values under its keys.
+
+    The names are beside the values, or else above them. If there are several extrinsics, the one
+    that names a frame counts.
+
+    Raises
+    ------
+    InputError
+        If there are several such extrinsics.
     """
-    found = []
-    for above, node in nodes:
-        if values := _at(node, keys):
-            beside = frames & {frame_name(str(value)) for value in node.values()}
-            found.append((beside or frames & {*above}, values))
-    if len(found) > 1:
-        found = [each for each in found if each[0]]
-    if len(found) != 1:
+    extrinsics = []
+    for path, node in nodes:
+        if values := _values_at(node, keys):
+            names = frames & {frame_name(str(value)) for value in node.values()}
+            extrinsics.append((names or frames & {*path}, values))
+    if len(extrinsics) > 1:
+        extrinsics = [(names, values) for names, values in extrinsics if names]
+    if len(extrinsics) != 1:
         raise InputError(
             "it has several extrinsics, and the names of the frames do not say which is meant "
             f"({' or '.join(sorted(frames))}); delete the others"
         )
-    return found[0]
+    return extrinsics[0]
 
 
-def _at(node: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
-    """What stands under keys such as ``T`` or ``extrinsics.T``; empty if one is not there."""
-    found = []
+def _values_at(node: Mapping[str, Any], keys: Sequence[str]) -> list[Any]:
+    """Return the values of keys such as ``T`` or ``extrinsics.T``; empty if one is missing."""
+    values = []
     for key in keys:
         value: Any = node
-        for part in [key] if key in node else key.split("."):
-            value = value.get(part) if isinstance(value, Mapping) else None
-        found.append(value)
-    return [] if None in found else found
+        for name in [key] if key in node else key.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        if value is None:
+            return []
+        values.append(value)
+    return values
 
 
 # ---- robot descriptions
 
 
 def read_urdf(path: str | Path) -> FrameTree:
-    """The frames of a URDF file; an InputError if it cannot be read, is no URDF, or has macros of
-    xacro in it, as nobody can tell where in such a file a value comes from.
+    """Return the frames of a URDF file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is no URDF, or has macros of xacro, whose values are unknown.
     """
     data = read_bytes(path)
     with located(path):
@@ -220,23 +261,25 @@ def _frames(data: bytes) -> FrameTree:
     joints = root.findall("joint")
     values = np.array([_origin(joint) for joint in joints]).reshape(-1, 6)
     poses = se3.from_rotation_translation(se3.rotation_from_rpy(values[:, 3:]), values[:, :3])
-    found = FrameTree("the robot description")
+    frames = FrameTree("the robot description")
     for joint, T_parent_child in zip(joints, poses, strict=True):
-        links = [
-            part.get("link", "") for each in ("parent", "child") for part in joint.findall(each)
-        ]
+        elements = [*joint.findall("parent"), *joint.findall("child")]
+        links = [element.get("link", "") for element in elements]
         if len(links) != 2 or not all(links):
             raise InputError(f"joint {joint.get('name', '')!r} has no parent or no child")
-        found.add(links[0], links[1], T_parent_child, joint.get("type") == "fixed")
-    return found
+        frames.add(links[0], links[1], T_parent_child, joint.get("type") == "fixed")
+    return frames
 
 
 def _origin(joint: ElementTree.Element) -> list[float]:
-    """x, y, z, roll, pitch and yaw of a joint's origin."""
-    origin = joint.find("origin")
-    given = {"xyz": "0 0 0", "rpy": "0 0 0"} | (origin.attrib if origin is not None else {})
-    values = numbers_of(" ".join(given.values()))
-    if len(given) != 2 or len(values) != 6 or not np.isfinite(values).all():
+    """Return x, y, z, roll, pitch and yaw of a joint's origin."""
+    attributes = {"xyz": "0 0 0", "rpy": "0 0 0"}
+    for origin in joint.findall("origin")[:1]:
+        attributes |= origin.attrib
+    values = numbers_of(" ".join(attributes.values()))
+    if len(attributes) != 2 or len(values) != 6 or not np.isfinite(values).all():
         name = joint.get("name", "")
-        raise InputError(f"the origin of joint {name!r} is not six numbers, xyz and rpy: {given}")
+        raise InputError(
+            f"the origin of joint {name!r} is not six numbers, xyz and rpy: {attributes}"
+        )
     return values

@@ -1,12 +1,13 @@
-"""The session journal: the poses that the node takes, written to disk as they arrive, so that a
-crash loses next to nothing.
+"""Session journal: the poses of the node, written to disk as they arrive.
 
-A journal is a directory with a text file for each stream, ``parent.tum``, ``child.tum`` and so on,
-which other programs read as well: a line ``t x y z qx qy qz qw`` for each pose, with the stamp in
-seconds and all digits of every number. Lines that begin with ``# {`` hold JSON. The first says what
-the stream is and which options hold, later ones what has changed. ``parent_poses`` says how many
-poses the parent's file had when the poses below it were written, which gives the order of arrival.
-A process that is killed while it writes leaves a line without an end; a reader stops before the
+A crash loses only the last poses.
+
+A journal is a directory with a text file for each stream: ``parent.tum``, ``child.tum`` and so on.
+Other programs also read these files. Each pose is a line ``t x y z qx qy qz qw``, with the stamp in
+seconds and all digits of every number. A line that begins with ``# {`` has JSON: the first one
+describes the stream and its options, later ones their changes. ``parent_poses`` is the number of
+poses in the parent's file when the poses below it were written. It determines the order of arrival.
+A process that is killed while it writes may leave an incomplete line: the reader stops before the
 first line that it cannot read.
 """
 
@@ -19,6 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,23 +36,34 @@ _FORMAT = "hand_eye_calib/journal"
 _VERSION = 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
-# Names for a journal that is kept aside, beside what is no journal.
+# Largest number in the name of a journal that is kept aside.
 _MOST_ASIDE = 100
 _ADVICE = "move it away to start anew"
-# What a line may raise that is none of a journal.
+# Errors of a line that does not belong to a journal.
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
-#: What is known of each stream: plain values, such as topic, frame, origin and options.
+#: Description of each stream in plain values, such as topic, frame, origin and options.
 About = Mapping[str, Document]
 
 
 class JournalWriter:
-    """Writes one session into a directory, which is made if it does not exist. All methods raise
-    OSError if it cannot be written.
+    """Writer of one session into a directory.
 
-    A directory with a file of such a name that is no journal, or a link, is refused.
-    ``about`` is what is known of each stream, ``resumed`` the session in the directory if that goes
-    on: what cannot be read at the end of its files is cut off.
+    All methods raise an OSError if the directory cannot be written.
+
+    Parameters
+    ----------
+    directory : str or path-like
+        It is made if it does not exist.
+    about : About
+        Description of each stream.
+    resumed : Journal, optional
+        Session in the directory that is continued. The unreadable end of its files is cut off.
+
+    Raises
+    ------
+    OSError
+        Also if a file of a stream's name is a link, or does not belong to a journal.
     """
 
     def __init__(
@@ -64,7 +77,7 @@ class JournalWriter:
         self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before.about}}
         self._files: dict[str, FileIO] = {}
         for stream in self._pending:
-            # Unbuffered: what is flushed is with the operating system and survives this process.
+            # Without a buffer, data is in the operating system at once and survives this process.
             path = Path(directory, f"{stream}.tum")
             self._files[stream] = open(path, "ab", buffering=0, opener=_open_no_link)  # noqa: SIM115
             self._files[stream].truncate(before.whole_bytes.get(stream, 0))
@@ -74,30 +87,34 @@ class JournalWriter:
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> None:
-        """Note a pose; it reaches the disk with the next :meth:`flush`."""
+        """Add a pose. It is written with the next :meth:`flush`."""
         self._pending[stream].append(tum_line(stamp_ns, (*position, *quat_xyzw)))
 
     def describe(self, about: About) -> None:
-        """Note what is known of the streams: what has changed reaches the disk at once."""
+        """Write the changes in the descriptions of streams at once."""
         self.flush()
-        for stream, known in about.items():
+        for stream, description in about.items():
             before = self._about.get(stream, {})
-            if changed := {key: each for key, each in known.items() if before.get(key) != each}:
-                self._write(stream, [f"# {json.dumps(changed)}"])
-            self._about[stream] = {**before, **known}
+            changes = {key: value for key, value in description.items() if before.get(key) != value}
+            if changes:
+                self._write(stream, [f"# {json.dumps(changes)}"])
+            self._about[stream] = {**before, **description}
 
     def flush(self) -> None:
-        """Hand everything noted to the operating system, where it survives this process."""
+        """Write all poses to the operating system, where they survive this process."""
         for stream, lines in self._pending.items():  # the parent is first
-            if lines:
-                batch = [] if stream == "parent" else [f'# {{"{_BATCH}": {self._parent_poses}}}']
-                self._write(stream, [*batch, *lines])
-                self._parent_poses += len(lines) * (stream == "parent")
-                lines.clear()
+            if not lines:
+                continue
+            if stream == "parent":
+                self._write(stream, lines)
+                self._parent_poses += len(lines)
+            else:
+                self._write(stream, [f'# {{"{_BATCH}": {self._parent_poses}}}', *lines])
+            lines.clear()
 
     def _write(self, stream: str, lines: Sequence[str]) -> None:
         file = self._files[stream]
-        # A file that is no longer where it was would take what is written, and lose it.
+        # Data that is written to a file without its name would be lost.
         if not os.path.samestat(os.stat(file.name), os.fstat(file.fileno())):
             raise OSError("another program has replaced its file")
         file.write("\n".join([*lines, ""]).encode())
@@ -113,12 +130,19 @@ class JournalWriter:
 
 @dataclass(frozen=True)
 class Journal:
-    """The session that a directory holds; its poses are in the order in which they arrived.
+    """Session of a directory, with its poses in the order of their arrival.
 
-    ``about`` has "options", "topic", "frame", "origin" and what else was noted of each stream;
-    ``streams`` (N,) and ``stamps_ns`` (N,) belong to ``poses`` (N, 7) of x y z (m), qx qy qz qw;
-    ``whole_bytes`` are those of each stream's file up to the end of the last line that could be
-    read.
+    Attributes
+    ----------
+    about : dict of str to dict
+        "options", "topic", "frame", "origin" and other values of each stream.
+    streams : (N,) array of str
+        Stream of each pose.
+    stamps_ns : (N,) array of int64
+    poses : (N, 7) array
+        x y z (m), qx qy qz qw.
+    whole_bytes : dict of str to int
+        Bytes of each stream's file up to the end of the last readable line.
     """
 
     about: dict[str, Document]
@@ -129,32 +153,47 @@ class Journal:
 
 
 def read_journal(directory: str | Path) -> Journal:
-    """Read the session that a directory holds; an InputError if there is none, or it cannot be
-    read.
+    """Read the session of a directory.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it cannot be read.
     """
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
-    found = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
-    if "parent" not in found:  # a node may just have renamed the directory
+    files = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
+    if "parent" not in files:  # a node may just have renamed the directory
         raise InputError(f"no session journal in {directory}")
-    abouts, stamps_ns, values, sizes = zip(*found.values(), strict=True)
-    rows = np.concatenate([np.reshape(each, (-1, 8)) for each in values])
+    rows = np.concatenate([np.reshape(file.values, (-1, 8)) for file in files.values()])
     order = np.argsort(rows[:, 0], kind="stable")
+    n_poses = [len(file.stamps_ns) for file in files.values()]
+    stamps_ns = np.concatenate([file.stamps_ns for file in files.values()])
     return Journal(
-        about=dict(zip(found, abouts, strict=True)),
-        streams=np.repeat([*found], [len(each) for each in stamps_ns])[order],
-        stamps_ns=np.concatenate(stamps_ns)[order],
+        about={stream: file.about for stream, file in files.items()},
+        streams=np.repeat([*files], n_poses)[order],
+        stamps_ns=stamps_ns[order],
         poses=rows[order, 1:],
-        whole_bytes=dict(zip(found, sizes, strict=True)),
+        whole_bytes={stream: file.whole_bytes for stream, file in files.items()},
     )
 
 
-def _read(path: Path) -> tuple[Document, "array[int]", "array[float]", int]:
-    """Read the file of one stream: what its comments say, the stamps of its poses, their rows, and
-    how many bytes could be read. A row is x y z qx qy qz qw behind the time of arrival, which is
-    counted in poses of the parent.
+class _StreamFile(NamedTuple):
+    """File of one stream.
+
+    A row of ``values`` is the time of arrival, counted in poses of the parent, and x y z qx qy qz
+    qw. ``whole_bytes`` is the number of readable bytes.
     """
+
+    about: Document
+    stamps_ns: "array[int]"
+    values: "array[float]"
+    whole_bytes: int
+
+
+def _read(path: Path) -> _StreamFile:
+    """Read the file of one stream up to the first unreadable line."""
     about: Document = {}
-    # A pose is 72 bytes in these, and 500 in lists: a session may last all day.
+    # A session may last all day: a pose has 72 bytes in these arrays, and 500 in lists.
     stamps_ns = array("q")
     values = array("d")
     whole_bytes = 0
@@ -167,7 +206,7 @@ def _read(path: Path) -> tuple[Document, "array[int]", "array[float]", int]:
                 seconds, _, decimals = stamp.partition(b".")
                 if len(cells) != 7 or len(decimals) != 9:
                     break
-                # The parent's poses count from 0; others came between two of them.
+                # The parent's poses count from 0. Other poses arrived between two of them.
                 arrived = about.get(_BATCH, len(stamps_ns) + 0.5) - 0.5
                 row = [float(cell) for cell in (arrived, *cells)]
                 stamps_ns.append(int(seconds + decimals))
@@ -180,11 +219,11 @@ def _read(path: Path) -> tuple[Document, "array[int]", "array[float]", int]:
             f"the session journal {path} is of format version {about.get('version')}, this program "
             f"reads {_VERSION}: use the version that wrote it, or {_ADVICE}"
         )
-    return about, stamps_ns, values, whole_bytes
+    return _StreamFile(about, stamps_ns, values, whole_bytes)
 
 
 def _refuse_foreign(directory: Path) -> None:
-    """Raise an OSError if a file of a stream's name is not a journal's: writing would empty it."""
+    """Raise an OSError if a file of a stream's name is no journal: writing would empty it."""
     for stream in _STREAMS:
         path = directory / f"{stream}.tum"
         if os.path.lexists(path) and not _is_own(path):
@@ -192,7 +231,7 @@ def _refuse_foreign(directory: Path) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is empty or begins as the file of a journal does; links are not."""
+    """Whether a file is empty or begins like a journal, and is no link."""
     if path.is_symlink() or not path.is_file():
         return False
     with open_regular(path) as file:
@@ -205,20 +244,25 @@ def _open_no_link(path: str, flags: int) -> int:
 
 
 def is_used(directory: str | Path) -> bool:
-    """Return whether a directory has a file of the name of a stream, whatever is in it."""
+    """Whether a directory has a file of a stream's name, with any content."""
     return any(os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS)
 
 
 def has_session(directory: str | Path) -> bool:
-    """Whether a directory holds a journal."""
+    """Whether a directory has a journal."""
     return os.path.isfile(Path(directory) / "parent.tum")
 
 
 def keep_aside(directory: str | Path) -> Path:
-    """Rename a journal's directory so that a new session can use it, and return where it went.
+    """Rename a journal's directory so that a new session can use it, and return the new path.
 
-    Only the last journal is kept: the one before is removed. Where that is more than a journal, the
-    next free name is taken, such as ``journal.previous2``. Raises OSError.
+    The new name is ``journal.previous``. A journal of that name is removed. If other files have the
+    name, the next free name is used, such as ``journal.previous2``.
+
+    Raises
+    ------
+    OSError
+        If the directory cannot be renamed, or no name is free.
     """
     directory = Path(directory)
     for number in ("", *range(2, _MOST_ASIDE)):
@@ -231,7 +275,7 @@ def keep_aside(directory: str | Path) -> Path:
 
 
 def _is_journal(directory: Path) -> bool:
-    """Return whether a directory holds files of a journal and nothing else."""
+    """Whether a directory has files of a journal and no other files."""
     if directory.is_symlink() or not directory.is_dir():
         return False
     names = {f"{stream}.tum" for stream in _STREAMS}
@@ -239,7 +283,7 @@ def _is_journal(directory: Path) -> bool:
 
 
 def count_poses(directory: str | Path) -> int | None:
-    """Number of poses in the session that a directory holds; None if it cannot be read."""
+    """Return the number of poses in the session of a directory; None if it cannot be read."""
     try:
         return len(read_journal(directory).stamps_ns)
     except InputError:
@@ -247,12 +291,12 @@ def count_poses(directory: str | Path) -> int | None:
 
 
 def replay_journal(journal: Journal, directory: Path, engines: Calibrators) -> None:
-    """Add the poses of the session of a directory to engines, in the order of their arrival.
+    """Add the poses of a directory's session to engines, in the order of their arrival.
 
     Raises
     ------
     InputError
-        If the engines refuse them.
+        If the engines refuse a pose.
     """
     with located(f"cannot use the session journal {directory}"):
         for stream, about in journal.about.items():

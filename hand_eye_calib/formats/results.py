@@ -1,5 +1,7 @@
-"""Calibrations and rigs in files: ``extrinsic.yaml`` or ``rig.yaml`` with everything, and the
-transforms alone as xacro and as launch file.
+"""Files of calibrations and rigs.
+
+``extrinsic.yaml`` or ``rig.yaml`` has everything. An xacro file and a launch file have only the
+transforms.
 """
 
 import hashlib
@@ -25,7 +27,7 @@ RIG_NAME = "rig.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 _NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
-# Every file that this program writes has its name in it; tables have a column of headlines.
+# Marks of a file that this program wrote: its name, or the column of headlines of a table.
 _MARKS = (b"hand_eye_calib", b'"headline"')
 
 
@@ -34,17 +36,17 @@ def save_result(
 ) -> Path:
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
-    If the verdict is DO NOT USE, only the first, and files of an earlier result with the other two
-    names are removed. If one cannot be written, none changes.
+    If the verdict is DO NOT USE, only the first is written, and files of an earlier result with the
+    other two names are removed. If a file cannot be written, none changes.
 
     Parameters
     ----------
     calibration : Calibration
     directory : str or path-like
-        Made if it is missing.
+        It is made if it is missing.
     inputs : mapping, optional
-        Where the data came from, in plain values; it goes into the file's provenance. Its
-        ``options`` are the parameters there.
+        Origin of the data in plain values, for the provenance in the file. Its ``options`` become
+        the parameters of the provenance.
 
     Returns
     -------
@@ -54,7 +56,7 @@ def save_result(
     Raises
     ------
     InputError
-        If they cannot be written.
+        If the files cannot be written.
 
     Examples
     --------
@@ -76,48 +78,58 @@ def save_rig(
     directory: str | Path,
     inputs: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write ``rig.yaml``, the rig in plain values, ``static_transform.launch.py`` with all
-    transforms that may be used, and a directory for each sensor with the files of
-    :func:`save_result`; returns the first.
+    """Write the files of a rig, and return ``rig.yaml``.
+
+    ``rig.yaml`` has the document, the rig in plain values. ``static_transform.launch.py`` has all
+    usable transforms. Each sensor has a directory with the files of :func:`save_result`.
     """
     folders = {RIG_NAME, LAUNCH_NAME, "report.html"}
     for calibration in calibrations:
-        # A frame's name, with what a folder's should not have replaced.
+        # Characters of a frame's name that a folder's name should not have are replaced.
         name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"
         while name in folders:
             name += "_2"
         folders.add(name)
         save_result(calibration, Path(directory, name), inputs)
-    usable = [each for each in calibrations if each.verdict is not Verdict.DO_NOT_USE]
+    usable = [
+        calibration for calibration in calibrations if calibration.verdict is not Verdict.DO_NOT_USE
+    ]
     launch = _launch_text(usable) if usable else None
     texts = {LAUNCH_NAME: launch, RIG_NAME: _yaml_text(document, inputs)}
     return _written(Path(directory), texts)
 
 
 def save_text(path: Path, text: str) -> Path:
-    """Write a file in one step, into a directory that is made if it is missing; returns its path.
-    Raises InputError if it cannot be written.
+    """Write a file in one step, and return its path. A missing directory is made.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
     """
     return _written(path.parent, {path.name: text})
 
 
 def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
-    """Write the texts into a directory by their names, all or none, and remove what has none;
-    returns the last file.
+    """Write all texts or none into files of a directory, and return the last file.
+
+    A file whose text is None is removed.
     """
-    kept = {directory / name: text for name, text in texts.items() if text is not None}
+    contents = {directory / name: text for name, text in texts.items() if text is not None}
+    paths = [directory / name for name in texts]
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-        for name in texts:
-            _keep_foreign(directory / name)
-        write_atomically(kept)
-        for path in {directory / name for name in texts} - kept.keys():
-            path.unlink(missing_ok=True)
-    return [*kept][-1]
+        for path in paths:
+            _keep_foreign(path)
+        write_atomically(contents)
+        for path in paths:
+            if path not in contents:
+                path.unlink(missing_ok=True)
+    return [*contents][-1]
 
 
 def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) -> str:
-    """A document with where it came from."""
+    """Return a document with its provenance as YAML."""
     inputs = {**(inputs or {})}
     provenance = {
         "package": "hand_eye_calib",
@@ -132,10 +144,10 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
 
 
 def _keep_foreign(path: Path) -> None:
-    """Give a file that this program has not written a second name, before it is replaced.
+    """Add a second name to a file that this program has not written, before it is replaced.
 
     The name is that of the file with ``.kept``, or ``.kept2`` and so on. A link needs none, because
-    the file that it leads to stays, nor does a file whose copy lies in ``previous``.
+    its target stays. A file with a copy in ``previous`` needs none either.
     """
     if path.is_symlink() or not path.is_file():
         return
@@ -154,35 +166,48 @@ def _free_name(path: Path) -> Path:
 
 
 def keep_earlier_results(directory: str | Path) -> str:
-    """Copy the result files and the report of a directory into its folder ``previous`` before they
-    are replaced; returns words about it, empty if there are none. An InputError if that fails.
+    """Copy the result files and the report of a directory into its folder ``previous``.
+
+    Returns
+    -------
+    str
+        A note for the user; empty without such files.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be copied.
     """
     previous = Path(directory, "previous")
-    names = (*_NAMES, "report.html")
-    found = [path for name in names if (path := Path(directory, name)).exists()]
+    paths = [Path(directory, name) for name in (*_NAMES, "report.html")]
+    copies = {previous / path.name: read_bytes(path) for path in paths if path.exists()}
+    if not copies:
+        return ""
     with writing(previous):
-        if found:
-            previous.mkdir(exist_ok=True)
-        for path in found:
-            _keep_foreign(previous / path.name)
-        write_atomically({previous / path.name: read_bytes(path) for path in found})
-    return f"; the files that were there are in {previous}" if found else ""
+        previous.mkdir(exist_ok=True)
+        for copy in copies:
+            _keep_foreign(copy)
+        write_atomically(copies)
+    return f"; the files that were there are in {previous}"
 
 
 def fingerprint(path: str | Path) -> dict[str, str | int]:
-    """Name, size and SHA-256 of an input file, for the provenance; read piece by piece."""
+    """Return name, size and SHA-256 of an input file, for the provenance.
+
+    The file is read piece by piece.
+    """
     with open_regular(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         return {"file": str(path), "bytes": file.tell(), "sha256": digest}
 
 
 def load_result(path: str | Path) -> Calibration:
-    """Read a calibration that :func:`save_result` wrote: the file, or the directory that holds it.
+    """Read a calibration that :func:`save_result` wrote: the file, or its directory.
 
     Raises
     ------
     InputError
-        If it cannot be read, is no calibration or is of an unknown version.
+        If the file cannot be read, is no calibration or is of an unknown version.
 
     Examples
     --------
@@ -193,7 +218,7 @@ def load_result(path: str | Path) -> Calibration:
     path = Path(path)
     if path.is_dir():
         if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
-            sensors = sorted(str(each.parent) for each in path.glob(f"*/{FILE_NAME}"))
+            sensors = sorted(str(file.parent) for file in path.glob(f"*/{FILE_NAME}"))
             raise InputError(f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}")
         path = path / FILE_NAME
     document = read_yaml(path)
@@ -202,31 +227,37 @@ def load_result(path: str | Path) -> Calibration:
 
 
 def _xacro_text(calibration: Calibration) -> str:
-    """A fixed joint from the parent's to the child's link, for a robot description with both."""
+    """Return a fixed joint from the parent's to the child's link, for a robot description."""
     parent = calibration.mounting[0]
     child = calibration.child_frame
-    # Quoted for XML, and kept from being evaluated by xacro.
-    joint, parent, child = (
-        quoteattr(printable(text).replace("$", "$$"))
-        for text in (f"{parent}_to_{child}", parent, child)
-    )
     numbers = usable_numbers(calibration) | usable_angles(calibration)
-    xyz, rpy = (
-        " ".join(str(numbers[name]) for name in names) for names in (TRANSLATIONS, ROTATIONS)
-    )
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
-    comment = re.sub("-(?=-)", "- ", comment)  # no comment may hold two hyphens
     return _template(XACRO_NAME).format(
-        comment=comment, joint=joint, parent=parent, child=child, xyz=xyz, rpy=rpy
+        comment=re.sub("-(?=-)", "- ", comment),  # XML forbids two hyphens in a comment
+        joint=_quoted(f"{parent}_to_{child}"),
+        parent=_quoted(parent),
+        child=_quoted(child),
+        xyz=" ".join(str(numbers[name]) for name in TRANSLATIONS),
+        rpy=" ".join(str(numbers[name]) for name in ROTATIONS),
     )
+
+
+def _quoted(text: str) -> str:
+    """Quote a text for XML, so that xacro does not evaluate it."""
+    return quoteattr(printable(text).replace("$", "$$"))
 
 
 def _launch_text(calibrations: Sequence[Calibration]) -> str:
-    """A launch file that publishes extrinsics as static transforms."""
-    comment = "\n".join(f"# {line}" for each in calibrations for line in _remarks(each))
-    arguments = [[*map(printable, transform_arguments(each, 12))] for each in calibrations]
-    transforms = "\n".join(f"    {each}," for each in arguments)
-    return _template(LAUNCH_NAME).format(comment=comment, transforms=transforms)
+    """Return a launch file that publishes extrinsics as static transforms."""
+    comments = []
+    transforms = []
+    for calibration in calibrations:
+        comments += [f"# {line}" for line in _remarks(calibration)]
+        arguments = [*map(printable, transform_arguments(calibration, 12))]
+        transforms.append(f"    {arguments},")
+    return _template(LAUNCH_NAME).format(
+        comment="\n".join(comments), transforms="\n".join(transforms)
+    )
 
 
 def _template(name: str) -> str:
@@ -234,7 +265,7 @@ def _template(name: str) -> str:
 
 
 def _remarks(calibration: Calibration) -> list[str]:
-    """What a person who opens the file must know, in lines."""
+    """Return lines for the user who opens the file: verdict, direction and origin."""
     parent = calibration.mounting[0]
     child = calibration.child_frame
     remarks = [
@@ -247,6 +278,6 @@ def _remarks(calibration: Calibration) -> list[str]:
     return [printable(" ".join(remark.split())) for remark in remarks]
 
 
-# Their names in the package's public interface.
+# Names in the public interface of the package.
 load = load_result
 save = save_result

@@ -1,4 +1,4 @@
-"""Poses of one frame in another from transforms, as they arrive live or are read from a bag."""
+"""Poses of one frame in another, from transforms that arrive live or are read from a bag."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,21 +15,22 @@ from hand_eye_calib.core.base.text import split_frames
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import FrameTree, check_pose
 
-# An edge's stamps that jump back by more begin a new session (ns).
+# Jump back of an edge's stamps (ns) above which a new session begins.
 _JUMP_BACK_NS = STAMP_UNITS["s"]
 
-# Transforms of each moving edge from which its rate is taken, and most that are kept.
+# Transforms of each moving edge from which its rate is estimated.
 _RATE_FROM = 5
+# Transforms of each moving edge that are kept.
 _MOST_KEPT = 2000
 
 # x y z qx qy qz qw of a frame in its parent.
 _Row = tuple[float, ...]
-# The newest stamps and poses of a moving edge, in order.
+# Newest stamps (ns) and poses of a moving edge, in order of time.
 _MovingEdge = deque[tuple[int, _Row]]
 
 
 class TfSource(NamedTuple):
-    """A pair of frames: the sensor's, and the fixed frame in which its poses are wanted."""
+    """Pair of frames: the fixed frame of the poses, and the frame of the sensor."""
 
     world_frame: str
     sensor_frame: str
@@ -39,13 +40,15 @@ class TfSource(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "TfSource":
-        """From ``world:sensor``; a ConfigError if these are not two different frames."""
+        """Return the source of ``world:sensor``; a ConfigError if the frames are not different."""
         return cls(*split_frames("a transform", text))
 
 
 class PoseFields(NamedTuple):
-    """What is unpacked of a message: a stamped pose or transform, in m. Its frames are the parent
-    and child of a transform; the sensor's is None if the type has no place for it.
+    """Stamped pose or transform of a message, in m.
+
+    The frames are the parent and the child of a transform. The sensor's frame is None if the type
+    of the message does not have it.
     """
 
     stamp_ns: int
@@ -56,12 +59,19 @@ class PoseFields(NamedTuple):
 
 
 class TfStream:
-    """Composes the poses of a sensor from the edges of a transform tree as they arrive.
+    """Stream of a sensor's poses, composed from the edges of a transform tree as they arrive.
 
     There is one pose for each transform of the moving edge with the lowest rate. The other moving
-    edges are interpolated there, never extrapolated and never across more than ``max_gap_s``. Of
-    repeated transforms of an edge the first counts, and those that are late are left out. ``tree``
-    has edges that are known before; ``max_gap_s`` may be changed.
+    edges are interpolated at its stamp, never extrapolated and never across more than
+    ``max_gap_s``. Repeated and late transforms of an edge are skipped.
+
+    Parameters
+    ----------
+    source : TfSource
+    max_gap_s : float
+        It may be changed later.
+    tree : FrameTree, optional
+        Edges that are known before the first transform.
     """
 
     def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
@@ -73,7 +83,7 @@ class TfStream:
         self._find_chain()
 
     def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
-        """Take a transform; yields the poses that are known with it. Raises as :meth:`edges_at`."""
+        """Add a transform, and yield the poses that it completes. Raises as :meth:`edges_at`."""
         for stamp_ns, rows in self.edges_at(transform, is_static):
             T_world_sensor = self.composed({name: np.array(row) for name, row in rows.items()})
             x, y, z, *quat_xyzw = _row(T_world_sensor)
@@ -82,9 +92,18 @@ class TfStream:
     def edges_at(
         self, transform: PoseFields, is_static: bool
     ) -> Iterator[tuple[int, dict[str, _Row]]]:
-        """Take a transform; yields stamps (ns) at which the pose is known with it, and the poses
-        x y z qx qy qz qw of the moving edges there. An InputError if it is no pose, or its frame
-        has another parent already.
+        """Add a transform, and yield the stamps at which it completes the pose.
+
+        Yields
+        ------
+        stamp_ns : int
+        rows : dict of str to tuple of float
+            Pose x y z qx qy qz qw of each moving edge at the stamp.
+
+        Raises
+        ------
+        InputError
+            If the transform is no pose, or its frame has another parent.
         """
         parent = transform.world_frame
         frame = transform.sensor_frame or ""
@@ -102,12 +121,12 @@ class TfStream:
             yield from self._move(frame, transform.stamp_ns, row)
 
     def composed(self, moving: Mapping[str, FloatArray]) -> FloatArray:
-        """Poses of the sensor (..., 4, 4) from those of the moving edges (..., 7)."""
+        """Return the sensor's poses (..., 4, 4) from the poses (..., 7) of the moving edges."""
         matrices = {frame: _matrices(rows) for frame, rows in moving.items()}
         return self._tree.pose(*self.source, matrices)
 
     def describe_missing(self) -> str:
-        """Why there is no pose yet."""
+        """Return the reason for which there is no pose yet."""
         try:
             up, down = self._tree.route(*self.source)
         except InputError as error:
@@ -121,41 +140,56 @@ class TfStream:
         frames = []
         with suppress(InputError):
             up, down = self._tree.route(*self.source)
-            frames = [each for each in up + down if not self._tree.edges[each].is_static]
-        self._moving = {each: self._moving.get(each, deque(maxlen=_MOST_KEPT)) for each in frames}
+            frames = [frame for frame in up + down if not self._tree.edges[frame].is_static]
+        self._moving = {
+            frame: self._moving.get(frame, deque(maxlen=_MOST_KEPT)) for frame in frames
+        }
 
     def _move(self, frame: str, stamp_ns: int, row: _Row) -> Iterator[tuple[int, dict[str, _Row]]]:
+        """Add a pose of a moving edge, and yield the stamps and poses that it completes."""
         last_ns = self._last_ns.get(frame, stamp_ns - 1)
         if last_ns - _JUMP_BACK_NS <= stamp_ns <= last_ns:
             return
         if stamp_ns < last_ns:
             self._slowest = ""
             self._last_ns.clear()
-            for each in self._moving.values():  # their stamps begin anew
-                each.clear()
+            for edge in self._moving.values():  # their stamps begin again
+                edge.clear()
         self._last_ns[frame] = stamp_ns
         self._moving[frame].append((stamp_ns, row))
-        if len(self._moving) == 1:  # the usual case, for which nothing has to wait
-            self._slowest = frame
-        elif not self._slowest and all(len(each) >= _RATE_FROM for each in self._moving.values()):
-            stamps_ns = {name: [row[0] for row in each] for name, each in self._moving.items()}
-            self._slowest = max(stamps_ns, key=lambda name: np.median(np.diff(stamps_ns[name])))
+        self._slowest = self._slowest or self._find_slowest()
         if not self._slowest:
             return
-        # The poses at the waiting stamps of the slowest edge that no other edge keeps waiting.
-        base = self._moving[self._slowest]
-        others = {name: each for name, each in self._moving.items() if each is not base}
-        while base and all(each and each[-1][0] >= base[0][0] for each in others.values()):
-            at_ns, row = base.popleft()
-            rows = {name: _at(each, at_ns, self.max_gap_s) for name, each in others.items()}
-            known = {name: each for name, each in rows.items() if each is not None}
-            if len(known) == len(rows):
-                yield at_ns, {self._slowest: row, **known}
+        slowest = self._moving[self._slowest]
+        others = {name: edge for name, edge in self._moving.items() if edge is not slowest}
+        # Poses at the stamps of the slowest edge that every other edge has reached.
+        while slowest and all(edge and edge[-1][0] >= slowest[0][0] for edge in others.values()):
+            at_ns, slowest_row = slowest.popleft()
+            rows = {self._slowest: slowest_row}
+            for name, edge in others.items():
+                other_row = _interpolated(edge, at_ns, self.max_gap_s)
+                if other_row is not None:
+                    rows[name] = other_row
+            if len(rows) == len(self._moving):
+                yield at_ns, rows
+
+    def _find_slowest(self) -> str:
+        """Return the moving edge with the lowest rate; empty until the rates of all are known."""
+        if len(self._moving) == 1:  # the usual case, in which no pose has to wait
+            return next(iter(self._moving))
+        if any(len(edge) < _RATE_FROM for edge in self._moving.values()):
+            return ""
+        intervals_ns = {
+            name: np.median(np.diff([stamp_ns for stamp_ns, _ in edge]))
+            for name, edge in self._moving.items()
+        }
+        return max(intervals_ns, key=lambda name: intervals_ns[name])
 
 
-def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
-    """The pose at a stamp that is not after the last one; None if it is not known. What is asked
-    for next is later.
+def _interpolated(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
+    """Return the pose at a stamp that is not after the edge's last one; None if it is not known.
+
+    Earlier poses are removed: the stamps of later calls must not be before this one.
     """
     while len(edge) > 1 and edge[1][0] <= stamp_ns:
         edge.popleft()
@@ -171,11 +205,11 @@ def _at(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
 
 
 def _row(T: FloatArray) -> _Row:
-    """x y z qx qy qz qw of a pose (4, 4)."""
+    """Return x y z qx qy qz qw of a pose (4, 4)."""
     return tuple(se3.to_rows(T).tolist())
 
 
 def _matrices(rows: ArrayLike) -> FloatArray:
-    """(..., 4, 4) of x y z qx qy qz qw (..., 7)."""
+    """Return poses (..., 4, 4) from x y z qx qy qz qw (..., 7)."""
     rows = np.asarray(rows)
     return se3.from_quat_xyzw(rows[..., :3], rows[..., 3:])
