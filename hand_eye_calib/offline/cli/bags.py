@@ -1,4 +1,4 @@
-"""Bags, the parts of one recording, and the journals of sessions, as the engine takes them."""
+"""Recordings in bags, in the parts of a recording, and in the journals of sessions."""
 
 import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -24,14 +24,18 @@ from hand_eye_calib.offline.cli.options import (
 )
 from hand_eye_calib.offline.cli.reading import Recording
 
-# Who starts a recorder again needs less (s). Odometry seldom runs on from one drive to the next.
-# A part may begin before the last poses of the one before it are written.
+# Longest pause (s) between the parts of a recording: a recorder can be restarted in less time.
+# Odometry seldom continues from one drive to the next.
 _LONGEST_PAUSE_S = 60.0
+# Longest overlap (s): a part may begin before the last poses of the part before it are written.
 _LONGEST_OVERLAP_S = 1.0
 
 
 class SeveralRecordingsError(InputError):
-    """Bags that are not parts of one recording; ``groups`` are the bags of each."""
+    """Error for bags that are not parts of one recording.
+
+    ``groups`` are the bags of each recording.
+    """
 
     def __init__(self, reason: str, groups: list[list[Path]]) -> None:
         super().__init__(f"{reason}; calibrate each by itself, or all of one rig together")
@@ -42,12 +46,24 @@ class SeveralRecordingsError(InputError):
 def read_recording(
     paths: Sequence[Path], wanted: Mapping[str, str], options: Mapping[str, Any]
 ) -> Recording:
-    """Read the recording of a journal, of a bag or of the parts of one.
+    """Read the recording of a journal, of a bag or of the parts of a bag.
 
-    Sources must be wanted by name if a bag leaves a choice; the options are those that somebody
-    gave. Journals are recordings of their own; SeveralRecordingsError if the bags are such, too.
+    Parameters
+    ----------
+    paths : sequence of pathlib.Path
+    wanted : mapping of str to str
+        Sources of the streams, and origins of their stamps; see options.sources_from. They are
+        needed if a bag has several candidates.
+    options : mapping
+        Options that the user set.
+
+    Raises
+    ------
+    SeveralRecordingsError
+        If the bags are not parts of one recording. Each journal is a recording of its own.
     """
-    journal = next(filter(None, map(journal_in, paths)), None)
+    journals = [journal for path in paths if (journal := journal_in(path))]
+    journal = journals[0] if journals else None
     if journal and len(paths) > 1:
         raise SeveralRecordingsError(
             f"{journal} is a session of its own", [[path] for path in paths]
@@ -65,40 +81,53 @@ def read_recording(
 def select(
     bag: PoseBag, wanted: Mapping[str, str], config: CalibratorConfig
 ) -> tuple[dict[str, Source], dict[str, str]]:
-    """The sources of "parent" and "child" in a bag, and what each measures."""
-    given = {stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted}
+    """Return the sources of "parent" and "child" in a bag, and their kinds of data."""
+    named = {stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted}
     frames = {stream: getattr(config, f"{stream}_frame") for stream in STREAMS}
-    chosen = bag.select(given.get("parent"), given.get("child"), frames)
-    if len(given) < len(STREAMS):
-        parent, child = chosen
+    parent, child = bag.select(named.get("parent"), named.get("child"), frames)
+    if len(named) < len(STREAMS):
         note(
             f"parent is {parent}, child is {child}; to change that, give --parent-topic and "
             "--child-topic"
         )
     measures = {
-        stream: bag.measured(source, getattr(config, f"{stream}_measures"))
-        for stream, source in zip(STREAMS, chosen, strict=True)
+        "parent": bag.measured(parent, config.parent_measures),
+        "child": bag.measured(child, config.child_measures),
     }
-    return dict(zip(STREAMS, chosen, strict=True)), measures
+    return {"parent": parent, "child": child}, measures
 
 
 def stamps_of(wanted: Mapping[str, str]) -> dict[str, str]:
-    """Where the stamps of "parent" and "child" come from."""
+    """Return the origins of the stamps of "parent" and "child"."""
     return {stream: wanted.get(f"{stream}_stamps", "header") for stream in STREAMS}
 
 
 def read_sources(
     bag: PoseBag, measures: Iterable[tuple[Source, str, str]]
 ) -> tuple[list[Trajectory], list[str]]:
-    """The whole trajectories of sources of a bag, each with what it measures and where its stamps
-    come from, and what was wrong with their stamps.
+    """Read the whole trajectories of sources of a bag.
+
+    Parameters
+    ----------
+    bag : PoseBag
+    measures : iterable of (Source, str, str)
+        Sources with their kinds of data and the origins of their stamps.
+
+    Returns
+    -------
+    trajectories : list of Trajectory
+    repairs : list of str
+        Notes on faults of the stamps.
     """
-    found = []
+    trajectories = []
+    repairs: list[str] = []
     for source, kind, stamps in measures:
         with waiting_for(f"reading {source}"):
-            found.append(bag.trajectory(source, kind, stamps))
+            trajectory, notes = bag.trajectory(source, kind, stamps)
+        trajectories.append(trajectory)
+        repairs += notes
     note(*bag.warnings)
-    return [poses for poses, _ in found], [text for _, notes in found for text in notes]
+    return trajectories, repairs
 
 
 def _read_bags(
@@ -107,12 +136,11 @@ def _read_bags(
     with PoseBag(*paths) as bag:
         sources, measures = select(bag, wanted, config)
         refuse_recordings(paths, sources.values())
-        of_streams: Options = {f"{stream}_measures": measures[stream] for stream in STREAMS}
-        calibrator = Calibrator(dataclasses.replace(config, **of_streams))
+        kinds: Options = {f"{stream}_measures": measures[stream] for stream in STREAMS}
+        calibrator = Calibrator(dataclasses.replace(config, **kinds))
         bag.shown = with_progress
         stamps = stamps_of(wanted)
-        both = sources["parent"], sources["child"]
-        poses = bag.poses(*both, config.max_gap, measures, stamps)
+        poses = bag.poses(sources["parent"], sources["child"], config.max_gap, measures, stamps)
         _feed(calibrator, poses, sources)
         for stream, source in sources.items():
             if not calibrator.frame(stream):
@@ -123,8 +151,12 @@ def _read_bags(
 
 
 def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]) -> None:
-    """Give every pose to the engine. The first message that cannot be used is an InputError with
-    topic and stamp.
+    """Add every pose to the engine.
+
+    Raises
+    ------
+    InputError
+        For the first message that the engine refuses, with topic and stamp.
     """
     for stream in STREAMS:
         worlds = poses.world_frames[poses.streams == stream]
@@ -143,19 +175,22 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]
 
 
 def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> None:
-    """Raise SeveralRecordingsError for bags that are not parts of one recording.
+    """Raise a SeveralRecordingsError for bags that are not parts of one recording.
 
-    Parts have different topics, or follow each other at once.
+    Parts of one recording have different topics, or follow each other without a pause.
     """
+    if len(paths) < 2:
+        return
     groups: list[list[_Part]] = []
     reason = ""
-    parts = [_Part.of(path, sources) for path in paths] if len(paths) > 1 else []
-    for part in sorted(parts):
+    for part in sorted(_Part.of(path, sources) for path in paths):
         for group in groups:
-            if not (told := part.differs_from([each for each in group if each.has & part.has])):
+            same_topics = [other for other in group if other.has & part.has]
+            difference = part.difference_from(same_topics)
+            if not difference:
                 group.append(part)
                 break
-            reason = told
+            reason = difference
         else:
             groups.append([part])
     if len(groups) > 1:
@@ -163,7 +198,7 @@ def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> Non
 
 
 class _Part(NamedTuple):
-    """When a bag was recorded, and which of the sources it has."""
+    """Time of a bag, and the sources that it has."""
 
     begin_ns: int
     end_ns: int
@@ -180,40 +215,48 @@ class _Part(NamedTuple):
                     has.add(source)
             return cls(bag.start_ns or 0, bag.end_ns or 0, path, has)
 
-    def differs_from(self, earlier: "Sequence[_Part]") -> str:
-        """What tells that it is no part of the recording of earlier bags; empty for nothing."""
-        latest = max(earlier, key=lambda part: part.end_ns, default=None)
-        pause_s = 0.0 if latest is None else (self.begin_ns - latest.end_ns) * 1e-9
-        if latest is None or -_LONGEST_OVERLAP_S <= pause_s <= _LONGEST_PAUSE_S:
+    def difference_from(self, earlier: "Sequence[_Part]") -> str:
+        """Return the reason for which the bag does not continue earlier bags; empty if it does."""
+        if not earlier:
             return ""
-        told = f"there is a pause of {pause_s:.0f} s between them"
+        latest = max(earlier, key=lambda part: part.end_ns)
+        pause_s = (self.begin_ns - latest.end_ns) * 1e-9
+        if -_LONGEST_OVERLAP_S <= pause_s <= _LONGEST_PAUSE_S:
+            return ""
+        reason = f"there is a pause of {pause_s:.0f} s between them"
         if pause_s < 0:
             until_ns = min(latest.end_ns, self.end_ns)
-            told = f"both are of the same {(until_ns - self.begin_ns) * 1e-9:.1f} s"
-        return f"{latest.path} and {self.path} are two recordings, not parts of one: {told}"
+            reason = f"both are of the same {(until_ns - self.begin_ns) * 1e-9:.1f} s"
+        return f"{latest.path} and {self.path} are two recordings, not parts of one: {reason}"
 
 
 def journal_in(path: Path | str) -> Path | None:
-    """The directory of a session's journal at a path, or in its output directory; None for bags."""
+    """Return the directory of a session's journal at a path, or in the output directory there.
+
+    None for bags.
+    """
     if isinstance(path, str) or not path.is_dir():
         return None
     from hand_eye_calib.formats.journal import has_session
 
-    return next((each for each in (path, path / "journal") if has_session(each)), None)
+    return next((folder for folder in (path, path / "journal") if has_session(folder)), None)
 
 
 def read_journal_of(directory: Path, options: Options) -> Recording:
-    """Read the journal of a session of the node; the options go before those of the session."""
+    """Read the journal of a session of the node. The options override those of the session."""
     from hand_eye_calib.formats.journal import read_journal, replay_journal
 
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
         session = journal.about["parent"]
-        # Options of an earlier version that were empty, and are no longer there, say nothing.
-        before = {**session.get("options", {})}
-        before = {name: each for name, each in before.items() if each or name in OPTION_FIELDS}
+        # Skip empty options of an earlier version that no longer exist.
+        before = {
+            name: value
+            for name, value in session.get("options", {}).items()
+            if value or name in OPTION_FIELDS
+        }
         config = CalibratorConfig.from_options(before | {**options})
-        names = [each.name for each in dataclasses.fields(config)]
+        names = [field.name for field in dataclasses.fields(config)]
         given = [name for name in names if name in session.get("given", ())]
         given += CalibratorConfig.from_options(options).given
         calibrator = Calibrator(dataclasses.replace(config, given=given))

@@ -1,6 +1,8 @@
-"""``calibrate PATH ...``: two trajectory files, a bag or the parts of one, or the journal of a
-session; several recordings; the stops of an arm; three sensors or more. ``replay`` is its other
-name, for bags and journals alone.
+"""``calibrate PATH ...``: calibrate from files, bags or journals.
+
+The paths are two trajectory files, a bag or its parts, the journal of a session, several
+recordings, the stops of an arm, or the files of three sensors or more. ``replay`` is the same for
+bags and journals only.
 """
 
 import argparse
@@ -33,7 +35,7 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
-# Of the table of topics.
+# Format of a row in the table of topics.
 _ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
 
@@ -96,7 +98,7 @@ def _add_installed(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Calibrate; returns the exit code."""
+    """Calibrate, and return the exit code."""
     is_batch = bool(getattr(arguments, "batch", None))
     if not (arguments.paths or is_batch):
         print(f"{arguments.parser.format_usage()}\n{EXAMPLES}", file=sys.stderr)
@@ -107,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.formats.bags.patterns import matching
 
         arguments.paths = [
-            type(path)(found) for path in arguments.paths for found in matching(str(path))
+            type(path)(match) for path in arguments.paths for match in matching(str(path))
         ]
     if not any("://" in str(path) for path in arguments.paths):
         return _run_here(arguments, lambda value: value)
@@ -118,7 +120,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
-    """Calibrate from files here; ``as_given`` puts URLs back into texts. Returns the exit code."""
+    """Calibrate from local files, and return the exit code.
+
+    ``as_given`` replaces the paths of copies in plain values by their URLs.
+    """
     routes = [route for route in ROUTES.values() if route.takes(arguments)]  # or it raises
     if arguments.list:
         return _list_topics(arguments, as_given)
@@ -129,17 +134,17 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
     paths = arguments.paths
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
-    given = options.options_from(arguments)
+    settings = options.options_from(arguments)
     if not are_bags:
         if len(paths) != len(options.STREAMS):
             raise ConfigError(f"expected the trajectory files of two sensors; got {len(paths)}")
         options.refuse_stamps(arguments)
-        recording = reading.read_pair(arguments, given)
+        recording = reading.read_pair(arguments, settings)
     else:
         from hand_eye_calib.offline.cli import bags
 
         try:
-            recording = bags.read_recording(paths, options.sources_from(arguments), given)
+            recording = bags.read_recording(paths, options.sources_from(arguments), settings)
         except bags.SeveralRecordingsError as several:
             note(f"{several.reason}; they give one result, as recordings of one rig")
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
@@ -150,34 +155,48 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
 
 def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
-    """Print the topics of a bag, with the rate in the bag's time, the frames of the first messages,
-    and whether one can be one of the two sensors; returns the exit code.
+    """Print the topics of a bag, and return the exit code.
+
+    Each row has the rate in the bag's time, the frames of the first messages, and whether the topic
+    has poses.
     """
     from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
     from hand_eye_calib.formats.bags.reader import PoseBag
 
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
-        topics = [
-            {
-                **each._asdict(),
-                "rate_hz": (each.count - 1) / (bag.duration_s or 1.0) if each.count > 1 else None,
-                "frames": bag.edges_on(each.name),
-                "is_usable": each.type in MESSAGE_TYPES,
-            }
-            for each in bag.topics.values()
-        ]
-        document: Document = {"bag": str(bag), "start_ns": bag.start_ns, "end_ns": bag.end_ns}
-        document |= {"duration_s": bag.duration_s, "topics": topics, "warnings": bag.warnings}
+        topics = []
+        for topic in bag.topics.values():
+            rate_hz = (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
+            topics.append(
+                {
+                    **topic._asdict(),
+                    "rate_hz": rate_hz,
+                    "frames": bag.edges_on(topic.name),
+                    "is_usable": topic.type in MESSAGE_TYPES,
+                }
+            )
+        document: Document = {
+            "bag": str(bag),
+            "start_ns": bag.start_ns,
+            "end_ns": bag.end_ns,
+            "duration_s": bag.duration_s,
+            "topics": topics,
+            "warnings": bag.warnings,
+        }
     document = as_given(document)
     note(*document["warnings"])
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
     lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
-    for topic in topics:
-        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
-        cells = (topic["name"], topic["type"] or "several types", topic["count"], rate)
-        usable = "yes" * topic["is_usable"]
-        frames = " ".join(topic["frames"])
-        lines.append(_ROW.format(*cells, usable, frames).rstrip())
+    for row in topics:
+        cells = [
+            row["name"],
+            row["type"] or "several types",
+            row["count"],
+            "" if row["rate_hz"] is None else f"{row['rate_hz']:.1f} Hz",
+            "yes" if row["is_usable"] else "",
+            " ".join(row["frames"]),
+        ]
+        lines.append(_ROW.format(*cells).rstrip())
     lines.append(
         "--parent-topic and --child-topic take the topics with poses, or frames of /tf: odom:lidar"
     )

@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import angle, length
@@ -40,36 +40,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what was found; returns 1 if a result from these streams would be unusable, else 0."""
+    """Print the findings, and return 1 if a result of these streams would be unusable, else 0."""
     from hand_eye_calib.core.base.plain import plain
     from hand_eye_calib.core.checks.findings import finding, gravest_first
     from hand_eye_calib.core.engine.run import check
     from hand_eye_calib.core.engine.snapshot import whole_snapshot
     from hand_eye_calib.offline.report.evidence import summarise
 
-    given = options.options_from(arguments)
-    sources, (first, second), repairs = _opened(arguments, given)
-    snapshot = whole_snapshot(first, second, given)
-    config = snapshot.config
-    parent, child = snapshot.unpaired
+    settings = options.options_from(arguments)
+    opened = _opened(arguments, settings)
+    sources = opened.sources
+    parent, child = opened.trajectories
+    snapshot = whole_snapshot(parent, child, settings)
     with waiting_for("checking the streams"):
-        checked = check(snapshot, None if config.measured == "poses" else snapshot.estimate())
-    of_files = [finding("disorder", text=text) for text in repairs]
-    findings = gravest_first([*checked.findings, *of_files])
-    both = zip(STREAMS, (parent, child), strict=True)
-    streams = {name: summarise(one) for name, one in both if len(one) > 1}
-    summaries = {name: {"source": sources[name]} | plain(streams[name]) for name in streams}
+        has_poses = snapshot.config.measured == "poses"
+        checked = check(snapshot, None if has_poses else snapshot.estimate())
+    repairs = [finding("disorder", text=text) for text in opened.repairs]
+    findings = gravest_first([*checked.findings, *repairs])
+    streams = {
+        stream: summarise(poses)
+        for stream, poses in zip(STREAMS, snapshot.unpaired, strict=True)
+        if len(poses) > 1
+    }
+    summaries = {
+        stream: {"source": sources[stream]} | plain(summary) for stream, summary in streams.items()
+    }
     document = {"streams": summaries, "findings": findings} if arguments.json else None
     lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
     print_result(lines, document)
-    unusable = [each for each in findings[:1] if each.makes_unusable]
-    return fail(unusable[0], 1) if unusable else 0
+    if findings and findings[0].makes_unusable:
+        return fail(findings[0], 1)
+    return 0
 
 
-def _opened(
-    arguments: argparse.Namespace, given: Mapping[str, Any]
-) -> "tuple[dict[str, str], list[Trajectory], list[str]]":
-    """Where both streams are from, their poses, and what was wrong with the stamps."""
+class _Opened(NamedTuple):
+    """Sources of both streams, their poses, and notes on faults of their stamps."""
+
+    sources: dict[str, str]
+    trajectories: "list[Trajectory]"
+    repairs: list[str]
+
+
+def _opened(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> _Opened:
+    """Read both streams."""
     from hand_eye_calib.offline.cli import reading
 
     paths = arguments.paths
@@ -79,60 +92,64 @@ def _opened(
     if not is_bag:
         options.refuse_stamps(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
-        files = reading.read_files(arguments, paths, given)
-        return names, files.trajectories, [*files.repairs, *files.warnings]
+        files = reading.read_files(arguments, paths, settings)
+        return _Opened(names, files.trajectories, [*files.repairs, *files.warnings])
     from hand_eye_calib.core.base.config import CalibratorConfig
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.offline.cli import bags
 
-    config = CalibratorConfig.from_options(given)
+    config = CalibratorConfig.from_options(settings)
     with PoseBag(paths[0]) as bag:
         wanted = options.sources_from(arguments)
         sources, measures = bags.select(bag, wanted, config)
         stamps = bags.stamps_of(wanted)
         names = {stream: str(source) for stream, source in sources.items()}
         readings = [(sources[stream], measures[stream], stamps[stream]) for stream in STREAMS]
-        return names, *bags.read_sources(bag, readings)
+        return _Opened(names, *bags.read_sources(bag, readings))
 
 
 def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:
-    """Both streams."""
+    """Yield the lines of the table of both streams."""
     yield from (f"{stream} is {source}" for stream, source in sources.items())
     yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
-        path = summary.path_m
-        rotation = summary.rotation_rad
+        path = "none" if summary.path_m is None else length(summary.path_m)
+        rotation = "none" if summary.rotation_rad is None else angle(summary.rotation_rad)
         yield (
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
-            f"{summary.longest_interval_s:10.3f} s {'none' if path is None else length(path):>12} "
-            f"{'none' if rotation is None else angle(rotation):>10}"
+            f"{summary.longest_interval_s:10.3f} s {path:>12} {rotation:>10}"
         )
 
 
 def _verdict(findings: "Sequence[Finding]") -> str:
-    """What the findings mean for a calibration with these streams, in one sentence."""
+    """Return the consequence of the findings for a calibration, in one sentence."""
     from hand_eye_calib.core.results.verdict import Verdict
 
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:
         return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
     errors = [finding for finding in serious if finding.makes_unusable]
-    told = f"look at the findings first ({', '.join(each.code for each in errors or serious)})"
+    verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
     if all(finding.options for finding in serious):
         typed = " ".join(typed_options(finding.options.items()) for finding in serious)
-        told = f"not as they are; calibrate with {typed}"
-    return f"{(Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE).value}: {told}."
+        return f"{verdict.value}: not as they are; calibrate with {typed}."
+    codes = ", ".join(finding.code for finding in errors or serious)
+    return f"{verdict.value}: look at the findings first ({codes})."
 
 
 def _table(findings: "Sequence[Finding]") -> Iterator[str]:
-    """Lines of the findings, in their order."""
+    """Yield the lines of the findings, in their order."""
     from hand_eye_calib.offline.cli.present import wrapped
 
     if not findings:
         yield "No findings."
     for finding in findings:
         mark = finding.severity.value
-        yield f"{mark if mark == 'note' else mark.upper():<8} {finding.code:<17} {finding.stream}"
-        typed = typed_options(finding.options.items())
-        for text in (finding.what, f"-> {finding.advice}{typed and f': {typed}'}"):
+        if mark != "note":
+            mark = mark.upper()
+        yield f"{mark:<8} {finding.code:<17} {finding.stream}"
+        advice = f"-> {finding.advice}"
+        if finding.options:
+            advice += f": {typed_options(finding.options.items())}"
+        for text in (finding.what, advice):
             yield from wrapped(text, "    ", "    ")

@@ -1,4 +1,4 @@
-"""``info RESULT``: show a saved calibration, or print it as the file of another program."""
+"""``info RESULT``: print a saved calibration, or the file of another program with it."""
 
 import argparse
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print a saved calibration; returns the exit code, 0 whatever the calibration's status."""
+    """Print a saved calibration, and return the exit code: 0 for every status of it."""
     from hand_eye_calib.formats.results import load_result
     from hand_eye_calib.offline.cli.present import as_lines
 

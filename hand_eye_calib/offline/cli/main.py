@@ -1,7 +1,7 @@
-"""``hand_eye_calib COMMAND``: find the command, run it, turn errors into one line and an exit code.
+"""``hand_eye_calib COMMAND``: run a command, and turn errors into one line and an exit code.
 
 A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. It is imported
-when it is asked for, so that a missing optional package breaks no other command.
+only to run it, so that a missing optional package breaks no other command.
 """
 
 import argparse
@@ -27,8 +27,8 @@ examples:
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
 unobservable or the verdict is DO NOT USE"""
 
-# How the names of ROS 2's packages end.
-_OF_ROS = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
+# Ends of the names of ROS 2's packages.
+_ROS_SUFFIXES = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,11 +54,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def exit_code_of(run: Callable[[], int]) -> int:
-    """What ``run()`` returns; an error that a person can act on becomes one line on stderr and an
-    exit code.
+    """Run a function, and return its exit code.
+
+    An error that the user can mend becomes one line on stderr and an exit code.
     """
-    # The matrices are small. Several threads would wait for each other, and take three times as
-    # long if other programs run.
+    # The matrices are small: several threads would wait for each other, and need three times as
+    # long beside other programs.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_memory()
     try:
@@ -73,14 +74,14 @@ def exit_code_of(run: Callable[[], int]) -> int:
         if package == "hand_eye_calib":
             raise
         text = f"this needs the Python package {name!r}, which is not installed; install it"
-        if package.endswith(_OF_ROS):
+        if package.endswith(_ROS_SUFFIXES):
             text = (
                 f"this needs ROS 2's Python packages ({name} is missing): source the setup file of "
                 f"a ROS 2 installation, or {installing('ros')}"
             )
         return fail(text)
     except BrokenPipeError:
-        # Keeps the interpreter from complaining when it flushes at exit: the reader has gone.
+        # The reader of stdout has closed it: the interpreter must not flush it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return Exit.BROKEN_PIPE
     except OSError as error:
@@ -93,9 +94,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
 
 
 def named_command() -> int:
-    """Entry point of the executables that are called like a command, as in ``ros2 run
-    hand_eye_calib replay BAG``.
-    """
+    """Run the command that the executable is called, as ``ros2 run hand_eye_calib replay`` does."""
     return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
@@ -120,19 +119,19 @@ def _run(argv: Sequence[str]) -> int:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    added = {name: commands.add_parser(name, help=COMMANDS[name].help) for name in COMMANDS}
-    for one in (parser, *added.values()):
-        one.formatter_class = argparse.RawDescriptionHelpFormatter
-        one.allow_abbrev = False
+    parsers = {name: commands.add_parser(name, help=COMMANDS[name].help) for name in COMMANDS}
+    for any_parser in (parser, *parsers.values()):
+        any_parser.formatter_class = argparse.RawDescriptionHelpFormatter
+        any_parser.allow_abbrev = False
     if command is not None:
         module = COMMANDS[command].load()
-        added[command].description = COMMANDS[command].help
-        module.add_arguments(added[command])
+        parsers[command].description = COMMANDS[command].help
+        module.add_arguments(parsers[command])
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
-        word = next((each for each in rest if each.startswith("-")), rest[0]).partition("=")[0]
-        of = added.get(command or "", parser)
-        of.error(f"unknown {word!r}{did_you_mean(word, of._option_string_actions)}")
+        option = next((word for word in rest if word.startswith("-")), rest[0]).partition("=")[0]
+        used = parsers.get(command or "", parser)
+        used.error(f"unknown {option!r}{did_you_mean(option, used._option_string_actions)}")
     if arguments.version:
         from hand_eye_calib.core.base.version import version_of
 

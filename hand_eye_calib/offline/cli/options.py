@@ -1,10 +1,9 @@
-"""What commands take, and what they print beside their result: notes, errors and progress, all on
-stderr.
+"""Arguments of the commands, and their notes, errors and progress on stderr.
 
-Options are those of the engine, made from the option dataclasses, with the configuration file that
-sets the same by name; what is read; what is written.
+The options of the engine are made from the option dataclasses. A configuration file sets the same
+options by name. Other arguments are about the input and the output.
 
-Nothing here loads a library: ``--help`` is quick.
+This module loads no library, so that ``--help`` is quick.
 """
 
 import argparse
@@ -33,10 +32,10 @@ _NODES = ("calibrator", "**", "*", "")
 _OF_ROS = "ros__parameters"
 _AXES = ", ".join(name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name)
 
-# What most people set: the help has these options first.
+# Options that most users set: they are first in the help.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
 
-# How a trajectory file is read. By name, what argparse needs.
+# Options to read a trajectory file, with their arguments for argparse.
 FILE_OPTIONS: dict[str, dict[str, Any]] = {
     "format": {
         "choices": config.TRAJECTORY_FORMATS,
@@ -61,14 +60,18 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
-# Where the stamps of a bag's poses come from.
+# Origins of the stamps of a bag's poses.
 STAMPS = ("header", "receive")
 
 _OF_FILES = (*FILE_OPTIONS, "pair_by", "stamps")
-_OPTIONS = {*OPTION_FIELDS, *_OF_FILES, *(f"{one}_{name}" for one in STREAMS for name in _OF_FILES)}
+_OPTIONS = {
+    *OPTION_FIELDS,
+    *_OF_FILES,
+    *(f"{stream}_{name}" for stream in STREAMS for name in _OF_FILES),
+}
 
-# Names in backticks; and names that are no words of the language, such as max_gap and prior.z, or
-# stand before a value, wherever they stand, but not in a path, after dashes or in quotes.
+# Names of options in a text: in backticks; names that are no English words, such as max_gap and
+# prior.z; and scale before a value. Names in a path, after dashes or in quotes are none.
 _NAMES = re.compile(
     r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._]+[a-z]+)+|scale(?= (?:none|auto|estimate\b|\d)))"
     r"(?![\w/=-]|\.\w)( VALUE)?"
@@ -79,8 +82,10 @@ _NAMES = re.compile(
 
 
 class Exit(IntEnum):
-    """Exit codes: failed or bad input; wrong usage; solved, but an axis is unobservable or the
-    verdict is DO NOT USE; and what a shell reports for SIGINT and SIGPIPE.
+    """Exit codes of the commands.
+
+    FAILED is also for bad input. NOT_ALL is a solution with an unobservable axis or the verdict DO
+    NOT USE. The last two are the codes of a shell for SIGINT and SIGPIPE.
     """
 
     GOOD = 0
@@ -91,56 +96,62 @@ class Exit(IntEnum):
     BROKEN_PIPE = 141
 
 
-# How a terminal shows the verdict that a line begins with: bold green, yellow, red.
+# Styles of the verdict at the beginning of a line on a terminal: bold green, yellow, red.
 _STYLES = {"USE": "\x1b[1;32m", "USE WITH CARE": "\x1b[1;33m", "DO NOT USE": "\x1b[1;31m"}
 
 
 def flag(name: str) -> str:
-    """The option of the command line for a public option name, without the leading dashes."""
+    """Return the command-line option of a public option name, without the leading dashes."""
     return name.replace(".", "-").replace("_", "-")
 
 
 def typed_options(options: Iterable[tuple[str, object]]) -> str:
-    """Options by their public names, as they are typed."""
+    """Return options and values, by their public names, as a user types them."""
     return " ".join(f"--{flag(name)} {value}" for name, value in options)
 
 
 def as_typed(text: str) -> str:
-    """A message of the engine with its option names, which are those of Python and the node, as
-    they are typed: ``raise max_gap`` becomes ``raise --max-gap``.
+    """Return a message of the engine with its option names as a user types them.
+
+    The engine has the names of Python and of the node: ``raise max_gap`` becomes ``raise
+    --max-gap``.
     """
 
     def typed(match: re.Match[str]) -> str:
         name = match[1] or match[2]
         value = match[3] or ""
-        if name in _OPTIONS and name.startswith("prior."):
+        if name not in _OPTIONS:
+            return match[0]
+        if name.startswith("prior."):
             return f"--prior {name.removeprefix('prior.')}{value.replace(' ', '=')}"
-        return f"--{flag(name)}{value}" if name in _OPTIONS else match[0]
+        return f"--{flag(name)}{value}"
 
     return _NAMES.sub(typed, text)
 
 
 def note(*texts: object) -> None:
-    """Print what is good to know, each in one line."""
+    """Print notes for the user, one line each."""
     for text in texts:
         print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
 def fail(error: object, code: int = Exit.FAILED) -> int:
-    """Print in one line what went wrong; returns ``code``."""
+    """Print an error in one line, and return ``code``."""
     print(f"hand_eye_calib: error: {printable(as_typed(str(error)))}", file=sys.stderr)
     return code
 
 
 @contextmanager
 def waiting_for(what: str) -> Iterator[None]:
-    """On a terminal, show what is being done for as long as it lasts."""
-    is_watched = sys.stderr.isatty()
-    print(f"{what} ..." * is_watched, end="", file=sys.stderr, flush=True)
+    """Print on a terminal what is being done, while the block runs."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    print(f"{what} ...", end="", file=sys.stderr, flush=True)
     try:
         yield
     finally:
-        print("\r\x1b[K" * is_watched, end="", file=sys.stderr, flush=True)
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 def with_progress(
@@ -149,9 +160,7 @@ def with_progress(
     doing: str,
     size: Callable[[_Item], int] = lambda item: 1,
 ) -> Iterator[_Item]:
-    """Pass on items. On a terminal, show how much of the sum of their sizes is done and the time
-    left.
-    """
+    """Yield items. On a terminal, print the finished share of their sizes and the time left."""
     if not sys.stderr.isatty():
         yield from items
         return
@@ -166,8 +175,9 @@ def with_progress(
 
 
 def print_result(lines: Iterable[str], document: object = None) -> None:
-    """Print what a command found: its document as JSON, if there is one; otherwise as text, on a
-    terminal with the verdict that it begins with in its colour.
+    """Print the result of a command: its document as JSON, or else its lines.
+
+    On a terminal, a verdict at the beginning of the lines is coloured.
     """
     if document is None:
         text = "\n".join(map(printable, lines))
@@ -185,7 +195,10 @@ def print_result(lines: Iterable[str], document: object = None) -> None:
 
 
 def argument_type(parse: Callable[[str], Any], prefix: str = "") -> Callable[[str], Any]:
-    """The type of an argument: a ConfigError is wrong usage, its message without ``prefix``."""
+    """Return the type of an argument, for argparse.
+
+    A ConfigError becomes wrong usage. Its message is printed without ``prefix``.
+    """
 
     def parsed(text: str) -> Any:
         try:
@@ -197,7 +210,7 @@ def argument_type(parse: Callable[[str], Any], prefix: str = "") -> Callable[[st
 
 
 def at_least(minimum: int) -> Callable[[str], int]:
-    """The type of an argument that is a whole number of at least ``minimum``."""
+    """Return the type of an argument that is a whole number of at least ``minimum``."""
 
     def parse(text: str) -> int:
         if not text.isdecimal() or int(text) < minimum:
@@ -212,7 +225,7 @@ def at_least(minimum: int) -> Callable[[str], int]:
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
-    # argparse takes -1e-3, -90deg+/-2deg and the like for options otherwise.
+    # Without this, argparse takes values such as -1e-3 and -90deg+/-2deg for options.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     rare = parser.add_argument_group("calibration options that are rarely needed")
@@ -253,28 +266,37 @@ def _prior(text: str) -> tuple[str, OptionValue]:
 
 
 def _named(name: str, value: object) -> tuple[str, OptionValue]:
-    """An option and its value, from text or as YAML has it; lengths and angles may name a unit."""
+    """Return an option and its checked value, from text or from YAML.
+
+    Lengths and angles may have a unit.
+    """
     field = OPTION_FIELDS[name]
     kind = type(field.default)
     unit = field.metadata["unit"]
     if isinstance(value, str) and kind in (int, float):
         if unit in ("m", "rad"):
             return name, check_value(field, *quantities(name, [unit], [value], ""))
-        with suppress(ValueError):  # check_value says what it should be
+        with suppress(ValueError):  # check_value reports the expected value
             value = kind(value)
     return name, check_value(field, value)
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
-    """The options that were set, by their public names: the command line before the file, of which
-    a ConfigError says what does not exist or cannot be.
+    """Return the options that the user set, by their public names.
+
+    The command line overrides the file.
+
+    Raises
+    ------
+    ConfigError
+        For unknown options and bad values in the file.
     """
-    of_file = _read_config(arguments.config) if arguments.config else {}
-    return {**of_file, **dict(arguments.options)}
+    file_options = _read_config(arguments.config) if arguments.config else {}
+    return {**file_options, **dict(arguments.options)}
 
 
 def _read_config(path: Path) -> Options:
-    """Options of a file: plain names and values, or what a ROS parameter file has for the node."""
+    """Return the options of a file with names and values, or of a ROS parameter file."""
     from hand_eye_calib.formats.yaml_files import read_yaml
 
     document = read_yaml(path)
@@ -283,16 +305,16 @@ def _read_config(path: Path) -> Options:
         raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
     options: dict[str, OptionValue] = {}
     ignored = []
-    of_others = []
+    other_nodes = []
     for name, value in _flat(document or {}):
-        node, is_of_ros, option = name.rpartition(f"{_OF_ROS}.")
-        if is_of_ros and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
-            of_others.append(f"/{node.strip('/.')}")
+        node, is_ros_parameter, option = name.rpartition(f"{_OF_ROS}.")
+        if is_ros_parameter and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
+            other_nodes.append(f"/{node.strip('/.')}")
         elif option in OPTION_FIELDS:
             try:
                 options |= [_named(option, value)]
             except ConfigError as error:
-                # In quotes it keeps the spelling of the file.
+                # In quotes the name keeps the spelling of the file.
                 text = str(error).replace(option, repr(option), 1)
                 raise ConfigError(f"{path}: {text}") from None
         elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
@@ -303,8 +325,8 @@ def _read_config(path: Path) -> Options:
                 f"{path}: unknown option {option!r}{did_you_mean(option, known)}; "
                 f"known are {', '.join(map(repr, known))}"
             )
-    if of_others and not (options or ignored):
-        found = ", ".join(dict.fromkeys(of_others))
+    if other_nodes and not (options or ignored):
+        found = ", ".join(dict.fromkeys(other_nodes))
         raise ConfigError(
             f"{path}: no parameters for a node named calibrator; found some for {found}"
         )
@@ -314,7 +336,7 @@ def _read_config(path: Path) -> Options:
 
 
 def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested mappings as dotted names and values."""
+    """Yield the values of nested mappings with dotted names."""
     for name, value in mapping.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{name}.")
@@ -326,7 +348,7 @@ def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 
 
 def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> None:
-    """Add the recording: paths, how files are read, and which streams of a bag are meant."""
+    """Add the arguments of the input: paths, the streams of a bag, and options of files."""
     parser.add_argument("paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths)
     group = parser.add_argument_group(
         "pose streams of a bag",
@@ -344,11 +366,11 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
             "t=header.stamp,x=pose.position.x,..."
         )
         group.add_argument(f"--{stream}-fields", metavar="NAME=PATH,...", help=fields)
-    of_stamps = (
+    help_of_stamps = (
         "stamps of the poses: of their headers, or the times at which the recorder received them, "
         "for headers without. Default: header"
     )
-    group.add_argument("--stamps", choices=STAMPS, help=of_stamps)
+    group.add_argument("--stamps", choices=STAMPS, help=help_of_stamps)
     for stream in STREAMS:
         same = f"the same for the {stream} only"
         group.add_argument(f"--{stream}-stamps", choices=STAMPS, help=same)
@@ -358,8 +380,8 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
     for name, settings in FILE_OPTIONS.items():
         group.add_argument(f"--{flag(name)}", dest=name, **settings)
         for stream in STREAMS:
-            of_one = settings | {"help": f"the same for {stream.upper()} only"}
-            group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **of_one)
+            for_stream = settings | {"help": f"the same for {stream.upper()} only"}
+            group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **for_stream)
     pair_by = (
         "time: by the stamps; row: poses without stamps, in their order; name: poses of images of "
         "the same name. For both files"
@@ -368,29 +390,34 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
-    """Topic or frames, WORLD:SENSOR, of "parent" and "child", and where their stamps come from,
-    "parent_stamps" and "child_stamps", if they are given.
+    """Return the sources of a bag's streams that the user named.
+
+    Returns
+    -------
+    dict of str to str
+        Topic, or frames WORLD:SENSOR, of "parent" and "child", and the origin of their stamps,
+        "parent_stamps" and "child_stamps".
     """
-    found = {}
+    sources = {}
     for stream in STREAMS:
-        topic, fields = (getattr(arguments, f"{stream}_{kind}") for kind in ("topic", "fields"))
+        topic = getattr(arguments, f"{stream}_topic")
+        fields = getattr(arguments, f"{stream}_fields")
         if fields and not topic:
             raise ConfigError(f"--{stream}-fields is for messages; give --{stream}-topic as well")
         if stream == "child" and topic and getattr(arguments, "target", None):
             fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
-        found[stream] = f"{topic}?{fields}" if fields else topic
-        found[f"{stream}_stamps"] = getattr(arguments, f"{stream}_stamps") or arguments.stamps
-    return {stream: source for stream, source in found.items() if source}
+        sources[stream] = f"{topic}?{fields}" if fields else topic
+        sources[f"{stream}_stamps"] = getattr(arguments, f"{stream}_stamps") or arguments.stamps
+    return {name: source for name, source in sources.items() if source}
 
 
 def refuse_stamps(arguments: argparse.Namespace) -> None:
-    """Raise ConfigError for the times of receipt of what is no bag."""
-    names = ("stamps", *(f"{stream}_stamps" for stream in STREAMS))
-    given = [name for name in names if getattr(arguments, name, None)]
-    if given:
-        raise ConfigError(
-            f"--{flag(given[0])} is for bags; trajectory files have one kind of stamps"
-        )
+    """Raise a ConfigError if an option about the stamps of bags is set for trajectory files."""
+    for name in ("stamps", *(f"{stream}_stamps" for stream in STREAMS)):
+        if getattr(arguments, name, None):
+            raise ConfigError(
+                f"--{flag(name)} is for bags; trajectory files have one kind of stamps"
+            )
 
 
 def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:
@@ -403,8 +430,9 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
 
 
 def _path(text: str) -> Path | str:
-    """A path, sample:NAME of the recording that comes with the package; a URL stays as it is, for
-    a path has no two slashes in a row.
+    """Return a path; for sample:NAME that of a recording in the package.
+
+    A URL stays a text, because a path would lose one of its two slashes.
     """
     if text.startswith("sample:"):
         return Path(__file__).parents[2] / "sample" / text.removeprefix("sample:")

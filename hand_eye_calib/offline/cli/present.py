@@ -1,4 +1,4 @@
-"""A calibration on the screen: as text for people, as JSON for programs, and as an exit code."""
+"""Output of a calibration: as text for people, as JSON for programs, and as an exit code."""
 
 import argparse
 import shlex
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 100
 
-# Verdicts on an axis that more motion would change.
+# Verdicts on an axis that more motion may change.
 _OPEN = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
 
 
@@ -51,10 +51,18 @@ def deliver(
     snapshot: "Snapshot | None" = None,
     bag: Path | None = None,
 ) -> int:
-    """Print a calibration, save it if ``--out`` asks for that, and return the exit code.
+    """Print a calibration, save it with ``--out``, and return the exit code.
 
-    ``inputs`` say where the data came from, in plain values. The snapshot has the poses and options
-    that gave it, unless they were stops; the bag may have the base frame among its transforms.
+    Parameters
+    ----------
+    calibration : Calibration
+    inputs : dict
+        Origin of the data in plain values.
+    arguments : argparse.Namespace
+    snapshot : Snapshot, optional
+        Poses and options of the calibration; None for stops.
+    bag : pathlib.Path, optional
+        Bag whose transforms may have the base frame.
     """
     if (arguments.installed or arguments.base_frame) and not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
@@ -69,27 +77,26 @@ def deliver(
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(calibration, steps, arguments.verbose), document)
-    finally:  # even if the reader of what is printed has gone
+    finally:  # even if the reader of stdout has closed it
         if arguments.out and calibration.motion_residuals:
             from hand_eye_calib.offline.cli.reporting import write_report
 
             write_report(arguments.out, calibration, snapshot, inputs)
-    for one in calibration.reasons[:1] if calibration.has_failed else ():
-        fail(f"{one.sentence}; do not use this result, {one.what_to_do}")
+    if calibration.has_failed:
+        for reason in calibration.reasons[:1]:
+            fail(f"{reason.sentence}; do not use this result, {reason.what_to_do}")
     return exit_code(calibration)
 
 
 def _with_robot(
     calibration: Calibration, arguments: argparse.Namespace, bag: Path | None
 ) -> Calibration:
-    """The result with its comparison with what is installed, and its pose in the base frame, if
-    they were asked for.
-    """
-    installed = arguments.installed
-    base = frame_name(arguments.base_frame or "")
+    """Add the comparison with the installed extrinsic and the base frame, if requested."""
     from hand_eye_calib.core.assessment.comparison import with_comparison
     from hand_eye_calib.formats.installed import frames_of_bag, open_installed, read_urdf
 
+    installed = arguments.installed
+    base = frame_name(arguments.base_frame or "")
     if installed:
         frames = calibration.parent_frame, calibration.child_frame
         with waiting_for(f"reading {installed}"):
@@ -107,69 +114,92 @@ def _with_robot(
 
 
 def exit_code(calibration: Calibration) -> int:
-    """0 good; 1 failed; 3 solved, but an axis is unobservable or the verdict is DO NOT USE."""
+    """Return the exit code of a calibration.
+
+    GOOD, FAILED, or NOT_ALL if an axis is unobservable or the verdict is DO NOT USE.
+    """
     if calibration.has_failed:
         return Exit.FAILED
-    is_whole = not calibration.hidden and calibration.verdict is not Verdict.DO_NOT_USE
-    return Exit.GOOD if is_whole else Exit.NOT_ALL
+    if calibration.hidden or calibration.verdict is Verdict.DO_NOT_USE:
+        return Exit.NOT_ALL
+    return Exit.GOOD
 
 
 def as_lines(
     calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False
 ) -> list[str]:
-    """What a person needs to see: verdict and reasons, the extrinsic in both directions, the steps
-    to take next, the recordings, the goal of the session and the comparison with what is
-    installed; with details also quaternions, and how it was solved.
+    """Return the text of a calibration.
+
+    It has the verdict with its reasons, the extrinsic in both directions, the next steps, the
+    command that publishes it, and details: recordings, goal and comparison with the installed
+    extrinsic. With details, quaternions and facts about the solution are added.
     """
-    parent = calibration.parent_frame
-    child = calibration.child_frame
-    transforms = transforms_of(calibration)
-    lines = [*verdict_lines(calibration)]
-    shown = [
-        (child, parent, "T_parent_child"),
-        (parent, child, "T_child_parent"),
-        (child, calibration.base_frame, "T_base_child"),
-    ]
-    extra = extra_transforms(calibration)
-    shown += [(added.source, added.target, name) for name, added in extra.items()]
-    for source, target, name in shown:
-        if name in transforms:
-            reach = () if name in extra else calibration.out_of_reach
-            lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
-            lines += transform_lines(transforms[name], reach, with_details)
-            if name == "T_parent_child":
-                lines += allowance_lines(calibration)
-    lines += ["Next", *(f"  {step}" for step in steps)] if steps else []
+    lines = [*verdict_lines(calibration), *_extrinsic_lines(calibration, with_details)]
+    if steps:
+        lines += ["Next", *(f"  {step}" for step in steps)]
     if command := calibration.static_transform_command():
-        by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
+        by_hand = [
+            number for number in usable_numbers(calibration).values() if isinstance(number, str)
+        ]
         condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = []
     for name, value in calibration.parts.items():
         details += part(name).details(value, calibration.headline)
-    if found := calibration.comparison:
-        details.append(f"compared with what is installed ({found.installed}): {found.sentence}")
+    if comparison := calibration.comparison:
+        details.append(
+            f"compared with what is installed ({comparison.installed}): {comparison.sentence}"
+        )
     if with_details:
         details += [f"{name}: {value}" for name, value in summary(calibration).items()]
-    lines += ["Details"] * bool(details)
-    return lines + [line for detail in details for line in wrapped(detail, "  ", "    ")]
+    if details:
+        lines.append("Details")
+    for detail in details:
+        lines += wrapped(detail, "  ", "    ")
+    return lines
+
+
+def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
+    """Return the lines of the extrinsic in both directions, and of its other transforms."""
+    parent = calibration.parent_frame
+    child = calibration.child_frame
+    frames = {
+        "T_parent_child": (child, parent),
+        "T_child_parent": (parent, child),
+        "T_base_child": (child, calibration.base_frame),
+    }
+    extra = extra_transforms(calibration)
+    frames |= {name: (transform.source, transform.target) for name, transform in extra.items()}
+    transforms = transforms_of(calibration)
+    lines = []
+    for name, (source, target) in frames.items():
+        if name not in transforms:
+            continue
+        out_of_reach = () if name in extra else calibration.out_of_reach
+        lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
+        lines += transform_lines(transforms[name], out_of_reach, with_details)
+        if name == "T_parent_child":
+            lines += allowance_lines(calibration)
+    return lines
 
 
 def verdict_lines(calibration: Calibration) -> Iterator[str]:
-    """Headline, reasons with what to do, and notes."""
+    """Yield the headline, the reasons with their advice, and the notes."""
     yield calibration.headline
     for number, reason in enumerate(shown(calibration.reasons)):
-        # What to do about the first one may follow the headline, which says why, at once.
+        # The headline may have the sentence of the first reason: then only its advice follows.
         if number or reason.sentence not in calibration.headline:
             yield from wrapped(reason.sentence, "- ", "  ")
-        options = typed_options(reason.options.items())
-        yield from wrapped(reason.what_to_do + (options and f": {options}"), "  -> ", "     ")
+        advice = reason.what_to_do
+        if reason.options:
+            advice += f": {typed_options(reason.options.items())}"
+        yield from wrapped(advice, "  -> ", "     ")
     for warning in calibration.warnings:
         yield from wrapped(f"Note: {warning}", "", "  ")
 
 
 def wrapped(text: str, first: str, others: str) -> list[str]:
-    """Lines of a text, with what the first and what the others begin with."""
+    """Return the lines of a text, with the beginnings of the first line and of the others."""
     return textwrap.wrap(
         printable(as_typed(text)),
         _WIDTH,
@@ -183,19 +213,20 @@ def wrapped(text: str, first: str, others: str) -> list[str]:
 def next_steps(
     calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
 ) -> list[str]:
-    """What to do next, in sentences and commands; empty if the result may be used."""
+    """Return the next steps in sentences and commands; empty if the result is usable."""
     if calibration.verdict is Verdict.USE:
         return []
-    options = [each for one in shown(calibration.reasons) for each in one.options.items()]
-    extra = [typed_options([each]) for each in options]
+    extra = []
+    for reason in shown(calibration.reasons):
+        extra += [typed_options([option]) for option in reason.options.items()]
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
         is_open = any(dof.verdict in _OPEN for dof in calibration.observability)
         if is_open and snapshot is not None and calibration.measured == "poses":
             from hand_eye_calib.core.assessment.excitation import excitation, what_is_missing
 
-            motion = what_is_missing(excitation(snapshot.pose_pairs), calibration)
-            steps += [motion] if motion else []
+            if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
+                steps.append(motion)
         extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.hidden[:3]]
     if extra:
         typed = shlex.join(arguments.typed)
@@ -204,7 +235,7 @@ def next_steps(
 
 
 def allowance_lines(calibration: Calibration) -> list[str]:
-    """What the printed standard deviations contain beside what the recording shows."""
+    """Return a line on the allowance that the printed standard deviations contain, if any."""
     words = allowance_in_words(calibration)
     return [f"  +/- is 1 sigma; it {words}"] if words else []
 
@@ -212,31 +243,37 @@ def allowance_lines(calibration: Calibration) -> list[str]:
 def transform_lines(
     transform: "Notation", out_of_reach: Sequence[str] = (), with_details: bool = False
 ) -> Iterator[str]:
-    """A row for each axis: the translation along it and an angle, with one standard deviation; with
-    details a row for each number with the parts of its standard deviation, and the quaternion.
+    """Yield a row for each axis: the translation along it and an angle, with standard deviations.
+
+    With details, there is a row for each number with the parts of its standard deviation, and a row
+    with the quaternion.
     """
     numbers = printed_numbers(transform, out_of_reach)
     if with_details:
         yield from _detailed_lines(transform, numbers)
         return
-    columns = []
-    for axes, width in ((TRANSLATIONS, 1), (ROTATIONS, 5)):
-        told = numbers.get(listing(axes))
-        rows = ["", f"{listing(axes)} are {told}", ""]
-        columns.append(rows if told else [f"{each:<{width}} {numbers[each]:>24}" for each in axes])
-    for metres, degrees in zip(*columns, strict=True):
-        yield f"  {metres:<30}  {degrees}".rstrip()
+    translations = _column(numbers, TRANSLATIONS, 1)
+    rotations = _column(numbers, ROTATIONS, 5)
+    for translation, rotation in zip(translations, rotations, strict=True):
+        yield f"  {translation:<30}  {rotation}".rstrip()
+
+
+def _column(numbers: Mapping[str, str], axes: Sequence[str], width: int) -> list[str]:
+    """Return the texts of three axes, or a text about all of them in the second row."""
+    if text := numbers.get(listing(axes)):
+        return ["", f"{listing(axes)} are {text}", ""]
+    return [f"{axis:<{width}} {numbers[axis]:>24}" for axis in axes]
 
 
 def _detailed_lines(transform: "Notation", numbers: Mapping[str, str]) -> Iterator[str]:
-    """A row for each number with the parts of its standard deviation, and the quaternion."""
+    """Yield a row for each number with the parts of its standard deviation, and the quaternion."""
     parts = parts_of_sigmas(transform)
     for axis, number in numbers.items():
-        told = f" ({parts[axis]})" if axis in parts else ""
+        details = f" ({parts[axis]})" if axis in parts else ""
         verb = " are" if "," in axis else ""
-        yield f"  {axis}{verb} {number}{told}"
-    words = ["unknown"]
+        yield f"  {axis}{verb} {number}{details}"
+    quaternion = "unknown"
     if transform.quat_xyzw is not None:
-        quaternion = zip("xyzw", transform.quat_xyzw, strict=True)
-        words = [f"{name} {value:.6f}" for name, value in quaternion]
-    yield f"  quaternion {' '.join(words)}"
+        coefficients = zip("xyzw", transform.quat_xyzw, strict=True)
+        quaternion = " ".join(f"{name} {value:.6f}" for name, value in coefficients)
+    yield f"  quaternion {quaternion}"

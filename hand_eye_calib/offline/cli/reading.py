@@ -1,4 +1,4 @@
-"""Recordings as the engine takes them, and the trajectory files of two or more sensors."""
+"""Recordings for the engine, and the trajectory files of two or more sensors."""
 
 import dataclasses
 import re
@@ -29,8 +29,18 @@ _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 
 @dataclass
 class Recording:
-    """Both streams of a recording with their options, where they came from in plain values, the
-    files that were read, and what there is to say of them.
+    """Both streams of a recording.
+
+    Attributes
+    ----------
+    snapshot : Snapshot
+        Streams with their options.
+    inputs : dict
+        Origin of the data in plain values.
+    files : list of pathlib.Path
+        Files that were read.
+    warnings : tuple of str
+        Warnings for the result.
     """
 
     snapshot: Snapshot
@@ -39,41 +49,47 @@ class Recording:
     warnings: tuple[str, ...] = ()
 
     def solved(self, with_fingerprints: bool) -> Calibration:
-        """Solve, check the streams, and solve again if a check is certain of an option; the
-        snapshot and the inputs have the options that gave the result. With name, size and SHA-256
-        of the files among the inputs, if they are wanted.
+        """Solve, check the streams, and solve again if a check is certain of an option.
+
+        The snapshot and the inputs get the options of the result. With fingerprints, the inputs
+        also get name, size and SHA-256 of the files.
         """
         with waiting_for("solving, and checking the streams"):
-            found = run(self.snapshot)
-        self.snapshot = found.snapshot
+            checked_run = run(self.snapshot)
+        self.snapshot = checked_run.snapshot
         self.inputs["options"] = self.snapshot.config.to_options()
         if with_fingerprints:
             from hand_eye_calib.formats.results import fingerprint
 
             files = with_progress(self.files, len(self.files), "hashing")
             self.inputs["files"] = [fingerprint(file) for file in files]
-        warnings = (*found.calibration.warnings, *self.warnings)
-        return dataclasses.replace(found.calibration, warnings=warnings)
+        warnings = (*checked_run.calibration.warnings, *self.warnings)
+        return dataclasses.replace(checked_run.calibration, warnings=warnings)
 
 
 def are_bags(paths: Sequence[Path | str]) -> bool:
-    """Whether these are bags, or parts of one, rather than trajectory files; a ConfigError if some
-    are bags and others are not, or a file stands alone.
+    """Whether paths are bags or parts of one rather than trajectory files. A URL is a bag.
+
+    Raises
+    ------
+    ConfigError
+        If only some are bags, or there is only one file.
     """
-    urls = [path for path in paths if isinstance(path, str)]
-    files = [path for path in paths if isinstance(path, Path)]
-    bags = [*urls, *(path for path in files if path.suffix in _BAG_SUFFIXES or path.is_dir())]
-    if len(bags) == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
+    bags = [path for path in paths if isinstance(path, str)]
+    local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
+    n_bags = len(bags) + len(local_bags)
+    if n_bags == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
         return True
-    folder = next((bag for bag in bags if isinstance(bag, Path) and not _has_bag(bag)), None)
-    if folder:
+    for folder in local_bags:
+        if folder.is_dir() and not any(map(_looks_like_file_of_bag, folder.iterdir())):
+            raise ConfigError(
+                f"{folder} is a folder without a bag: give a trajectory file of each sensor, or a "
+                "bag"
+            )
+    if n_bags:
         raise ConfigError(
-            f"{folder} is a folder without a bag: give a trajectory file of each sensor, or a bag"
-        )
-    if bags:
-        raise ConfigError(
-            f"{bags[0]} is a bag, but not all of the others are: give two trajectory files, or the "
-            "parts of one bag"
+            f"{[*bags, *local_bags][0]} is a bag, but not all of the others are: give two "
+            "trajectory files, or the parts of one bag"
         )
     if len(paths) == 1:
         raise ConfigError(
@@ -82,36 +98,39 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     return False
 
 
-def _has_bag(path: Path) -> bool:
-    """Whether a path is a bag's file, or a folder with one."""
-    if not path.is_dir():
-        return True
-    return any(inside.suffix in _BAG_SUFFIXES for inside in path.iterdir())
+def _looks_like_file_of_bag(path: Path) -> bool:
+    return path.suffix in _BAG_SUFFIXES
+
+
+def _looks_like_bag(path: Path) -> bool:
+    """Whether a path is a folder or a bag's file, by its name."""
+    return _looks_like_file_of_bag(path) or path.is_dir()
 
 
 # ----------------------------------------------------------------------- files
 
 
 def read_pair(arguments: Namespace, options: Options) -> Recording:
-    """The recording of the trajectory files of parent and child."""
+    """Return the recording of the trajectory files of parent and child."""
     files = read_files(arguments, arguments.paths, options)
-    parent, child = files.trajectories
     note(*files.repairs)
     inputs: Document = {}
-    for path, stream, poses in zip(arguments.paths, STREAMS, (parent, child), strict=True):
-        first_ns, last_ns = poses.stamps_ns[[0, -1]].tolist()
-        inputs[stream] = {"file": str(path), "poses": len(poses)}
-        inputs[stream] |= {"first_stamp_ns": first_ns, "last_stamp_ns": last_ns}
+    for path, stream, poses in zip(arguments.paths, STREAMS, files.trajectories, strict=True):
+        inputs[stream] = {
+            "file": str(path),
+            "poses": len(poses),
+            "first_stamp_ns": int(poses.stamps_ns[0]),
+            "last_stamp_ns": int(poses.stamps_ns[-1]),
+        }
     times = {arguments.times, arguments.parent_times, arguments.child_times} - {None}
+    paths = [*map(Path, arguments.paths), *times]
+    parent, child = files.trajectories
     snapshot = whole_snapshot(parent, child, options)
-    read = [*map(Path, arguments.paths), *times]
-    return Recording(snapshot, inputs, read, tuple(files.warnings))
+    return Recording(snapshot, inputs, paths, tuple(files.warnings))
 
 
 class FilesRead(NamedTuple):
-    """The trajectories of files, what was wrong with the files and was repaired, and what a result
-    has to be warned of.
-    """
+    """Trajectories of files, notes on their repairs, and warnings for the result."""
 
     trajectories: list[Trajectory]
     repairs: list[str]
@@ -119,9 +138,15 @@ class FilesRead(NamedTuple):
 
 
 def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Options) -> FilesRead:
-    """The trajectories of files; a note says what was guessed. How each is read is among the
-    arguments: of two, its own options go before those for both. ``options`` say what the sensors
-    measure.
+    """Read trajectory files, and print notes on what the files do not state.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        Options of the files. With two files, the options of one file override those of both.
+    paths : sequence of path-like
+    options : dict
+        Kind of data of each sensor, "parent_measures" and "child_measures".
     """
     from hand_eye_calib.formats.trajectory_files.reading import FileOptions, read_trajectory_files
 
@@ -131,19 +156,21 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
             raise ConfigError(f"--{flag(name)} is of two files; give it for all of a rig's")
     files = []
     for path, stream in zip(paths, streams, strict=True):
-        given = {name: getattr(arguments, f"{stream}_{name}", None) for name in FILE_OPTIONS}
-        given = {name: value or getattr(arguments, name) for name, value in given.items()}
-        given["pair_by"] = arguments.pair_by
-        given = {"format": "auto"} | {name: value for name, value in given.items() if value}
+        settings: dict[str, Any] = {"format": "auto"}
+        for name in (*FILE_OPTIONS, "pair_by"):
+            value = getattr(arguments, f"{stream}_{name}", None) or getattr(arguments, name)
+            if value:
+                settings[name] = value
         measures = options.get(f"{stream}_measures", "auto")
-        files.append((Path(path), FileOptions(**given, measures=measures, repair=True)))
+        files.append((Path(path), FileOptions(**settings, measures=measures, repair=True)))
     with waiting_for(f"reading {' and '.join(map(str, paths))}"):
         readings = read_trajectory_files(files)
     for (path, _), reading, stream in zip(files, readings, streams, strict=True):
         for text in reading.guesses:
-            named_as = rf"`{stream}_\1`" if stream else r"`\1`"
             text = text.replace(str(path), path.name)
-            note(re.sub(f"`({'|'.join(FILE_OPTIONS)})`", named_as, text))
+            if stream:  # name the option of this file alone
+                text = re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
+            note(text)
     return FilesRead(
         [reading.trajectory for reading in readings],
         _with_short_names(files, [reading.repairs for reading in readings]),
@@ -152,6 +179,8 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
 
 
 def _with_short_names(files: Sequence[tuple[Path, Any]], texts: Sequence[list[str]]) -> list[str]:
-    """Texts of files with their names in place of their paths."""
-    both = zip(files, texts, strict=True)
-    return [text.replace(str(path), path.name) for (path, _), of_file in both for text in of_file]
+    """Return the texts about all files, with names in place of paths."""
+    short = []
+    for (path, _), texts_of_file in zip(files, texts, strict=True):
+        short += [text.replace(str(path), path.name) for text in texts_of_file]
+    return short

@@ -1,4 +1,4 @@
-"""Pages: ``report.html`` of a calibration or of a session of the node."""
+"""Report pages, ``report.html``, of a calibration or of a session of the node."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,8 +20,16 @@ REPORT = "report.html"
 def write_report(
     directory: Path, calibration: Calibration, snapshot: "Snapshot | None", inputs: Document
 ) -> None:
-    """Write the report of a result, of the poses and options that gave it, and of where the data
-    came from in plain values.
+    """Write the report of a result.
+
+    Parameters
+    ----------
+    directory : pathlib.Path
+    calibration : Calibration
+    snapshot : Snapshot or None
+        Poses and options of the result.
+    inputs : dict
+        Origin of the data in plain values.
     """
     from hand_eye_calib.offline.report.report import render
 
@@ -29,16 +37,16 @@ def write_report(
 
 
 def write_page(directory: Path, page: Callable[[], str]) -> None:
-    """Write the page that ``page()`` renders, and print where it is."""
+    """Write the page that ``page()`` renders, and print its path."""
     with waiting_for(f"writing {REPORT}"):
         path = save_text(directory / REPORT, page())
     note(f"wrote {path}")
 
 
 def write_session_report(directory: Path, session: SessionResult) -> None:
-    """Check the streams of a session, and write its result and the report again with the findings.
+    """Check the streams of a session, and write its result and its report with the findings.
 
-    The session's own checks may be older than its result.
+    The checks are repeated because those of the session may be older than its result.
     """
     if not session.with_report:
         return
